@@ -22,7 +22,7 @@ from enum import Enum
 import numpy as np
 
 from ident.basis.posterior import ResponsePosterior
-from ident.data.arrays import ComplexArray, RealArray
+from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
@@ -47,9 +47,11 @@ SMALLEST_RESPONSE = 1e-14
 # Ellipses are at least so wide along the gain, as a share of their width along the phase: twice the error
 # with which the basis follows a fraction of a step.
 GAIN_OF_PHASE = 0.1
-# Of the gaps between changes of a command that repeats, this share is a multiple of its period: single rows
-# may be lost.
+# Of the gaps between changes of a command that repeats, this share is a multiple of its period, and of the
+# changes this share keeps to one phase: the rest are commands that happen to stay.
 NEARLY_ALL = 0.99
+# Gaps between changes of a command from which its period is read.
+FEWEST_GAPS = 10
 # A stated period agrees with whole rows within this share.
 SAME_PERIOD = 1e-3
 
@@ -165,28 +167,35 @@ def timing_of(
     Raises
     ------
     ValueError
-        The log contradicts the stated period.
+        The log contradicts the stated period, or the mean of commands was logged in open loop and their
+        period is not stated.
     """
     step_s = records[0].dt_s
-    rows_per_command = min(_rows_per_command(record) for record in records)
+    rows_per_command = rows_per_command_of(records)
     if stated_period_s is not None:
-        _refuse_contradiction(records[0], stated_period_s, rows_per_command)
-        law = law_of(records) if in_loop else None
-        if law is not None and not (law.repeats_command and stated_period_s >= step_s * (1 - SAME_PERIOD)):
-            law = None
-        if stated_period_s < step_s * (1 - SAME_PERIOD):
-            taken = Hold(stated_period_s / step_s, averaged)
-        else:
-            taken = HELD
-        rows = round(stated_period_s / step_s) if in_loop else 1
-        return _thinned(
-            CommandTiming(TimingSource.STATED, step_s, stated_period_s, taken, law=law), records, rows
-        )
+        usual_gap = min(_usual_gaps(records), default=1)
+        _refuse_contradiction(records[0], stated_period_s, usual_gap)
+        # In a loop the position of a row at which the command stands was never seen by the controller.
+        rows_used = rows_per_command if in_loop else 1
+        used_step_s = rows_used * step_s
+        stated = CommandTiming(TimingSource.STATED, step_s, stated_period_s)
+        if in_loop:
+            stated = _with_rows(stated, records, rows_used)
+        if stated_period_s < used_step_s * (1 - SAME_PERIOD):
+            _refuse_law_at_rows(records[0], stated_period_s, used_step_s, stated.law)
+            # A law of rows between which the command changed is not the one that ran.
+            return replace(stated, taken=Hold(stated_period_s / used_step_s, averaged), law=None)
+        return stated
     if not in_loop:
+        if averaged:
+            raise ValueError(
+                f"{records[0].label}: a mean of commands over {step_s:.6g} s needs the period of each: add "
+                "--controller-period SECONDS (controller_period_s)"
+            )
         return CommandTiming(TimingSource.OPEN_LOOP, step_s, None)
     if rows_per_command > 1:
         found = CommandTiming(TimingSource.REPEATS, step_s, rows_per_command * step_s)
-        return _thinned(found, records, rows_per_command)
+        return _with_rows(found, records, rows_per_command)
 
     law = law_of(records)
     if law is None or not law.repeats_command:
@@ -204,31 +213,61 @@ def timing_of(
     return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=possible, middle=Hold(0.5), law=law)
 
 
-def _rows_per_command(record: Record) -> int:
-    """Rows after which the command changes while the output goes on; 1 where it changes from row to row."""
-    changes = np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
-    gaps = np.diff(changes)
-    if gaps.size < 10:
-        return 1
-    usual = int(np.median(gaps))
-    if usual > 1 and np.mean(gaps % usual == 0) > NEARLY_ALL:
-        return usual
-    return 1
+def rows_per_command_of(records: Sequence[Record]) -> int:
+    """Rows after which the command of records changes while the output goes on.
 
+    Parameters
+    ----------
+    records : sequence of Record
+        As logged, of one sampling time. Those whose command hardly changes tell nothing.
 
-def _thinned(timing: CommandTiming, records: Sequence[Record], rows: int) -> CommandTiming:
-    """The timing with the rows that are used where a command stands for several; law: of these rows."""
-    if rows <= 1:
-        return timing
-    first = []
+    Returns
+    -------
+    int
+        1 where it changes from row to row, or where the changes do not keep to one phase: rows were lost, or
+        two clocks drift apart. Held from row to row is then what the rows say.
+    """
+    gaps = _usual_gaps(records)
+    least = min(gaps, default=1)
     for record in records:
-        changes = 1 + np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
-        first.append(int(np.bincount(changes % rows, minlength=rows).argmax()))
-    timing = replace(timing, rows_per_command=rows, first_row=tuple(first))
-    law = law_of([_every(record, start, rows) for record, start in zip(records, first, strict=True)])
+        changes = _changes(record)
+        if changes.size and np.mean(changes % least == _phase(changes, least)) <= NEARLY_ALL:
+            return 1
+    return least
+
+
+def _usual_gaps(records: Sequence[Record]) -> list[int]:
+    """Rows after which the command changes, in each record whose command changes often; 1 where gaps differ."""
+    usual_gaps = []
+    for record in records:
+        gaps = np.diff(_changes(record))
+        if gaps.size < FEWEST_GAPS:
+            continue
+        usual = int(np.median(gaps))
+        if np.mean(gaps % usual == 0) <= NEARLY_ALL:
+            usual = 1
+        usual_gaps.append(usual)
+    return usual_gaps
+
+
+def _changes(record: Record) -> IntArray:
+    """Rows (N,) whose command is another than that of the row before."""
+    return 1 + np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
+
+
+def _phase(changes: IntArray, rows: int) -> int:
+    """First row of a record, of `rows`, at which its command usually changes."""
+    return int(np.bincount(changes % rows, minlength=rows).argmax())
+
+
+def _with_rows(timing: CommandTiming, records: Sequence[Record], rows: int) -> CommandTiming:
+    """The timing with the rows that are used, of which the command stands for so many, and with their law."""
+    first = tuple(_phase(_changes(record), rows) for record in records)
+    used = [_every(record, start, rows) for record, start in zip(records, first, strict=True)]
+    law = law_of(used)
     if law is not None and not law.repeats_command:
         law = None
-    return replace(timing, law=law)
+    return replace(timing, rows_per_command=rows, first_row=first, law=law)
 
 
 def _every(record: Record, start: int, rows: int) -> Record:
@@ -236,7 +275,7 @@ def _every(record: Record, start: int, rows: int) -> Record:
     return replace(thinned, dt_s=record.dt_s * rows)
 
 
-def _refuse_contradiction(record: Record, period_s: float, rows_per_command: int) -> None:
+def _refuse_contradiction(record: Record, period_s: float, usual_gap: int) -> None:
     """Raise ValueError where the log shows that the stated period is not that of its controller."""
     step_s = record.dt_s
     option = "controller_period_s, --controller-period"
@@ -247,11 +286,21 @@ def _refuse_contradiction(record: Record, period_s: float, rows_per_command: int
             f"{step_s:.6g} s: expected a whole part of the log's step, such as "
             f"{step_s / round(share):.6g} ({option})"
         )
-    longest = rows_per_command * step_s
+    longest = usual_gap * step_s
     if period_s > longest * (1 + SAME_PERIOD):
         raise ValueError(
             f"{record.label}: the command changes every {longest:.6g} s, more often than a controller every "
             f"{period_s:.6g} s could: expected at most {longest:.6g} ({option})"
+        )
+
+
+def _refuse_law_at_rows(record: Record, period_s: float, used_step_s: float, law: RecordedLaw | None) -> None:
+    """Raise ValueError where the rows show the law that made them, and a faster one would have left more."""
+    if law is not None and law.tells_period:
+        raise ValueError(
+            f"{record.label}: a linear law makes every command from rows {used_step_s:.6g} s apart, which no "
+            f"controller every {period_s:.6g} s would: expected {used_step_s:.6g} (controller_period_s, "
+            "--controller-period)"
         )
 
 

@@ -26,6 +26,9 @@ from ident.response_coefficients import coefficients_of
 
 # Whole multiples and parts of a step agree within this share of it.
 SAME_RATIO = 1e-3
+# Steps of one rate in one of the other, at most: a log at 10 kHz beside a controller at 100 Hz. Beyond that a
+# log shows hardly any of the controller's band, and a computation takes minutes.
+MOST_STEPS = 100
 # Taps beyond those of the posterior: what a delay of a part of a step leaves behind the poles.
 TAPS = 6
 # Power of sin(w Td / 2) with which ellipses open towards the log's Nyquist frequency, where they are as wide
@@ -52,9 +55,14 @@ def ratio_of(model_dt_s: float, controller_dt_s: float) -> tuple[int, int]:
     Raises
     ------
     ValueError
-        Neither is a whole multiple of the other.
+        Neither is a whole multiple of the other, or there are more than `MOST_STEPS`.
     """
     longer = controller_dt_s / model_dt_s
+    if max(longer, 1 / longer) > MOST_STEPS * (1 + SAME_RATIO):
+        raise ValueError(
+            f"controller_dt_s = {controller_dt_s:.6g} s beside a log every {model_dt_s:.6g} s: expected "
+            f"{model_dt_s / MOST_STEPS:.6g} to {model_dt_s * MOST_STEPS:.6g}"
+        )
     if longer >= 1 and abs(longer - round(longer)) <= SAME_RATIO * longer:
         return round(longer), 1
     if longer < 1 and abs(1 / longer - round(1 / longer)) <= SAME_RATIO / longer:
@@ -78,7 +86,10 @@ def resampled_poles(poles: Poles, model_dt_s: float, controller_dt_s: float) -> 
         else:
             # A pole at zero or below has no root in an arm: it decays within a step, and stays what it is.
             real.append(pole)
-    return Poles(np.array(real), poles.pairs ** (down / up))
+    pairs = poles.pairs ** (down / up)
+    # A mode above half the controller's rate is folded below it: its pair is named by the other of its poles.
+    pairs = pairs.real + 1j * np.abs(pairs.imag)
+    return Poles(np.array(real), pairs)
 
 
 def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponsePosterior:
@@ -134,8 +145,6 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     )
     known = np.column_stack([posterior.mean, posterior.covariance_factor])
     slower_dt_s = max(posterior.dt_s, controller_dt_s)
-    # Between the points of the even part no tap turns round.
-    even = np.linspace(0.0, 0.99 * np.pi / slower_dt_s, 4 * n_taps + 200)[1:]
     slow = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, 600) / slower_dt_s
     # Between two of these no tap turns round.
     even = np.linspace(0.0, 0.99 * np.pi, 4 * n_taps + 200)[1:] / slower_dt_s

@@ -161,6 +161,71 @@ def test_a_period_that_the_log_contradicts_is_refused_in_one_line(period_s, said
     assert "\n" not in str(refused.value)
 
 
+def faster_log(rows, *, late=0, seed=11):
+    """A loop's log at `rows` times the rate of its controller; `late` first rows are missing."""
+    slow = loop_log(*pid(), seed=seed)
+    fine = np.arange(rows * slow.n_samples) / rows
+    log = Record(
+        "fast",
+        np.repeat(slow.input, rows, axis=0),
+        np.interp(fine, np.arange(slow.n_samples), slow.output[:, 0])[:, None],
+        0.001 / rows,
+        ("u",),
+        ("y",),
+        reference=np.repeat(slow.reference, rows, axis=0),
+        reference_names=("r",),
+    )
+    return log.slice(late, log.n_samples)
+
+
+@pytest.mark.parametrize("lost", [[8000], [5000, 11000]])
+def test_rows_that_lost_the_phase_of_the_command_are_not_thinned(lost):
+    """Every fourth row of what follows a lost one would hold a command that is about to change."""
+    log = faster_log(4).each(lambda signal: np.delete(signal, lost, axis=0))
+    records = [log, faster_log(4, seed=12)]
+    found = timing_of(records, in_loop=True)
+    assert not found.known
+    assert found.rows_per_command == 1
+    stated = timing_of(records, in_loop=True, stated_period_s=0.001)
+    assert stated.rows_per_command == 1
+    assert stated.taken == HELD
+
+
+def test_a_log_whose_command_hardly_changes_tells_no_period_of_the_others():
+    still = faster_log(4, seed=12)
+    still = replace(still, input=np.where(np.arange(still.n_samples) < 100, 1.0, 2.0)[:, None])
+    found = timing_of([faster_log(4, late=3), still], in_loop=True)
+    assert found.source is TimingSource.REPEATS
+    assert found.rows_per_command == 4
+    assert found.first_row[0] == 1
+
+
+def test_a_stated_period_shorter_than_the_repeats_of_a_command_counts_from_where_it_changes():
+    """A command column that is refreshed every fourth row, of a controller that ran at every second one."""
+    refreshed = faster_log(4)
+    noise = 0.1 * np.random.default_rng(3).standard_normal((refreshed.n_samples // 4, 1))
+    # A law that is not linear tells no period.
+    refreshed = replace(refreshed, input=refreshed.input + np.repeat(noise, 4, axis=0))
+    stated = timing_of([refreshed], in_loop=True, stated_period_s=0.0005)
+    assert stated.rows_per_command == 4
+    assert stated.taken == Hold(0.5)
+    (used,) = with_equivalent_command([refreshed], stated)
+    np.testing.assert_allclose(used.input, filtered(refreshed.input[::4], Hold(0.5)))
+
+
+@pytest.mark.parametrize(
+    ("record", "period_s"), [(loop_log(*pid()), 0.00025), (faster_log(4), 0.00025), (faster_log(3), 0.0005)]
+)
+def test_a_period_shorter_than_that_of_the_law_in_the_log_is_refused(record, period_s):
+    with pytest.raises(ValueError, match=r"from rows 0\.001 s apart.*--controller-period"):
+        timing_of([record], in_loop=True, stated_period_s=period_s)
+
+
+def test_a_mean_of_commands_in_open_loop_needs_the_period_of_each():
+    with pytest.raises(ValueError, match="--controller-period"):
+        timing_of([fast_log(4, averaged=True)], in_loop=False, averaged=True)
+
+
 @pytest.mark.parametrize("integrators", [0, 1])
 def test_ellipses_of_an_unknown_period_hold_the_response_of_each(integrators):
     """Narrow ellipses hold every possibility then, up to half the Nyquist frequency; those of a known period

@@ -91,6 +91,20 @@ def test_a_law_of_the_row_before_does_not_act_at_once():
     assert not law.acts_at_once
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_reference_that_stands_at_zero_tells_of_the_output_alone(rows):
+    record = loop_log(*pid(), rows=rows, noise=1e-3)
+    rng = np.random.default_rng(4)
+    output = np.cumsum(rng.standard_normal(record.n_samples)) * 1e-3
+    command = np.round(np.append(0.0, 30 * output[1:] - 28 * output[:-1]), 4) + 0.01 * rng.standard_normal()
+    still = replace(
+        record, input=command[:, None], output=output[:, None], reference=np.zeros_like(record.reference)
+    )
+    law_of([still, record])
+    assert np.all(np.isfinite(law_of([still]).of_reference))
+
+
 def test_no_reference_and_a_relay_tell_no_law():
     record = loop_log(*pid())
     assert law_of([replace(record, reference=None, reference_names=())]) is None

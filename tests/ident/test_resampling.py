@@ -51,6 +51,15 @@ def posterior(integrators=0, taps=2, delay=0):
     return replace(empty, mean=mean, covariance_factor=0.01 * np.diag(np.abs(mean)))
 
 
+@pytest.mark.parametrize("steps", [15, 20, 30, 60])
+def test_a_mode_above_half_the_rate_of_a_slow_controller_is_folded_below_it(steps):
+    """The mode is at 120 rad/s, half the rates at 105, 79, 52 and 26 rad/s."""
+    slower = resampled(posterior(), steps * STEP_S)
+    omega = np.geomspace(0.1, 0.95 * np.pi / (steps * STEP_S), 60)
+    np.testing.assert_allclose(slower.centre(omega), arm(steps * STEP_S, omega), rtol=1e-3)
+    assert np.all(slower.poles.pairs.imag > 0)
+
+
 @pytest.mark.parametrize("integrators", [0, 1])
 @pytest.mark.parametrize("steps", [2, 3])
 def test_a_slower_controller_sees_the_arm_that_is_sampled_at_its_rate(integrators, steps):

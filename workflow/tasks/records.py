@@ -112,7 +112,7 @@ def command_timing(config: AnyConfig, records: Sequence[Record]) -> CommandTimin
     stated, for a law of several inputs is not read off. Raises InputError for a period that the logs
     contradict.
     """
-    from ident.command_timing import timing_of
+    from ident.command_timing import SAME_PERIOD, rows_per_command_of, timing_of
     from workflow.tasks.identification import made_in_loop
 
     source = config.source
@@ -129,9 +129,16 @@ def command_timing(config: AnyConfig, records: Sequence[Record]) -> CommandTimin
         ]
         in_loop = config.closed_loop_data.stated or made_in_loop(fitted)
     stated_s = source.controller_period_s
-    if stated_s is None and isinstance(config, RunConfig) and config.closed_loop_data.controlled:
-        # A controller that is stated in z is one that runs at the step of the log.
-        stated_s = records[0].dt_s
+    if isinstance(config, RunConfig) and config.closed_loop_data.controlled:
+        # A controller that is stated in z is one that runs at the rows at which its command changes.
+        rows_s = records[0].dt_s * rows_per_command_of(records)
+        if stated_s is not None and stated_s < rows_s * (1 - SAME_PERIOD):
+            raise InputError(
+                f"controller_period_s = {stated_s:.6g} s: of a controller that ran faster than the rows "
+                f"({rows_s:.6g} s) the logs do not show the commands, so its reference does not follow from "
+                "them; leave closed_loop_data.controller out, or record the reference"
+            )
+        stated_s = rows_s if stated_s is None else stated_s
     with naming(""):
         return timing_of(records, in_loop=in_loop, stated_period_s=stated_s, averaged=source.command_averaged)
 
