@@ -131,16 +131,26 @@ def law_of(records: Sequence[Record]) -> RecordedLaw | None:
 def _tells_period(columns: _Columns, structure: _Structure, law: RecordedLaw) -> bool:
     """Whether a law of half the period would have left more than this one, which repeats the command.
 
-    Its log would look as every second row of this one does, but for a factor that the step from every second
-    to every fourth row shows: the errors of guessing the rows in between grow with a power of the step.
+    Its log would look as every second row of this one does, but for a factor that the steps from every second
+    to every fourth and eighth row show: the errors of guessing the rows in between grow with a power of the
+    step, and with a higher one where the signals are smooth over a step. Steps of the reference may fall on
+    every fourth row, which leaves little to guess there, so even and odd rows are judged by themselves, and
+    the smaller answer counts. A reference that the controller got as it was written has no rounding error,
+    though it has decimals, so what this law leaves beyond that of the other two columns may be an excess.
     """
-    every_second = columns.fitted(structure, thinned=2)
-    every_fourth = columns.fitted(structure, thinned=4)
-    if every_second is None or every_fourth is None:
-        return False
-    twice_as_fast = every_second.residual**2 / max(every_fourth.residual, law.rounding)
-    shown = np.sqrt(max(law.residual**2 - law.rounding**2, 0.0))
-    return bool(twice_as_fast >= LEAST_EXCESS * law.rounding and shown <= SHOWN_SHARE * twice_as_fast)
+    least = np.inf
+    for parity in range(2):
+        second = columns.least_residual(structure, 2, parity)
+        fourth = columns.least_residual(structure, 4, parity)
+        eighth = columns.least_residual(structure, 8, parity)
+        if second is None or fourth is None or eighth is None:
+            return False
+        falls = max(fourth, law.rounding) / second
+        fell_before = max(eighth, law.rounding) / max(fourth, law.rounding)
+        least = min(least, second / (falls * max(falls / fell_before, 1.0)))
+    certain_rounding = columns.rounding(law.own, np.zeros_like(law.of_reference), law.of_output)
+    shown = np.sqrt(max(law.residual**2 - certain_rounding**2, 0.0))
+    return bool(least >= LEAST_EXCESS * law.rounding and shown <= SHOWN_SHARE * least)
 
 
 @dataclass(frozen=True)
@@ -190,8 +200,13 @@ class _Columns:
             dt_s=records[0].dt_s,
         )
 
-    def fitted(self, structure: _Structure, thinned: int = 1) -> RecordedLaw | None:
-        """The law of a structure, by least squares over every row or every `thinned`-th one.
+    def least_residual(self, structure: _Structure, thinned: int, parity: int) -> float | None:
+        """Of the laws of every `thinned`-th even or odd row, the least residual; None: too few rows."""
+        laws = [self.fitted(structure, thinned, start) for start in range(parity, thinned, 2)]
+        return min((law.residual for law in laws if law is not None), default=None)
+
+    def fitted(self, structure: _Structure, thinned: int = 1, start: int = 0) -> RecordedLaw | None:
+        """The law of a structure, by least squares over every row, or every `thinned`-th one from `start`.
 
         None where there are too few rows.
         """
@@ -200,9 +215,8 @@ class _Columns:
         for command, reference, output in self.signals:
             if command.size <= thinned * (structure.n_states + 2):
                 continue
-            for start in range(thinned):
-                every = slice(start, None, thinned)
-                parts.append(_regression(command[every], reference[every], output[every], structure, limit))
+            every = slice(start, None, thinned)
+            parts.append(_regression(command[every], reference[every], output[every], structure, limit))
         if not parts:
             return None
         rows = np.concatenate([part[0] for part in parts])
@@ -221,6 +235,18 @@ class _Columns:
             own = np.convolve(own, [1.0, -1.0])
         of_reference = solved[n_own : n_own + structure.n_states + 1]
         of_output = -of_reference if structure.of_error else solved[n_own + structure.n_states + 1 :]
+        return RecordedLaw(
+            own,
+            of_reference,
+            of_output,
+            residual=float(np.std(target - rows @ solved)),
+            rounding=self.rounding(own, of_reference, of_output),
+            dt_s=self.dt_s * thinned,
+            tells_period=False,
+        )
+
+    def rounding(self, own: RealArray, of_reference: RealArray, of_output: RealArray) -> float:
+        """What the decimals of the columns leave of an exact law with these coefficients, root mean square."""
         variance = (
             own @ own * self.command_step**2
             + of_reference @ of_reference * self.reference_step**2
@@ -228,15 +254,7 @@ class _Columns:
         ) / 12
         # Sums of doubles are themselves rounded, a few times per term.
         of_doubles = 100 * np.finfo(np.float64).eps * self.largest
-        return RecordedLaw(
-            own,
-            of_reference,
-            of_output,
-            residual=float(np.std(target - rows @ solved)),
-            rounding=float(np.sqrt(variance)) + of_doubles,
-            dt_s=self.dt_s * thinned,
-            tells_period=False,
-        )
+        return float(np.sqrt(variance)) + of_doubles
 
 
 def _regression(

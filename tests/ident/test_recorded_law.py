@@ -74,6 +74,16 @@ def test_where_signals_are_smooth_the_log_does_not_tell_the_period():
     assert not every.tells_period
 
 
+@pytest.mark.parametrize("rows", [2, 4])
+@pytest.mark.parametrize("decimals", [3, 5, 9])
+def test_steps_that_fall_on_rows_do_not_tell_a_period_that_the_rest_does_not(rows, decimals):
+    """A simulator steps its reference at whole tenths of a second, and nothing else is new from row to row:
+    what a faster controller used between the rows can be guessed wherever no step is."""
+    numerator, denominator = pid(0.95)
+    law = law_of([loop_log(0.1 * numerator, denominator, rows=rows, noise=0.0, decimals=decimals, n=6000)])
+    assert law is None or not law.tells_period
+
+
 def test_a_law_with_the_derivative_of_the_output_alone_has_no_error_to_act_on():
     record = loop_log(*pid())
     u, y, r = record.input[:, 0].copy(), record.output[:, 0], record.reference[:, 0]
