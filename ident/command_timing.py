@@ -135,6 +135,15 @@ class CommandTiming:
         return not self.possible
 
     @property
+    def offered_dt_s(self) -> float:
+        """The known period, s, where a new controller may have it; else the step of the rows in use."""
+        used_step_s = self.row_step_s * self.rows_per_command
+        if self.period_s is None:
+            return used_step_s
+        parts = used_step_s / self.period_s
+        return self.period_s if abs(parts - round(parts)) <= SAME_PERIOD * parts else used_step_s
+
+    @property
     def acts_at_once(self) -> bool:
         """The rows tell that the command of a row was made of the output of the same row."""
         return self.law is not None and self.law.tells_period and self.law.acts_at_once
@@ -237,7 +246,7 @@ def rows_per_command_of(records: Sequence[Record]) -> int:
 
 
 def _usual_gaps(records: Sequence[Record]) -> list[int]:
-    """Rows after which the command changes, in each record whose command changes often; 1 where gaps differ."""
+    """Rows after which the command changes, of each record where it changes often; 1 where gaps differ."""
     usual_gaps = []
     for record in records:
         gaps = np.diff(_changes(record))

@@ -246,7 +246,7 @@ class _Columns:
         )
 
     def rounding(self, own: RealArray, of_reference: RealArray, of_output: RealArray) -> float:
-        """What the decimals of the columns leave of an exact law with these coefficients, root mean square."""
+        """Root mean square of what the decimals of the columns leave of an exact law."""
         variance = (
             own @ own * self.command_step**2
             + of_reference @ of_reference * self.reference_step**2

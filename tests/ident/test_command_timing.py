@@ -20,6 +20,7 @@ from ident.command_timing import (
     with_unknown_timing,
 )
 from ident.data.arrays import real_rows
+from ident.resampling import ratio_of
 from tests.ident.test_recorded_law import loop_log, pid
 
 STEP_S = 0.002
@@ -219,6 +220,15 @@ def test_a_stated_period_shorter_than_the_repeats_of_a_command_counts_from_where
 def test_a_period_shorter_than_that_of_the_law_in_the_log_is_refused(record, period_s):
     with pytest.raises(ValueError, match=r"from rows 0\.001 s apart.*--controller-period"):
         timing_of([record], in_loop=True, stated_period_s=period_s)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "offered_s"), [(0.0005, 0.0005), (0.0014, 0.002), (0.002, 0.002), (None, 0.002)]
+)
+def test_a_new_controller_is_offered_a_period_that_it_may_have(period_s, offered_s):
+    timing = CommandTiming(TimingSource.STATED, STEP_S, period_s)
+    assert timing.offered_dt_s == pytest.approx(offered_s)
+    ratio_of(STEP_S, timing.offered_dt_s)
 
 
 def test_a_mean_of_commands_in_open_loop_needs_the_period_of_each():

@@ -111,6 +111,12 @@ def test_periods_that_do_not_meet_are_refused_in_one_line(period_s):
     assert "controller_dt_s" in str(refused.value)
 
 
+@pytest.mark.parametrize("times", [1000, 0.001])
+def test_rates_too_far_apart_are_refused_in_one_line(times):
+    with pytest.raises(ValueError, match=r"controller_dt_s = .* beside a log every 0\.002 s: expected 2e-05"):
+        ratio_of(STEP_S, times * STEP_S)
+
+
 def test_the_arm_with_friction_moves_alike_at_both_rates():
     """Under one command, held for the longer step: the same position at the samples that both have."""
     from tests.workflow.test_friction_loop import DT_S, fit

@@ -136,7 +136,7 @@ def command_timing(config: AnyConfig, records: Sequence[Record]) -> CommandTimin
             raise InputError(
                 f"controller_period_s = {stated_s:.6g} s: of a controller that ran faster than the rows "
                 f"({rows_s:.6g} s) the logs do not show the commands, so its reference does not follow from "
-                "them; leave closed_loop_data.controller out, or record the reference"
+                "them; leave closed_loop_data.controller out"
             )
         stated_s = rows_s if stated_s is None else stated_s
     with naming(""):
