@@ -185,11 +185,15 @@ def timing_of(
         usual_gap = min(_usual_gaps(records), default=1)
         _refuse_contradiction(records[0], stated_period_s, usual_gap)
         # In a loop the position of a row at which the command stands was never seen by the controller.
-        rows_used = rows_per_command if in_loop else 1
-        used_step_s = rows_used * step_s
+        # Without a law it may be an experiment in open loop, of which every row counts; unless the controller
+        # is faster than the command changes in the log, so that it is the logger that repeats.
         stated = CommandTiming(TimingSource.STATED, step_s, stated_period_s)
         if in_loop:
-            stated = _with_rows(stated, records, rows_used)
+            of_controller = _with_rows(stated, records, rows_per_command)
+            logger_repeats = stated_period_s < rows_per_command * step_s * (1 - SAME_PERIOD)
+            if of_controller.law is not None or logger_repeats:
+                stated = of_controller
+        used_step_s = stated.rows_per_command * step_s
         if stated_period_s < used_step_s * (1 - SAME_PERIOD):
             _refuse_law_at_rows(records[0], stated_period_s, used_step_s, stated.law)
             # A law of rows between which the command changed is not the one that ran.
@@ -204,7 +208,10 @@ def timing_of(
         return CommandTiming(TimingSource.OPEN_LOOP, step_s, None)
     if rows_per_command > 1:
         found = CommandTiming(TimingSource.REPEATS, step_s, rows_per_command * step_s)
-        return _with_rows(found, records, rows_per_command)
+        of_controller = _with_rows(found, records, rows_per_command)
+        # Without a law it may be an experiment in open loop that was taken for a loop: then every row counts,
+        # and held from row to row is what the rows say.
+        return found if of_controller.law is None else of_controller
 
     law = law_of(records)
     if law is None or not law.repeats_command:

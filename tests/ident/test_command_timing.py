@@ -108,6 +108,19 @@ def test_the_period_is_read_off_or_not_known():
     assert open_loop.taken == HELD
 
 
+def test_every_row_is_used_of_a_command_that_repeats_and_was_made_by_no_law():
+    """A held random command: of an experiment that may have been taken for a loop."""
+    rng = np.random.default_rng(3)
+    command = np.repeat(rng.standard_normal(300), 8)[:, None]
+    record = Record("held", command, np.cumsum(command, axis=0) * 1e-3, STEP_S, ("u",), ("y",))
+    timing = timing_of([record], in_loop=True)
+    assert timing.source is TimingSource.REPEATS
+    assert timing.known
+    (used,) = with_equivalent_command([record], timing)
+    np.testing.assert_array_equal(used.input, record.input)
+    assert used.dt_s == STEP_S
+
+
 def test_logs_of_two_controllers_have_a_law_each():
     logs = [loop_log(*pid(pole), seed=seed) for pole, seed in ((0.82, 1), (0.6, 2))]
     timing = timing_of(logs, in_loop=True)
