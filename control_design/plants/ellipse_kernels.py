@@ -1,5 +1,12 @@
-"""Compiled geometry of `ellipses`, element by element. A module of its own, because numba takes a second to
-import and most who name an ellipse compute with none."""
+"""Compiled geometry of ellipses in the plane, element by element.
+
+An ellipse has half axes a >= b >= 0, stands at the origin and has its axes parallel to the coordinate axes;
+callers (`control_design.plants.ellipses`) turn and shift points so that this holds. The nearest and the
+farthest member seen from a point both come to the root of one secular equation (`_secular_root`). `bisected`
+finds the largest gain of a linear fractional map over an ellipse with them. The functions ending in `of_each`
+are ufuncs: they take arrays (F,) that broadcast. A module of its own, because numba takes a second to import
+and most who name an ellipse compute with none.
+"""
 
 from __future__ import annotations
 
@@ -10,68 +17,112 @@ import numpy as np
 
 from ident.data.arrays import INSIDE
 
-_elementwise: Any = numba.vectorize  # which numba leaves untyped
+# numba leaves this decorator untyped.
+_elementwise: Any = numba.vectorize
+
+# Newton steps of the secular equation, and halvings of the bisection. Newton converges quadratically from a
+# bound within a factor of two (5 to 8 steps); 60 halvings of a positive interval reach double precision.
+_MOST_STEPS = 60
+
+# A Newton step below this share of the root is rounding: a few units of the last digit.
+_ROUNDING_SHARE = 1e-15
+
+# Keeps divisions by a size that may be zero finite; far below any size that matters.
+_TINY = 1e-300
 
 
 @numba.njit(**INSIDE)
 def _secular_root(p: float, q: float, c: float, d: float) -> Any:
-    """Convex and decreasing: Newton from the left never overshoots."""
+    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the left side is below 1
+    at t = 0. The left side is convex and decreasing, so Newton's method from the left never overshoots."""
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
     t = max(max(p - c, q - d), 0.0)
-    tiny = 1e-300
-    for _ in range(60):
-        dc, dd = c + t + tiny, d + t + tiny
-        pc, qd = (p / dc) ** 2, (q / dd) ** 2
-        value, slope = pc + qd - 1.0, -2.0 * (pc / dc + qd / dd)
-        step = -value / slope if value > 0 and slope < 0 else 0.0
+    for _ in range(_MOST_STEPS):
+        first_denominator = c + t + _TINY
+        second_denominator = d + t + _TINY
+        first_term = (p / first_denominator) ** 2
+        second_term = (q / second_denominator) ** 2
+        value = first_term + second_term - 1.0
+        slope = -2.0 * (first_term / first_denominator + second_term / second_denominator)
+        step = 0.0
+        if value > 0 and slope < 0:
+            step = -value / slope
         t += step
-        if not step > 1e-15 * (t + 1e-16):
+        if not step > _ROUNDING_SHARE * (t + 1e-16):
             break
     return t
 
 
 @numba.njit(**INSIDE)
 def _nearest(point: complex, semi_major: float, semi_minor: float) -> Any:
-    x, y = abs(point.real), abs(point.imag)
-    scale = max(max(x, y), max(semi_major, 1e-300))
-    x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
-    beside = (a == 0 and x > 0) or (b == 0 and y > 0)
-    if not beside and (x / a if a > 0 else 0.0) ** 2 + (y / b if b > 0 else 0.0) ** 2 <= 1.0:
+    """Distance from `point` to the filled ellipse; 0 inside. By symmetry the point is taken to the first
+    quadrant, and everything is divided by the largest size, so that squares neither overflow nor vanish."""
+    scale = max(max(abs(point.real), abs(point.imag)), max(semi_major, _TINY))
+    x = abs(point.real) / scale
+    y = abs(point.imag) / scale
+    a = semi_major / scale
+    b = semi_minor / scale
+    # An axis of length zero leaves a segment or a point: whatever is off it is outside.
+    off_segment = (a == 0 and x > 0) or (b == 0 and y > 0)
+    x_share = 0.0
+    y_share = 0.0
+    if a > 0:
+        x_share = x / a
+    if b > 0:
+        y_share = y / b
+    if not off_segment and x_share**2 + y_share**2 <= 1.0:
         return 0.0
     t = _secular_root(a * x, b * y, a * a, b * b)
-    da, db = a * a + t, b * b + t
+    x_denominator = a * a + t
+    y_denominator = b * b + t
     # t = 0 on a degenerate axis: the point projects onto the segment itself.
-    nx = a * a * x / da if da > 0 else 0.0
-    ny = b * b * y / db if db > 0 else 0.0
-    return np.hypot(x - nx, y - ny) * scale
+    nearest_x = 0.0
+    nearest_y = 0.0
+    if x_denominator > 0:
+        nearest_x = a * a * x / x_denominator
+    if y_denominator > 0:
+        nearest_y = b * b * y / y_denominator
+    return np.hypot(x - nearest_x, y - nearest_y) * scale
 
 
 @numba.njit(**INSIDE)
 def _farthest(point: complex, semi_major: float, semi_minor: float) -> Any:
-    x, y = abs(point.real), abs(point.imag)
-    scale = max(max(x, y), max(semi_major, 1e-300))
-    x, y, a, b = x / scale, y / scale, semi_major / scale, semi_minor / scale
-    by, gap = b * y, a * a - b * b
-    n = _secular_root(a * x, by, 0.0, gap)
-    sin_f = min(max(by / (n + gap) if n + gap > 0 else 0.0, 0.0), 1.0)
-    # cos from sin: when x = 0 the cosine term of the secular equation degenerates (n -> 0).
-    distance = np.hypot(x + a * np.sqrt(1.0 - sin_f**2), y + b * sin_f)
+    """Distance from `point` to the farthest member of the ellipse, which lies in the quadrant opposite to the
+    point at (-a cos f, -b sin f). Scaled as in `_nearest`."""
+    scale = max(max(abs(point.real), abs(point.imag)), max(semi_major, _TINY))
+    x = abs(point.real) / scale
+    y = abs(point.imag) / scale
+    a = semi_major / scale
+    b = semi_minor / scale
+    gap = a * a - b * b
+    n = _secular_root(a * x, b * y, 0.0, gap)
+    sin_f = 0.0
+    if n + gap > 0:
+        sin_f = b * y / (n + gap)
+    sin_f = min(max(sin_f, 0.0), 1.0)
+    # The cosine from the sine: when x = 0 the cosine's own term of the secular equation degenerates (n -> 0).
+    cos_f = np.sqrt(1.0 - sin_f**2)
+    distance = np.hypot(x + a * cos_f, y + b * sin_f)
     # The vertices are members too: they guard the degenerate circles and segments.
-    return max(distance, max(np.hypot(x + a, y), np.hypot(x, y + b))) * scale
+    vertex_distance = max(np.hypot(x + a, y), np.hypot(x, y + b))
+    return max(distance, vertex_distance) * scale
 
 
 @_elementwise(cache=True)
 def root_of_each(p: float, q: float, c: float, d: float) -> Any:
+    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1, element by element; see `_secular_root`."""
     return _secular_root(p, q, c, d)
 
 
 @_elementwise(cache=True)
 def nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
+    """Distance from each point to the nearest member of its ellipse; 0 inside."""
     return _nearest(point, semi_major, semi_minor)
 
 
 @_elementwise(cache=True)
 def farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
+    """Distance from each point to the farthest member of its ellipse."""
     return _farthest(point, semi_major, semi_minor)
 
 
@@ -88,22 +139,31 @@ def bisected(
     semi_minor: float,
     accuracy: float,
 ) -> Any:
-    """Upper end of the bisection of `largest_ratio`."""
-    for _ in range(60):
+    """Upper bound h of |alpha G + beta|/|1 + k G| over the ellipse of members G, within the relative
+    accuracy.
+
+    low, high: a value that some member has, and a bound of all. centre, direction (of modulus one),
+    semi_major, semi_minor: the ellipse. For h = mid the members with a ratio of at most h are a disc around
+    g0, or everything outside of one where h |k| > |alpha| (an Apollonius circle; the formulas stand in
+    `largest_ratio`).
+    """
+    for _ in range(_MOST_STEPS):
         mid = 0.5 * (low + high)
-        a, part = abs(alpha) ** 2, (mid * abs(k)) ** 2
-        tiny = 1e-13 * (a + part) + 1e-300
-        gap = a - part
-        if abs(gap) < tiny:  # a half-plane is the limit of both cases
-            gap = tiny
-        middle = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / gap
+        alpha_square = abs(alpha) ** 2
+        k_square = (mid * abs(k)) ** 2
+        # A half-plane is the limit of disc and outside of a disc: a gap of rounding size stands for it.
+        smallest_gap = 1e-13 * (alpha_square + k_square) + _TINY
+        gap = alpha_square - k_square
+        if abs(gap) < smallest_gap:
+            gap = smallest_gap
+        g0 = (mid**2 * np.conj(k) - np.conj(alpha) * beta) / gap
         radius = mid * abs(alpha - k * beta) / abs(gap)
-        turned = (middle - centre) * np.conj(direction)
+        turned = (g0 - centre) * np.conj(direction)
         if gap > 0:
-            inside = _farthest(turned, semi_major, semi_minor) <= radius
+            holds = _farthest(turned, semi_major, semi_minor) <= radius
         else:
-            inside = _nearest(turned, semi_major, semi_minor) >= radius
-        if inside:
+            holds = _nearest(turned, semi_major, semi_minor) >= radius
+        if holds:
             high = mid
         else:
             low = mid

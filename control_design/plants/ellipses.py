@@ -1,7 +1,11 @@
 """Ellipses of frequency-response uncertainty and the exact geometry control needs of them.
 
-One frequency, one filled ellipse E = {centre + u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1} in the complex
-plane, |u1| = 1, s1 >= s2 >= 0. Exact up to rounding: no sampling of the boundary, no enclosing disc.
+At every frequency the plant's response G is known up to one filled ellipse in the complex plane, E = {centre
++ u1 s1 d1 + j u1 s2 d2 : d1^2 + d2^2 <= 1}, with |u1| = 1 and s1 >= s2 >= 0. `Ellipses` holds F of them. The
+functions below it answer what a certificate asks of an ellipse and a controller value k: how near the loop
+comes to -1 (`distance_to_minus_one`), by how much the ellipse may grow until it does (`scale_to_minus_one`),
+and the largest closed-loop gain (`largest_ratio`). All are exact up to rounding: no sampling of the boundary,
+no enclosing disc. The loops over elements are compiled (`ellipse_kernels`).
 """
 
 from __future__ import annotations
@@ -19,42 +23,82 @@ Complex = npt.NDArray[np.complex128]
 Integer = npt.NDArray[np.int64]
 Boolean = npt.NDArray[np.bool_]
 
+# A covariance may be off symmetry or definiteness by this share of its larger eigenvalue: products of factors
+# of a few hundred coefficients leave 1e-13, stored files of nine digits 1e-9. Larger errors are mistakes.
+_ROUNDING_SHARE = 1e-9
+
 
 def radius_of(level: float) -> float:
-    """Radius, in standard deviations, of the ellipse that holds a plane Gaussian with probability level."""
+    """Radius, in standard deviations, of the ellipse that holds a Gaussian of the plane with probability
+    `level` in (0, 1): the root of the chi-square quantile with two degrees of freedom, 2.45 for .95."""
     return float(np.sqrt(-2.0 * np.log1p(-level)))
 
 
 def quotient(above: Any, below: Real, otherwise: float = 0.0) -> Any:
-    """above/below where below is positive, `otherwise` elsewhere; real or complex, shapes broadcast."""
+    """above/below where below is positive, `otherwise` elsewhere.
+
+    above is real or complex, below real; their shapes broadcast and no warning is given.
+    """
+    positive = below > 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return np.where(below > 0, above / np.where(below > 0, below, 1.0), otherwise)
+        ratio = above / np.where(positive, below, 1.0)
+        return np.where(positive, ratio, otherwise)
 
 
 class ResponseSet(Protocol):
-    """omega_rad_s (F,), centre (F,) complex, covariance (F, 2, 2) of (real, imaginary), level in (0, 1)."""
+    """Uncertain responses on frequencies of their own, as a record of `ident` holds them."""
 
     @property
-    def omega_rad_s(self) -> Real: ...
+    def omega_rad_s(self) -> Real:
+        """Ascending frequencies (F,) in rad/s."""
+        ...
+
     @property
-    def centre(self) -> Complex: ...
+    def centre(self) -> Complex:
+        """Middle of the response (F,), units of output per input."""
+        ...
+
     @property
-    def covariance(self) -> Real: ...
+    def covariance(self) -> Real:
+        """Covariance (F, 2, 2) of real and imaginary part."""
+        ...
+
     @property
-    def level(self) -> float: ...
+    def level(self) -> float:
+        """Probability in (0, 1) that an ellipse of the record holds the response."""
+        ...
 
 
 @runtime_checkable
 class EvaluableUncertainty(Protocol):
     """Uncertainty known at any frequency; `ident.uncertainty.ResponsePosterior` is one."""
 
-    def at(self, omega_rad_s: Real, level: float) -> ResponseSet: ...
+    def at(self, omega_rad_s: Real, level: float) -> ResponseSet:
+        """Responses and covariances at omega (F,) in rad/s, for ellipses of that level."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipses:
-    """Filled uncertainty ellipses: omega_rad_s (F,) ascending, centre (F,), semi_major >= semi_minor >= 0
-    (F,), direction (F,) of the major axis, of modulus one; the minor axis is 1j * direction."""
+    """Filled uncertainty ellipses, one at each of F frequencies.
+
+    Parameters
+    ----------
+    omega_rad_s : (F,) array
+        Ascending, not negative.
+    centre : (F,) complex array
+        Middle of the response, units of output per input.
+    semi_major, semi_minor : (F,) array
+        Lengths of the half axes, semi_major >= semi_minor >= 0.
+    direction : (F,) complex array
+        Direction of the major axis, of modulus one (not checked); the minor axis is 1j * direction.
+
+    Raises
+    ------
+    ValueError
+        For arrays of different shapes, frequencies that do not ascend, a centre that is not finite, or axes
+        that are negative or exchanged.
+    """
 
     omega_rad_s: Real
     centre: Complex
@@ -63,6 +107,7 @@ class Ellipses:
     direction: Complex
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check them."""
         lock(self, "omega_rad_s", "semi_major", "semi_minor")
         lock(self, "centre", "direction", dtype=np.complex128)
         shapes = {field.name: getattr(self, field.name).shape for field in fields(self)}
@@ -79,144 +124,217 @@ class Ellipses:
 
     @classmethod
     def from_covariance(cls, omega_rad_s: Real, centre: Complex, covariance: Real, level: float) -> Ellipses:
-        """Ellipse e^T P^-1 e <= -2 ln(1 - level) of covariance P (F, 2, 2). Raises ValueError if level is
-        outside (0, 1) or a covariance is not symmetric positive semi-definite (names the frequency)."""
+        """Ellipses that hold a Gaussian response with probability `level`.
+
+        Parameters
+        ----------
+        omega_rad_s : (F,) array
+            Ascending frequencies.
+        centre : (F,) complex array
+            Mean of the response.
+        covariance : (F, 2, 2) array
+            P, of real and imaginary part.
+        level : float
+            Probability in (0, 1).
+
+        Returns
+        -------
+        Ellipses
+            e^T P^-1 e <= -2 ln(1 - level).
+
+        Raises
+        ------
+        ValueError
+            For a level outside (0, 1), or a covariance that is not symmetric positive semi-definite within
+            rounding (the line names the frequency).
+        """
         if not 0 < level < 1:
             raise ValueError(f"uncertainty: level must lie in (0, 1); got {level}")
         covariance = np.asarray(covariance, dtype=np.float64)
         if covariance.shape != (np.size(omega_rad_s), 2, 2):
             raise ValueError(f"uncertainty: covariance must be (F, 2, 2); got {covariance.shape}")
-        a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-        trace = a + d
-        large = trace / 2 + np.hypot((a - d) / 2, b)
-        # small = determinant / large keeps the relative accuracy of thin ellipses.
-        determinant = a * d - b * covariance[:, 1, 0]
+        real_variance = covariance[:, 0, 0]
+        cross = covariance[:, 0, 1]
+        cross_below = covariance[:, 1, 0]
+        imag_variance = covariance[:, 1, 1]
+        trace = real_variance + imag_variance
+        difference = real_variance - imag_variance
+        # Eigenvalues of the 2 x 2 matrix. The smaller one as determinant over the larger one keeps its
+        # relative accuracy for thin ellipses, where a difference would leave rounding only.
+        large = trace / 2 + np.hypot(difference / 2, cross)
+        determinant = real_variance * imag_variance - cross * cross_below
         small = quotient(determinant, large)
-        tolerance = 1e-9 * np.abs(large) + 1e-300
-        good = (
-            np.isfinite(trace)
-            & (large >= 0)
-            & (small >= -tolerance)
-            & (np.abs(b - covariance[:, 1, 0]) <= tolerance)
-        )
+        tolerance = _ROUNDING_SHARE * np.abs(large) + 1e-300
+        symmetric = np.abs(cross - cross_below) <= tolerance
+        good = np.isfinite(trace) & (large >= 0) & (small >= -tolerance) & symmetric
         if not np.all(good):
             worst = float(np.asarray(omega_rad_s)[np.argmin(good)])
             raise ValueError(
                 f"uncertainty: covariance at {worst:.4g} rad/s is not symmetric positive semi-definite"
             )
-        quantile, angle = radius_of(level) ** 2, 0.5 * np.arctan2(2 * b, a - d)
+        quantile = radius_of(level) ** 2
+        angle = 0.5 * np.arctan2(2 * cross, difference)
         semi_major = np.sqrt(quantile * large)
-        semi_minor = np.minimum(np.sqrt(quantile * np.maximum(small, 0.0)), semi_major)
+        semi_minor = np.sqrt(quantile * np.maximum(small, 0.0))
+        # A circle's axes may come out exchanged by a rounding error.
+        semi_minor = np.minimum(semi_minor, semi_major)
         return cls(np.asarray(omega_rad_s), centre, semi_major, semi_minor, np.exp(1j * angle))
 
     @classmethod
     def of_no_size(cls, omega_rad_s: Real, response: Complex) -> Ellipses:
-        """A response that is known exactly, (F,)."""
+        """Ellipses of size zero around a response (F,) that is known exactly at omega (F,) in rad/s."""
         zero = np.zeros(omega_rad_s.size)
         return cls(omega_rad_s, response, zero, zero, np.ones(zero.size, np.complex128))
 
     def scaled(self, factor: float) -> Ellipses:
-        """Axes times a factor."""
+        """Ellipses with both axes times a factor >= 0, their centres where they are."""
         return replace(self, semi_major=factor * self.semi_major, semi_minor=factor * self.semi_minor)
 
     def subset(self, index: Integer | Boolean) -> Ellipses:
-        """The ellipses at the given positions."""
+        """The ellipses at the given positions (N,), integers or a mask (F,)."""
         return Ellipses(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def joined(self, other: Ellipses) -> Ellipses:
-        """These and others, at other frequencies, in ascending order."""
+        """Ellipses of both objects in ascending order of frequency; ValueError where they have one in
+        common."""
         order = np.argsort(np.concatenate([self.omega_rad_s, other.omega_rad_s]))
-        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
-        return Ellipses(*(np.concatenate(pair)[order] for pair in pairs))
+        values = []
+        for field in fields(self):
+            both_values = np.concatenate([getattr(self, field.name), getattr(other, field.name)])
+            values.append(both_values[order])
+        return Ellipses(*values)
 
     def points(self, d1: Real, d2: Real) -> Complex:
-        """Members centre + u1 s1 d1 + j u1 s2 d2; d1, d2 broadcast against (F,) on the last axis."""
-        return np.asarray(
-            self.centre + self.direction * (self.semi_major * d1 + 1j * self.semi_minor * d2),
-            dtype=np.complex128,
-        )
+        """Members centre + u1 s1 d1 + j u1 s2 d2, (..., F) complex.
+
+        d1, d2 : (..., F) arrays
+            Coordinates along major and minor axis in units of the half axes; in the ellipse for
+            d1^2 + d2^2 <= 1.
+        """
+        offset = self.semi_major * d1 + 1j * self.semi_minor * d2
+        return np.asarray(self.centre + self.direction * offset, dtype=np.complex128)
 
     def farthest(self) -> Real:
-        """max |G| over each ellipse, (F,)."""
-        return farthest_distance(-self.centre * np.conj(self.direction), self.semi_major, self.semi_minor)
+        """Largest |G| over each ellipse, (F,)."""
+        origin_seen_from_ellipse = -self.centre * np.conj(self.direction)
+        return farthest_distance(origin_seen_from_ellipse, self.semi_major, self.semi_minor)
 
 
 def _compiled() -> Any:
-    """The compiled functions, imported where one is called."""
+    """Module of the compiled functions. It is imported where one is called, because numba takes a second."""
     from control_design.plants import ellipse_kernels
 
     return ellipse_kernels
 
 
 def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
-    """Root t >= 0 (F,) of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the sum is below 1
-    there."""
-    with np.errstate(all="ignore"):  # compiled loops divide first and choose then
+    """Root t >= 0 (F,) of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d (F,), none negative; 0 where the
+    left side is below 1 at t = 0. The condition of a nearest or farthest point of an ellipse comes to it."""
+    # Compiled loops divide first and choose then.
+    with np.errstate(all="ignore"):
         return np.asarray(_compiled().root_of_each(p, q, c, d), dtype=np.float64)
 
 
 def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
-    """Distance (F,) from `point` to the filled axis-parallel ellipse at the origin; 0 inside. The nearest
-    point is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), t the `secular_root`."""
+    """Distance (F,) from complex points (F,) to filled ellipses at the origin whose axes are parallel to the
+    coordinate axes; 0 inside.
+
+    With half axes a, b and the point (x, y), the nearest member is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), where
+    t is the `secular_root` for p = a x, q = b y, c = a^2, d = b^2.
+    """
     with np.errstate(all="ignore"):
         return np.asarray(_compiled().nearest_of_each(point, semi_major, semi_minor), dtype=np.float64)
 
 
 def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
-    """Distance (F,) from `point` to the farthest point of the axis-parallel ellipse at the origin: with x, y
-    >= 0 the multiplier m is the largest root of (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1, n = m - a^2 a
-    `secular_root`."""
+    """Distance (F,) from complex points (F,) to the farthest members of ellipses at the origin whose axes are
+    parallel to the coordinate axes.
+
+    With half axes a >= b and the point (x, y) in the first quadrant, the multiplier m is the largest root of
+    (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1, so n = m - a^2 is a `secular_root` for c = 0, d = a^2 - b^2.
+    """
     with np.errstate(all="ignore"):
         return np.asarray(_compiled().farthest_of_each(point, semi_major, semi_minor), dtype=np.float64)
 
 
 def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
-    """min |1 + G k| over G in E, (F,), exact; 0 where some member puts the loop on -1. k (F,): the controller
-    with its delay."""
+    """Smallest |1 + G k| over G in each ellipse, (F,), exact; 0 where some member puts the loop on -1.
+
+    k : (F,) complex array
+        The controller's response with its delay, at the frequencies of the ellipses.
+    """
     size = np.abs(k)
-    # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2); work with k (centre + 1/k) = 1 + k centre.
+    # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2). With k (centre + 1/k) = 1 + k centre the
+    # formula holds for k = 0 too, where the distance is one.
     turned = quotient((1.0 + k * ellipses.centre) * np.conj(k * ellipses.direction), size, 1.0)
     return nearest_distance(turned, size * ellipses.semi_major, size * ellipses.semi_minor)
 
 
 def scale_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
-    """Factor (F,) on each ellipse's axes with which it just reaches -1 with K: below 1 it covers -1, the
-    deeper the smaller; inf where no size of it does (K = 0, or an axis of no length in the way)."""
+    """Factor (F,) on the axes of each ellipse with which the loop of its members just reaches -1.
+
+    k : (F,) complex array
+        The controller's response with its delay.
+
+    Below 1 the ellipse covers -1, the deeper the smaller; inf where no size of it does (k = 0, or an axis of
+    length zero in the way).
+    """
+    # -1/k seen from the ellipse: its coordinates along the axes, in units of the half axes.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         turned = (1.0 + k * ellipses.centre) * np.conj(ellipses.direction) / k
-        sides = [
-            np.where(part == 0, 0.0, np.abs(part) / axis)
-            for part, axis in ((turned.real, ellipses.semi_major), (turned.imag, ellipses.semi_minor))
-        ]
-    scale = np.hypot(*sides)
-    return np.asarray(np.where((k == 0) | np.isnan(scale), np.inf, scale), dtype=np.float64)
+        # An axis of length zero is no obstacle where nothing is to be reached along it.
+        along_major = np.where(turned.real == 0, 0.0, np.abs(turned.real) / ellipses.semi_major)
+        along_minor = np.where(turned.imag == 0, 0.0, np.abs(turned.imag) / ellipses.semi_minor)
+    scale = np.hypot(along_major, along_minor)
+    unreachable = (k == 0) | np.isnan(scale)
+    return np.asarray(np.where(unreachable, np.inf, scale), dtype=np.float64)
 
 
 def largest_disturbance_gain(k: Complex, ellipses: Ellipses) -> Real:
-    """max |G / (1 + G k)| over G in E at every frequency, (F,); see `largest_ratio`."""
+    """Largest |G / (1 + G k)| over G in each ellipse, (F,): `largest_ratio` with alpha = 1, beta = 0."""
     return largest_ratio(np.ones_like(k), np.zeros_like(k), k, ellipses)
 
 
 def largest_ratio(
     alpha: Complex, beta: Complex, k: Complex, ellipses: Ellipses, *, accuracy: float = 1e-13
 ) -> Real:
-    """max |alpha G + beta| / |1 + k G| over G in E at every frequency, (F,), rounded up by at most the
-    relative accuracy; inf where some member has 1 + k G = 0.
+    """Largest |alpha G + beta| / |1 + k G| over G in each ellipse.
 
-    With A = |alpha|^2 - h^2 |k|^2, |alpha G + beta| <= h |1 + k G| is an Apollonius set: |G - g0| <= r for A
-    > 0, >= r for A < 0, with g0 = (h^2 conj(k) - conj(alpha) beta)/A and r = h |alpha - k beta|/|A|. The
-    ellipse lies in it or not by its exact nearest/farthest distance from g0; h by bisection from the centre's
-    value to (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
+    Parameters
+    ----------
+    alpha, beta : (F,) complex array
+        Linear numerator: 1 and 0 for the gain from a disturbance, 0 and 1 for the sensitivity.
+    k : (F,) complex array
+        The controller's response with its delay.
+    ellipses : Ellipses
+        Of the plant at F frequencies.
+    accuracy : float
+        Relative; the bisection ends there.
+
+    Returns
+    -------
+    (F,) array
+        Rounded up by at most the accuracy; inf where some member has 1 + k G = 0.
+
+    Notes
+    -----
+    |alpha G + beta| <= h |1 + k G| is an Apollonius set. With A = |alpha|^2 - h^2 |k|^2,
+    g0 = (h^2 conj(k) - conj(alpha) beta)/A and r = h |alpha - k beta|/|A| it is |G - g0| <= r for A > 0 and
+    |G - g0| >= r for A < 0. Whether the ellipse lies in it is told by its exact farthest or nearest distance
+    from g0. The smallest such h is found by bisection, from the value at the centre up to
+    (|alpha centre + beta| + |alpha| semi_major)/min|1 + k G|.
     """
-    e = ellipses
-    distance = distance_to_minus_one(k, e)
+    distance = distance_to_minus_one(k, ellipses)
     blocked = distance <= 0.0
-    centre_value = np.abs(alpha * e.centre + beta)
-    upper = (centre_value + np.abs(alpha) * e.semi_major) / np.where(blocked, 1.0, distance)
-    low = centre_value / np.maximum(np.abs(1.0 + k * e.centre), 1e-300)
+    centre_numerator = np.abs(alpha * ellipses.centre + beta)
+    centre_denominator = np.abs(1.0 + k * ellipses.centre)
+    largest_numerator = centre_numerator + np.abs(alpha) * ellipses.semi_major
+    upper = largest_numerator / np.where(blocked, 1.0, distance)
+    low = centre_numerator / np.maximum(centre_denominator, 1e-300)
+    # A little above, so that rounding of the two ends does not begin the bisection with an empty interval.
     high = np.maximum(upper, low) * (1 + 1e-12) + 1e-300
     low = np.minimum(low, high)
-    shape = e.centre, e.direction, e.semi_major, e.semi_minor
+    shape = (ellipses.centre, ellipses.direction, ellipses.semi_major, ellipses.semi_minor)
     with np.errstate(all="ignore"):
         high = _compiled().bisected(low, high, alpha, beta, k, *shape, accuracy)
     return np.asarray(np.where(blocked, np.inf, high), dtype=np.float64)

@@ -1,4 +1,11 @@
-"""A plant with U inputs and Y outputs, and what is not known of its response matrix."""
+"""A plant with U inputs and Y outputs, and what is not known of its response matrix.
+
+The response matrix of several joints has uncertainty of two kinds. A `ResponseBall` holds what the
+identification leaves open: all entries of the matrix together, as a ball of the Frobenius norm behind left
+and right factors. Errors of single channels (an actuator's gain, a sensor's) are weights, each with a complex
+uncertainty of its own. `MultivariablePlant` puts both beside the nominal model and turns them into the blocks
+that the scaled bound of `scaled_bound` works on.
+"""
 
 from __future__ import annotations
 
@@ -19,32 +26,76 @@ if TYPE_CHECKING:
     import control
 
 
+# The Tustin map takes the Nyquist frequency to infinity; beyond this multiple of 1/dt a proper weight has its
+# value at infinity within nine digits.
+_INFINITE_S_DT = 1e9
+
+# A frequency asked for is one of the ball's own within this share: files round to nine digits or so.
+_SAME_FREQUENCY_SHARE = 1e-8
+
+# Zeros farther out in z are at infinity: rounding of the generalised eigenvalue problem.
+_INFINITE_ZERO = 1e4
+
+
 def tustin_s(omega_rad_s: Real, dt_s: float) -> Complex:
-    """s = j (2/dt) tan(omega dt/2) (F,), in which weights and controllers are written; 1e9/dt at most."""
+    """s = j (2/dt) tan(omega dt/2), (F,) complex in rad/s, in which weights and controllers are written.
+
+    omega_rad_s (F,), dt_s in seconds. At most 1e9/dt, where the tangent goes to infinity at Nyquist.
+    """
+    largest = _INFINITE_S_DT / dt_s
     with np.errstate(over="ignore"):
         size = 2.0 / dt_s * np.tan(np.asarray(omega_rad_s, dtype=np.float64) * dt_s / 2)
-    return 1j * np.where(np.abs(size) > 1e9 / dt_s, 1e9 / dt_s, size)
+    return 1j * np.where(np.abs(size) > largest, largest, size)
 
 
 class IdentifiedMatrix(Protocol):
     """What a ball needs of an identified matrix response (`ident.uncertainty` has it)."""
 
     @property
-    def dt_s(self) -> float: ...
+    def dt_s(self) -> float:
+        """Sampling period in seconds."""
+        ...
+
     @property
-    def output_factor(self) -> Real: ...
-    def input_factor(self, lowest_rad_s: float) -> tuple[Real, Real, Real, Real]: ...
-    def largest_radius(self, lowest_rad_s: float) -> float: ...
+    def output_factor(self) -> Real:
+        """Lo (Y, P), a factor of the covariance between outputs."""
+        ...
+
+    def input_factor(self, lowest_rad_s: float) -> tuple[Real, Real, Real, Real]:
+        """State-space matrices A, B, C, D of the stable Li(z) with U inputs, kept constant below a
+        frequency."""
+        ...
+
+    def largest_radius(self, lowest_rad_s: float) -> float:
+        """Radius of the ball that holds the response at every frequency from lowest_rad_s on."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
 class ResponseBall:
-    """G + Lo Delta Li with |Delta|_F <= radius at every frequency; `of` makes one of an identified response.
+    """Responses G + Lo Delta Li with |Delta|_F <= radius at every frequency; `of` makes a ball of an
+    identified response.
 
-    Lo (Y, P); Li: stable discrete `control.StateSpace` with U inputs, or an array (F, Q, U) at omega_rad_s
-    (F,) [rad/s], between which nothing is known. radius: for a Kronecker covariance Lo Lo^H (x) Li^H Li,
-    sqrt(chi^2 quantile / 2) with 2 U Y degrees of freedom. lowest_rad_s: below it the ball says nothing, and
-    certificates begin there. Raises ValueError for shapes that do not fit.
+    Parameters
+    ----------
+    Lo : (Y, P) array
+        Factor at the outputs.
+    Li : control.StateSpace or (F, Q, U) complex array
+        Factor at the inputs: stable and discrete with U inputs, or its values at omega_rad_s, between which
+        nothing is known.
+    radius : float
+        Positive. For a Kronecker covariance Lo Lo^H (x) Li^H Li it is sqrt(chi^2 quantile / 2) with 2 U Y
+        degrees of freedom.
+    omega_rad_s : (F,) array or None
+        Ascending and positive, at least two, for values; None for a state space.
+    lowest_rad_s : float
+        Below it the ball says nothing, and certificates begin there.
+
+    Raises
+    ------
+    ValueError
+        For shapes that do not fit, values that are not finite, an unstable Li or a radius that is not
+        positive.
     """
 
     Lo: Real
@@ -54,6 +105,7 @@ class ResponseBall:
     lowest_rad_s: float = 0.0
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check them."""
         lock(self, "Lo")
         if self.Lo.ndim != 2 or not np.all(np.isfinite(self.Lo)):
             raise ValueError(f"Lo must be a finite matrix (Y, P); got shape {self.Lo.shape}")
@@ -76,27 +128,35 @@ class ResponseBall:
 
     @classmethod
     def of(cls, posterior: IdentifiedMatrix, lowest_rad_s: float) -> ResponseBall:
-        """Of an identified matrix response, from lowest_rad_s on: Li exact, the radius the largest of a
-        grid.
+        """Ball of an identified matrix response; Li is exact, the radius the largest of a grid of
+        frequencies.
 
-        lowest_rad_s: the slowest motion that the records tell, 2 pi over the length of the longest, or the
-        lowest frequency that was excited. Below, an integrator's uncertainty grows without bound and is kept
-        as it is there. Lower values widen every ball (one radius for all), higher ones leave more unchecked.
+        Parameters
+        ----------
+        posterior : IdentifiedMatrix
+            Gives the factors and the radius.
+        lowest_rad_s : float
+            The slowest motion that the records tell: 2 pi over the length of the longest, or the lowest
+            frequency that was excited. Below, an integrator's uncertainty grows without bound and is kept as
+            it is there. Lower values widen every ball (one radius for all), higher ones leave more unchecked.
         """
-        import control  # here, because it brings a plotting library with it
+        # Imported here, because it brings a plotting library with it.
+        import control
 
         li = control.ss(*posterior.input_factor(lowest_rad_s), posterior.dt_s, remove_useless_states=False)
         radius = posterior.largest_radius(lowest_rad_s)
         return cls(posterior.output_factor, li, radius, lowest_rad_s=lowest_rad_s)
 
     def gram(self, omega_rad_s: Real) -> Complex:
-        """radius^2 Li^H Li (F, U, U)."""
+        """radius^2 Li^H Li, (F, U, U) complex, at omega (F,) in rad/s. Raises ValueError at a frequency
+        between those that values are given at."""
         if self.omega_rad_s is None:
             values = matrix_response(self.Li, omega_rad_s)
         else:
-            own = self.omega_rad_s
-            index = np.clip(np.searchsorted(own, omega_rad_s * (1 - 1e-9)), 0, own.size - 1)
-            if np.any(np.abs(own[index] - omega_rad_s) > 1e-8 * omega_rad_s):
+            grid = self.omega_rad_s
+            # A little below what is asked for, so that rounding does not take the next one.
+            index = np.clip(np.searchsorted(grid, omega_rad_s * (1 - 1e-9)), 0, grid.size - 1)
+            if np.any(np.abs(grid[index] - omega_rad_s) > _SAME_FREQUENCY_SHARE * omega_rad_s):
                 raise ValueError("the uncertainty is known on its own frequencies only; ask there")
             values = self.Li[index]
         return self.radius**2 * conjugate(values) @ values
@@ -104,13 +164,28 @@ class ResponseBall:
 
 @dataclass(frozen=True, eq=False)
 class MultivariablePlant(NominalPlant):
-    """Nominal plant (discrete `control.StateSpace`, dt in seconds) and its uncertainty: U inputs, Y outputs,
-    u = -K y.
+    """Plant with U inputs and Y outputs and its uncertainty, under the law u = -K y.
 
-    ball: of the response matrix, or None. input_error, output_error: a weight per actuator or sensor, or (),
-    one of the two: that channel's gain is (1 + w Delta), |Delta| <= 1 complex, each by itself. Poles at z = 1
-    are allowed. Neglected: products of the ball and a channel's error. Raises ValueError for a plant that is
-    not discrete, not finite, or whose parts do not fit.
+    Parameters
+    ----------
+    name : str
+        Errors name the plant by it.
+    nominal : control.StateSpace
+        Discrete, dt in seconds. Poles at z = 1 are allowed.
+    ball : ResponseBall or None
+        Uncertainty of the response matrix.
+    input_error, output_error : tuple of RationalWeight
+        A weight for each actuator or sensor, or (): that channel's gain is (1 + w Delta), |Delta| <= 1
+        complex, each by itself. One of the two only.
+
+    Raises
+    ------
+    ValueError
+        For a plant that is not discrete or not finite, or whose parts do not fit.
+
+    Notes
+    -----
+    Neglected: products of the ball and a channel's error.
     """
 
     name: str
@@ -120,21 +195,25 @@ class MultivariablePlant(NominalPlant):
     output_error: tuple[RationalWeight, ...] = ()
 
     def __post_init__(self) -> None:
-        import control  # here, because it brings a plotting library with it
+        """Check the parts against one another."""
+        # Imported here, because it brings a plotting library with it.
+        import control
 
         system = self.nominal
         if not isinstance(system, control.StateSpace):
             raise ValueError(f"the nominal plant must be a control.StateSpace; got {type(system).__name__}")
         if system.dt is None or system.dt is True or not system.dt > 0:
             raise ValueError(f"the nominal plant must be discrete with dt in seconds; got dt = {system.dt}")
-        if not all(np.all(np.isfinite(getattr(system, each))) for each in "ABCD"):
+        if not all(np.all(np.isfinite(getattr(system, matrix))) for matrix in "ABCD"):
             raise ValueError(f"plant {self.name!r} has a value that is not finite")
-        for words, given, count in (
+        for field_name, weights, count in (
             ("input_error", self.input_error, self.inputs),
             ("output_error", self.output_error, self.outputs),
         ):
-            if len(given) not in (0, count):
-                raise ValueError(f"plant {self.name!r}: {words} needs {count} weights; got {len(given)}")
+            if len(weights) not in (0, count):
+                raise ValueError(
+                    f"plant {self.name!r}: {field_name} needs {count} weights; got {len(weights)}"
+                )
         if self.input_error and self.output_error:
             raise ValueError(f"plant {self.name!r}: give input_error or output_error, not both")
         if self.ball is not None and not isinstance(self.ball, ResponseBall):
@@ -144,7 +223,10 @@ class MultivariablePlant(NominalPlant):
             )
         if self.ball is not None:
             li = self.ball.Li
-            columns = li.ninputs if self.ball.omega_rad_s is None else li.shape[2]
+            if self.ball.omega_rad_s is None:
+                columns = li.ninputs
+            else:
+                columns = li.shape[2]
             if self.ball.Lo.shape[0] != self.outputs or columns != self.inputs:
                 raise ValueError(
                     f"plant {self.name!r} has {self.outputs} outputs and {self.inputs} inputs; "
@@ -153,62 +235,92 @@ class MultivariablePlant(NominalPlant):
 
     @property
     def inputs(self) -> int:
+        """Number of inputs U."""
         return int(self.nominal.ninputs)
 
     @property
     def outputs(self) -> int:
+        """Number of outputs Y."""
         return int(self.nominal.noutputs)
 
     @property
     def own_grid(self) -> Real | None:
-        """Frequencies where alone the uncertainty is known, or None."""
-        return None if self.ball is None else self.ball.omega_rad_s
+        """Frequencies (F,) in rad/s where alone the uncertainty is known, or None: it is known everywhere."""
+        if self.ball is None:
+            return None
+        return self.ball.omega_rad_s
 
     @cached_property
     def zeros(self) -> Complex:
-        """Transmission zeros in z of a square plant; none otherwise."""
+        """Transmission zeros in z, (N,) complex, of a plant with as many inputs as outputs; none otherwise.
+
+        They are the finite generalised eigenvalues of the pencil [A - zI, B; C, D].
+        """
         if self.inputs != self.outputs or self.nominal.nstates == 0:
             return np.zeros(0, complex)
-        a, b, c, d = (np.asarray(getattr(self.nominal, each), dtype=np.float64) for each in "ABCD")
+        a, b, c, d = (np.asarray(getattr(self.nominal, matrix), dtype=np.float64) for matrix in "ABCD")
         n, m = b.shape
+        system_matrix = np.block([[a, b], [c, d]])
+        states_only = scipy.linalg.block_diag(np.eye(n), np.zeros((m, m)))
         with np.errstate(divide="ignore", invalid="ignore"):
-            found = scipy.linalg.eigvals(
-                np.block([[a, b], [c, d]]), scipy.linalg.block_diag(np.eye(n), np.zeros((m, m)))
-            )
-        return np.asarray(found[np.isfinite(found) & (np.abs(found) < 1e4)])
+            zeros = scipy.linalg.eigvals(system_matrix, states_only)
+        is_finite = np.isfinite(zeros) & (np.abs(zeros) < _INFINITE_ZERO)
+        return np.asarray(zeros[is_finite])
 
     def blocks(self, omega_rad_s: Real, delay_samples: int = 0) -> tuple[Complex, Complex, Complex]:
-        """Nominal response (F, Y, U) behind the delay, and the Gram matrices seen (F, N, U, U) and entering
-        (F, N, Y, Y) of `scaled_bound.BoundRows`: the ball first, actuators, sensors."""
+        """Nominal response and the Gram matrices of N uncertain blocks: the ball first, then actuators,
+        sensors.
+
+        Parameters
+        ----------
+        omega_rad_s : (F,) array
+            Frequencies.
+        delay_samples : int
+            Computational delay in front of the plant.
+
+        Returns
+        -------
+        G : (F, Y, U) complex array
+            Nominal response behind the delay.
+        seen : (F, N, U, U) complex array
+            L_i^H L_i of each block B_i Delta_i L_i: what it sees of the input.
+        entering : (F, N, Y, Y) complex array
+            B_i B_i^H: how it enters the output. Both are fields of `scaled_bound.BoundRows`.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        late = np.exp(-1j * omega * self.dt_s * delay_samples)[:, None, None]
-        G = matrix_response(self.nominal, omega) * late
+        delay_response = np.exp(-1j * omega * self.dt_s * delay_samples)[:, None, None]
+        G = matrix_response(self.nominal, omega) * delay_response
         s = tustin_s(omega, self.dt_s)
+        input_square = (omega.size, self.inputs, self.inputs)
+        output_square = (omega.size, self.outputs, self.outputs)
         seen: list[Any] = []
         entering: list[Any] = []
         if self.ball is not None:
             seen.append(self.ball.gram(omega))
-            entering.append(np.broadcast_to(self.ball.Lo @ self.ball.Lo.T, (omega.size, *G.shape[1:2] * 2)))
+            entering.append(np.broadcast_to(self.ball.Lo @ self.ball.Lo.T, output_square))
+        # An actuator's error sees its own input only and enters through that column of G.
         for i, weight in enumerate(self.input_error):
             size = np.abs(weight.at(s))[:, None, None] ** 2
-            axis = np.zeros((self.inputs, self.inputs))
+            axis = np.zeros(input_square[1:])
             axis[i, i] = 1.0
-            seen.append(np.broadcast_to(axis, (omega.size, *axis.shape)))
+            seen.append(np.broadcast_to(axis, input_square))
             entering.append(size * G[:, :, i, None] * np.conj(G[:, None, :, i]))
+        # A sensor's error sees the inputs through that row of G and enters at its own output.
         for i, weight in enumerate(self.output_error):
             size = np.abs(weight.at(s))[:, None, None] ** 2
-            axis = np.zeros((self.outputs, self.outputs))
+            axis = np.zeros(output_square[1:])
             axis[i, i] = 1.0
             seen.append(size * np.conj(G[:, i, :, None]) * G[:, None, i, :])
-            entering.append(np.broadcast_to(axis, (omega.size, *axis.shape)))
-        empty = np.zeros((omega.size, 0))
+            entering.append(np.broadcast_to(axis, output_square))
 
-        def stacked(parts: list[Any], size: int) -> Complex:
-            together = np.stack(parts, axis=1) if parts else empty[:, :, None, None] * np.zeros((size, size))
-            return np.asarray(together, dtype=np.complex128)
+        def stacked(blocks: list[Any], shape: tuple[int, int, int]) -> Complex:
+            """Blocks of a shape (F, n, n) as one array (F, N, n, n); N = 0 for none."""
+            if blocks:
+                return np.asarray(np.stack(blocks, axis=1), dtype=np.complex128)
+            return np.zeros((shape[0], 0, *shape[1:]), dtype=np.complex128)
 
-        return G, stacked(seen, self.inputs), stacked(entering, self.outputs)
+        return G, stacked(seen, input_square), stacked(entering, output_square)
 
     def delayed(self, samples: int) -> control.StateSpace:
-        """The nominal behind the computational delay."""
+        """The nominal system behind a computational delay of whole samples."""
         return delayed(self.nominal, samples)

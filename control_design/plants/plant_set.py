@@ -1,4 +1,12 @@
-"""The uncertain plant: a nominal state space for the poles, ellipses for what must hold on the machine."""
+"""The uncertain plant: a nominal state space for the poles, ellipses for what must hold on the machine.
+
+A design needs two things of a plant. Its nominal model, a discrete state space, tells how often the loop must
+wind around -1 (`unstable_poles`, `n_integrators`) and where modes and zeros lie. Its uncertainty tells where
+the true response may be at each frequency (`at` gives `Ellipses`). `PlantChannel` is one response with its
+uncertainty, `UncertainPlant` a whole plant: the measured output and, where the damped point of the machine is
+another one, a second channel for it. Below them stand the functions that evaluate, delay and classify a
+discrete system without losing the digits of slow poles.
+"""
 
 from __future__ import annotations
 
@@ -16,13 +24,42 @@ if TYPE_CHECKING:
     import control
 
 
+# A frequency is one of a record's own, and inside its range, within this share: files round to ten digits or
+# so.
+_SAME_FREQUENCY_SHARE = 1e-9
+
+# Frequencies evaluated at once: bounds the memory of the batch (n x n complex matrices of each), 13 MB at
+# twenty states. No digit depends on it.
+_BATCH_FREQUENCIES = 2048
+
+# A pole in z with a smaller imaginary part is real, one nearer to z = 0 has died out within a sample.
+_REAL_BELOW = 1e-9
+_DEADBEAT_BELOW = 1e-6
+
+# Zeros farther out in z are at infinity: rounding of a zero that the discrete system does not have.
+_INFINITE_ZERO = 1e4
+
+# A nominal pole nearer to the unit circle than this counts as on it: its response there is 1e10 times larger.
+_ON_CIRCLE_DISTANCE = 1e-10
+
+# (number of poles, distance from z = 1 within which all of them lie): how far rounding splits a multiple
+# pole, the n-th root of 1e-15 with a factor of a hundred to a million in hand.
+_INTEGRATOR_CLUSTERS = ((3, 1e-3), (2, 1e-5), (1, 1e-9))
+
+# The mean of such a cluster stays accurate to rounding; poles whose mean is farther from z = 1 are slow
+# poles.
+_INTEGRATOR_MEAN_DISTANCE = 1e-9
+
+
 class NominalPlant:
-    """What follows from a discrete nominal `control.StateSpace` alone."""
+    """What follows from a discrete nominal `control.StateSpace` alone; base of plants with one or more
+    inputs."""
 
     nominal: control.StateSpace
 
     @property
     def dt_s(self) -> float:
+        """Sampling period in seconds."""
         return float(self.nominal.dt)
 
     @cached_property
@@ -32,22 +69,42 @@ class NominalPlant:
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the nominal, below the Nyquist frequency."""
-        return tuple(m for m in modes_of(self.poles, self.dt_s) if m.omega_rad_s < np.pi / self.dt_s)
+        """Flexible modes of the nominal below the Nyquist frequency, ascending in frequency."""
+        modes = modes_of(self.poles, self.dt_s)
+        return tuple(mode for mode in modes if mode.omega_rad_s < np.pi / self.dt_s)
 
 
 @dataclass(frozen=True, eq=False)
 class PlantChannel(NominalPlant):
-    """One response with its uncertainty. nominal: SISO discrete `control.StateSpace`. uncertainty: an object
-    with `at(omega, level)` (any frequency), a record with omega_rad_s, centre, covariance, level (its own
-    frequencies only), or None (the nominal response is exact)."""
+    """One response with its uncertainty.
+
+    Parameters
+    ----------
+    nominal : control.StateSpace
+        Discrete, one input and one output.
+    uncertainty : object or None
+        With a method `at(omega_rad_s, level)` it is known at any frequency; with omega_rad_s, centre,
+        covariance and level on these frequencies only; None: the nominal response is exact.
+    level : float
+        Probability in (0, 1) of the ellipses where the uncertainty is known at any frequency; a record on its
+        own frequencies brings its own level.
+
+    Raises
+    ------
+    ValueError
+        For a nominal that is no discrete state space with one input and one output, or not finite, a level
+        outside (0, 1), an object that is no uncertainty, or own frequencies that do not ascend from zero to
+        at most Nyquist.
+    """
 
     nominal: control.StateSpace
     uncertainty: EvaluableUncertainty | ResponseSet | None = None
     level: float = 0.95
 
     def __post_init__(self) -> None:
-        import control  # here and below, because it brings a plotting library with it
+        """Check nominal, level and uncertainty."""
+        # Imported here and below, because it brings a plotting library with it.
+        import control
 
         system = self.nominal
         if not isinstance(system, control.StateSpace):
@@ -76,47 +133,56 @@ class PlantChannel(NominalPlant):
                 "covariance, level; "
                 f"got {type(uncertainty).__name__}"
             )
-        own = self.own_grid
-        if own is not None:
-            if own.size < 2 or not np.all(np.diff(own) > 0) or not own[0] >= 0:
+        grid = self.own_grid
+        if grid is not None:
+            ascending = grid.size >= 2 and np.all(np.diff(grid) > 0) and grid[0] >= 0
+            if not ascending:
                 raise ValueError(
                     "the uncertainty's own grid needs at least two ascending frequencies in rad/s"
                 )
-            if not own[-1] <= np.pi / system.dt * (1 + 1e-9):
+            if not grid[-1] <= np.pi / system.dt * (1 + _SAME_FREQUENCY_SHARE):
                 raise ValueError(
-                    f"the uncertainty's grid reaches {own[-1]:.5g} rad/s; the Nyquist frequency is "
+                    f"the uncertainty's grid reaches {grid[-1]:.5g} rad/s; the Nyquist frequency is "
                     f"{np.pi / system.dt:.5g}"
                 )
 
     @property
     def own_grid(self) -> Real | None:
-        """Frequencies (F,) where alone the uncertainty is known, or None if it can be evaluated anywhere."""
+        """Frequencies (F,) in rad/s where alone the uncertainty is known, or None if it can be evaluated
+        anywhere."""
         if self.uncertainty is None or hasattr(self.uncertainty, "at"):
             return None
         return np.asarray(self.uncertainty.omega_rad_s, dtype=np.float64)
 
     def nominal_response(self, omega_rad_s: Real) -> Complex:
-        """G_nom(e^{j omega dt}), (F,); see `frequency_response`."""
+        """G_nom(e^{j omega dt}), (F,) complex, at omega (F,) in rad/s."""
         return frequency_response(self.nominal, omega_rad_s)
 
     def at(self, omega_rad_s: Real) -> Ellipses:
-        """Ellipses at omega (F,). Of a record with its own grid omega must be on it; outside its range the
-        nominal response stands alone, without uncertainty. Raises ValueError at a frequency without
-        ellipse."""
+        """Ellipses at omega (F,) in rad/s, ascending.
+
+        Frequencies of a record that is known on its own ones only must be among these; outside their range
+        the nominal response stands alone, without uncertainty. Raises ValueError at a frequency between them.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:
             return Ellipses.of_no_size(omega, self.nominal_response(omega))
         record: Any = self.uncertainty
         if hasattr(record, "at"):
             record = record.at(omega, self.level)
-            centre, covariance = np.asarray(record.centre), np.asarray(record.covariance)
+            centre = np.asarray(record.centre)
+            covariance = np.asarray(record.covariance)
             return Ellipses.from_covariance(omega, centre, covariance, self.level)
-        own = np.asarray(record.omega_rad_s, dtype=np.float64)
-        outside = (omega < own[0] * (1 - 1e-9)) | (omega > own[-1] * (1 + 1e-9))
-        index = np.clip(np.searchsorted(own, omega), 0, own.size - 1)
-        before = np.maximum(index - 1, 0)
-        index = np.where(np.abs(own[before] - omega) < np.abs(own[index] - omega), before, index)
-        missing = ~outside & (np.abs(own[index] - omega) > 1e-9 * omega)
+        grid = np.asarray(record.omega_rad_s, dtype=np.float64)
+        below = omega < grid[0] * (1 - _SAME_FREQUENCY_SHARE)
+        above = omega > grid[-1] * (1 + _SAME_FREQUENCY_SHARE)
+        outside = below | above
+        # The nearest of the record's frequencies: the one at or above, or the one before it.
+        after = np.clip(np.searchsorted(grid, omega), 0, grid.size - 1)
+        before = np.maximum(after - 1, 0)
+        before_is_nearer = np.abs(grid[before] - omega) < np.abs(grid[after] - omega)
+        index = np.where(before_is_nearer, before, after)
+        missing = ~outside & (np.abs(grid[index] - omega) > _SAME_FREQUENCY_SHARE * omega)
         if np.any(missing):
             raise ValueError(
                 f"the uncertainty is known on its own grid only; {omega[np.argmax(missing)]:.6g} "
@@ -131,13 +197,30 @@ class PlantChannel(NominalPlant):
 
 
 def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
-    """`matrix_response` (F,) of a SISO discrete system."""
+    """Response (F,) complex of a discrete system with one input and one output at omega (F,) in rad/s."""
     return matrix_response(system, omega_rad_s)[:, 0, 0]
 
 
 def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
-    """C (zI - A)^-1 B + D on z = e^{j omega dt}, (F, Y, U), for a discrete system; zI - A as (z - 1) I - (A -
-    I) with z - 1 = expm1(j omega dt), for slow poles."""
+    """Response matrix of a discrete system with U inputs and Y outputs.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Discrete, dt in seconds.
+    omega_rad_s : (F,) array
+        Frequencies.
+
+    Returns
+    -------
+    (F, Y, U) complex array
+        C (zI - A)^-1 B + D on z = e^{j omega dt}.
+
+    Notes
+    -----
+    zI - A is formed as (z - 1) I - (A - I) with z - 1 = expm1(j omega dt), so that a pole of 1e-3 rad/s at 1
+    kHz keeps its digits.
+    """
     a = np.asarray(system.A, dtype=np.float64)
     b = np.asarray(system.B, dtype=np.float64)
     c = np.asarray(system.C, dtype=np.float64)
@@ -151,67 +234,114 @@ def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
     theta = omega * float(system.dt)
     z_minus_1 = -2.0 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta)
     shifted = a - np.eye(n)
-    for start in range(0, omega.size, 2048):  # bounds the memory of the batch
-        part = z_minus_1[start : start + 2048]
+    for start in range(0, omega.size, _BATCH_FREQUENCIES):
+        batch = slice(start, start + _BATCH_FREQUENCIES)
+        part = z_minus_1[batch]
         matrices = part[:, None, None] * np.eye(n) - shifted
         states = np.linalg.solve(matrices, np.broadcast_to(b, (part.size, *b.shape)))
-        response[start : start + 2048] += c @ states
+        response[batch] += c @ states
     return response
 
 
 def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
-    """A discrete system behind a delay of whole samples of every input, whose states come after its own."""
+    """Discrete system behind a delay of whole samples of every input; the states of the delay come after
+    those of the system. samples = 0 returns the system itself."""
     if samples == 0:
         return system
     import control
 
-    a, b, c, d = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
+    a = np.asarray(system.A, dtype=np.float64)
+    b = np.asarray(system.B, dtype=np.float64)
+    c = np.asarray(system.C, dtype=np.float64)
+    d = np.asarray(system.D, dtype=np.float64)
+    # Each sample of delay turns the inputs into states, which then drive the system so far.
     for _ in range(samples):
         n, inputs = b.shape
         a = np.block([[a, b], [np.zeros((inputs, n + inputs))]])
         b = np.vstack([np.zeros((n, inputs)), np.eye(inputs)])
-        c, d = np.hstack([c, d]), np.zeros_like(d)
+        c = np.hstack([c, d])
+        d = np.zeros_like(d)
     return control.ss(a, b, c, d, system.dt)
 
 
 def count_integrators(poles_z: Complex) -> int:
-    """Poles at z = 1. A multiple pole splits by a root of the rounding error (1e-8 for two, 1e-5 for three),
-    but the mean of the cluster stays accurate; a true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is
-    none."""
+    """Number of poles at z = 1, from 0 to 3, among poles_z (N,) complex.
+
+    A multiple pole splits by a root of the rounding error (1e-8 for two poles, 1e-5 for three), but the mean
+    of the cluster stays accurate. A true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is no integrator.
+    """
     distance = np.asarray(poles_z, dtype=np.complex128) - 1.0
     distance = distance[np.argsort(np.abs(distance), kind="stable")]
-    for count, radius in ((3, 1e-3), (2, 1e-5), (1, 1e-9)):
-        if (
-            distance.size >= count
-            and abs(distance[count - 1]) < radius
-            and abs(np.mean(distance[:count])) < 1e-9
-        ):
+    for count, radius in _INTEGRATOR_CLUSTERS:
+        if distance.size < count:
+            continue
+        within_radius = abs(distance[count - 1]) < radius
+        if within_radius and abs(np.mean(distance[:count])) < _INTEGRATOR_MEAN_DISTANCE:
             return count
     return 0
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A lightly damped pole pair: undamped frequency [rad/s] and damping ratio."""
+    """A lightly damped pole pair: undamped frequency in rad/s and damping ratio zeta (negative: unstable)."""
 
     omega_rad_s: float
     zeta: float
 
 
 def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple[Mode, ...]:
-    """Oscillatory pole pairs of z-plane poles as s = ln(z)/dt, ascending in frequency; zeta < 0: unstable."""
+    """Oscillatory pole pairs among poles in z, ascending in frequency.
+
+    Parameters
+    ----------
+    poles_z : (N,) complex array
+        Of a pair both are there; the one in the upper half plane is read.
+    dt_s : float
+        Sampling period in seconds.
+    zeta_below : float
+        Pairs of this damping ratio or more are no modes: at .4 the peak is 3 dB, and nothing narrow is left
+        that a grid of frequencies could miss.
+
+    Returns
+    -------
+    tuple of Mode
+        From s = ln(z)/dt.
+    """
     poles = np.asarray(poles_z, dtype=np.complex128)
-    upper = poles[(np.imag(poles) > 1e-9) & (np.abs(poles) > 1e-6)]
-    modes = [Mode(float(abs(value)), float(-value.real / abs(value))) for value in np.log(upper) / dt_s]
-    return tuple(sorted((m for m in modes if m.zeta < zeta_below), key=lambda m: m.omega_rad_s))
+    oscillating = (np.imag(poles) > _REAL_BELOW) & (np.abs(poles) > _DEADBEAT_BELOW)
+    modes = []
+    for s in np.log(poles[oscillating]) / dt_s:
+        mode = Mode(float(abs(s)), float(-s.real / abs(s)))
+        if mode.zeta < zeta_below:
+            modes.append(mode)
+    return tuple(sorted(modes, key=lambda mode: mode.omega_rad_s))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainPlant(NominalPlant, Shown):
-    """Input -> measured output with ellipses (`PlantChannel`), one plant per load or operating point.
+    """A plant from its input to its measured output, with ellipses: one for each load or operating point.
 
-    integrators: poles at z = 1, None = counted; a number that contradicts the nominal is refused.
-    performance: the channel whose |Gp S| the damping weight bounds; None = the measured output itself.
+    Parameters
+    ----------
+    name : str
+        Not empty; errors and tables name the plant by it.
+    nominal : control.StateSpace
+        Discrete, one input and one output.
+    uncertainty : object or None
+        Of the measured output, see `PlantChannel`.
+    integrators : int or None
+        Poles at z = 1, 0 to 2; None: counted. A number that contradicts the nominal is refused.
+    performance : PlantChannel or None
+        The response whose |Gp S| the damping requirement bounds, from the same input; None: the measured
+        output.
+    level : float
+        Probability of the ellipses of the measured output, in (0, 1).
+
+    Raises
+    ------
+    ValueError
+        For an empty name, a wrong number of integrators, an undamped mode, a performance channel of another
+        sampling period, or what `PlantChannel` refuses.
     """
 
     name: str
@@ -222,6 +352,7 @@ class UncertainPlant(NominalPlant, Shown):
     level: float = 0.95
 
     def __post_init__(self) -> None:
+        """Check the parts against one another and count the integrators."""
         if not self.name:
             raise ValueError("an uncertain plant needs a name")
         channel = self.channel
@@ -235,7 +366,7 @@ class UncertainPlant(NominalPlant, Shown):
             )
         if counted > 2:
             raise ValueError(f"plant {self.name!r}: at most two integrators are supported; got {counted}")
-        if np.any(np.abs(np.abs(self._other_poles) - 1.0) < 1e-10):
+        if np.any(np.abs(np.abs(self._other_poles) - 1.0) < _ON_CIRCLE_DISTANCE):
             raise ValueError(
                 f"plant {self.name!r}: a nominal pole lies on the unit circle away from z = 1 "
                 "(undamped mode); "
@@ -249,11 +380,12 @@ class UncertainPlant(NominalPlant, Shown):
 
     @cached_property
     def channel(self) -> PlantChannel:
-        """Input -> measured output."""
+        """The response from the input to the measured output."""
         return PlantChannel(self.nominal, self.uncertainty, self.level)
 
     @property
     def nyquist_rad_s(self) -> float:
+        """Nyquist frequency pi/dt in rad/s."""
         return float(np.pi / self.dt_s)
 
     @property
@@ -263,51 +395,70 @@ class UncertainPlant(NominalPlant, Shown):
 
     @cached_property
     def zeros(self) -> Complex:
-        """Finite nominal zeros in z, (n,); numerically infinite ones (|z| > 1e4) are dropped."""
+        """Finite nominal zeros in z, (n,) complex; those that are infinite but for rounding are dropped."""
         if self.nominal.nstates == 0:
             return np.zeros(0, complex)
         zeros = np.asarray(self.nominal.zeros(), dtype=np.complex128)
-        return zeros[np.isfinite(zeros) & (np.abs(zeros) < 1e4)]
+        is_finite = np.isfinite(zeros) & (np.abs(zeros) < _INFINITE_ZERO)
+        return zeros[is_finite]
 
     @property
     def n_integrators(self) -> int:
+        """Poles at z = 1, 0 to 2."""
         assert self.integrators is not None
         return self.integrators
 
     @cached_property
     def unstable_poles(self) -> int:
-        """Poles strictly outside the unit circle; integrators are not among them."""
+        """Number of nominal poles outside the unit circle; integrators are not among them."""
         return int(np.sum(np.abs(self._other_poles) > 1.0))
 
     def slow_poles_rad_s(self, below_rad_s: float) -> tuple[float, ...]:
-        """|log z|/dt of nominal poles below a frequency, ascending, 0 for integrators: beyond each the plant
-        integrates. As many as zeros below it are left out, the fastest first."""
-        poles, zeros = (
-            np.sort(np.abs(np.log(roots[roots != 0])) / self.dt_s)
-            for roots in (self._other_poles, self.zeros)
-        )
-        slow = [0.0] * self.n_integrators + [float(pole) for pole in poles if pole < below_rad_s]
-        return tuple(slow[: max(len(slow) - int(np.sum(zeros < below_rad_s)), 0)])
+        """Frequencies |log z|/dt in rad/s beyond which the plant integrates: those of nominal poles below
+        `below_rad_s`, ascending, 0 for an integrator.
+
+        Each zero below that frequency takes the slope of one pole away again: as many poles are left out, the
+        fastest first.
+        """
+        poles = self._other_poles
+        zeros = self.zeros
+        # Roots at z = 0 are delays: infinitely fast.
+        is_delay = poles == 0
+        is_zero_at_0 = zeros == 0
+        pole_frequencies = np.sort(np.abs(np.log(poles[~is_delay])) / self.dt_s)
+        zero_frequencies = np.sort(np.abs(np.log(zeros[~is_zero_at_0])) / self.dt_s)
+        slow = [0.0] * self.n_integrators
+        for frequency in pole_frequencies:
+            if frequency < below_rad_s:
+                slow.append(float(frequency))
+        n_slow_zeros = int(np.sum(zero_frequencies < below_rad_s))
+        return tuple(slow[: max(len(slow) - n_slow_zeros, 0)])
 
     @property
     def _other_poles(self) -> Complex:
-        """Poles without the integrators."""
-        return self.poles[np.argsort(np.abs(self.poles - 1.0), kind="stable")][self.n_integrators :]
+        """Nominal poles without the integrators, (n,) complex, the nearest to z = 1 first."""
+        by_distance = np.argsort(np.abs(self.poles - 1.0), kind="stable")
+        return self.poles[by_distance][self.n_integrators :]
 
     @property
     def ellipse_modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the poles that ellipses stand on, which the nominal need not have."""
-        from ident.uncertainty import ResponsePosterior  # here, because it brings compiled kernels with it
+        """Flexible modes of the poles on which the ellipses of both channels stand; the nominal need not have
+        them. Empty where an uncertainty is no posterior over basis functions."""
+        # Imported here, because it brings compiled kernels with it.
+        from ident.uncertainty import ResponsePosterior
 
-        known = [
-            c.uncertainty for c in (self.channel, self.damped) if isinstance(c.uncertainty, ResponsePosterior)
-        ]
-        return tuple(mode for each in known for mode in modes_of(each.poles.values, self.dt_s))
+        modes: list[Mode] = []
+        for channel in (self.channel, self.damped):
+            uncertainty = channel.uncertainty
+            if isinstance(uncertainty, ResponsePosterior):
+                modes.extend(modes_of(uncertainty.poles.values, self.dt_s))
+        return tuple(modes)
 
     @property
     def own_grid(self) -> npt.NDArray[np.float64] | None:
+        """Frequencies (F,) in rad/s where alone the measured output's uncertainty is known, or None."""
         return self.channel.own_grid
 
     def at(self, omega_rad_s: Real) -> Ellipses:
-        """Ellipses of input -> measured output at omega (F,)."""
+        """Ellipses of the response from the input to the measured output at omega (F,) in rad/s."""
         return self.channel.at(omega_rad_s)
