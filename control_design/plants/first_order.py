@@ -1,8 +1,11 @@
 """First-order expansions with a proved remainder, on intervals of frequency (Taylor models of order one).
 
-On |x| <= half_width around omega_k: f(omega_k + x) = value + slope x + r with |r| <= remainder. Sums and
-products are such expansions again, and so is every rational response (`RationalResponse`). Neglected:
-rounding.
+A certificate that holds between grid points needs bounds of responses on whole intervals. On |x| <=
+half_width around omega_k a function is written f(omega_k + x) = value + slope x + r with |r| <= remainder
+(`FirstOrder`). `FrequencyIntervals` gives the expansions of the simplest factors, z - q, 1/(z - p) and z^n,
+whose remainder comes from a bound of the second derivative. Sums and products of expansions are expansions
+again, and so is every rational response (`RationalResponse`), factor by factor. Roots are kept as their
+distance from z = 1, so that slow poles keep their digits. Neglected: rounding.
 """
 
 from __future__ import annotations
@@ -21,10 +24,29 @@ if TYPE_CHECKING:
     import control
 
 
+# The remainder of 1/(z - p) goes with the third power of 1/distance; a pole inside of an interval gets this
+# distance: a bound so large that the interval is split.
+_SMALLEST_DISTANCE = 1e-100
+
+# A product of state-space matrices below this share of their norms is zero but for rounding (a thousand units
+# of the last digit): the direct term, and the Markov parameters before the first that does not vanish.
+_ROUNDING_SHARE = 1e-12
+
+# Singular values below this share of the largest belong to the null space of rows of norm one.
+_NULL_SPACE_SHARE = 1e-13
+
+
 @dataclass(frozen=True, eq=False)
 class FrequencyIntervals:
-    """Frequency intervals centre_k +- half_width_k [rad/s], (F,) each, at dt_s; also below 0 or above
-    pi/dt."""
+    """Frequency intervals centre_k +- half_width_k, F of them; they may reach below 0 or above pi/dt.
+
+    Parameters
+    ----------
+    centre, half_width : (F,) array
+        rad/s.
+    dt_s : float
+        Sampling period in seconds.
+    """
 
     centre: Real
     half_width: Real
@@ -32,59 +54,80 @@ class FrequencyIntervals:
 
     @property
     def z_minus_1(self) -> Complex:
-        """e^{j omega dt} - 1 at the centres, without the cancellation near omega = 0; (F,)."""
+        """e^{j omega dt} - 1 at the centres, (F,) complex, without the cancellation near omega = 0."""
         theta = self.centre * self.dt_s
         return np.asarray(-2.0 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta), dtype=np.complex128)
 
     def distance_to(self, root_minus_1: complex) -> Real:
-        """Smallest |e^{j omega dt} - p| over each arc, (F,), p = 1 + root_minus_1."""
+        """Smallest |e^{j omega dt} - p| over each arc of the unit circle, (F,), with p = 1 + root_minus_1."""
         size = abs(1.0 + root_minus_1)
         # 1 - |p| without cancellation for p near 1.
-        inward = -(2.0 * root_minus_1.real + abs(root_minus_1) ** 2) / (1.0 + size)
+        radial = -(2.0 * root_minus_1.real + abs(root_minus_1) ** 2) / (1.0 + size)
+        # Angle between p and the middle of the arc, in (-pi, pi]; beyond the end of the arc it adds to the
+        # distance as a chord.
         offset = np.angle(np.exp(1j * (np.angle(1.0 + root_minus_1) - self.centre * self.dt_s)))
-        beyond = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
-        return np.asarray(np.hypot(inward, 2.0 * np.sqrt(size) * np.sin(beyond / 2)), dtype=np.float64)
+        beyond_arc = np.maximum(np.abs(offset) - self.half_width * self.dt_s, 0.0)
+        chord = 2.0 * np.sqrt(size) * np.sin(beyond_arc / 2)
+        return np.asarray(np.hypot(radial, chord), dtype=np.float64)
 
     def part(self, index: Boolean) -> FrequencyIntervals:
-        """Some of them."""
+        """The intervals that a mask (F,) chooses."""
         return replace(self, centre=self.centre[index], half_width=self.half_width[index])
 
     def constant(self, value: complex) -> FirstOrder:
-        """A constant."""
-        size, h = self.centre.size, self.half_width
-        return FirstOrder(np.full(size, complex(value)), np.zeros(size, complex), np.zeros(size), h)
+        """Expansion (F,) of a constant."""
+        size = self.centre.size
+        return FirstOrder(
+            np.full(size, complex(value)), np.zeros(size, complex), np.zeros(size), self.half_width
+        )
 
     def zero(self, root_minus_1: complex) -> FirstOrder:
-        """z - q, q = 1 + root_minus_1. Its second derivative in omega has modulus dt^2."""
-        shift, dt, h = self.z_minus_1, self.dt_s, self.half_width
-        return FirstOrder(shift - root_minus_1, 1j * dt * (1.0 + shift), 0.5 * (h * dt) ** 2, h)
+        """Expansion (F,) of z - q with q = 1 + root_minus_1. Its second derivative in omega has modulus
+        dt^2."""
+        z_minus_1 = self.z_minus_1
+        slope = 1j * self.dt_s * (1.0 + z_minus_1)
+        remainder = 0.5 * (self.half_width * self.dt_s) ** 2
+        return FirstOrder(z_minus_1 - root_minus_1, slope, remainder, self.half_width)
 
     def pole(self, root_minus_1: complex) -> FirstOrder:
-        """1/(z - p), p = 1 + root_minus_1: |d2/d omega2| = dt^2 |z + p|/|z - p|^3, bounded on the arc."""
-        shift, dt, h = self.z_minus_1, self.dt_s, self.half_width
-        value = 1.0 / (shift - root_minus_1)
-        nearest = np.maximum(self.distance_to(root_minus_1), 1e-100)
-        bound = dt**2 * (1.0 + abs(1.0 + root_minus_1)) / nearest**3
-        return FirstOrder(value, -1j * dt * (1.0 + shift) * value**2, 0.5 * h**2 * bound, h)
+        """Expansion (F,) of 1/(z - p) with p = 1 + root_minus_1. Its second derivative in omega has modulus
+        dt^2 |z + p|/|z - p|^3, which is bounded on the arc by the smallest distance from p."""
+        z_minus_1 = self.z_minus_1
+        value = 1.0 / (z_minus_1 - root_minus_1)
+        slope = -1j * self.dt_s * (1.0 + z_minus_1) * value**2
+        nearest = np.maximum(self.distance_to(root_minus_1), _SMALLEST_DISTANCE)
+        second_derivative = self.dt_s**2 * (1.0 + abs(1.0 + root_minus_1)) / nearest**3
+        return FirstOrder(value, slope, 0.5 * self.half_width**2 * second_derivative, self.half_width)
 
     def shift(self, samples: int) -> FirstOrder:
-        """z^samples: |d2/d omega2| = (samples dt)^2."""
-        rate, h = samples * self.dt_s, self.half_width
+        """Expansion (F,) of z^samples. Its second derivative in omega has modulus (samples dt)^2."""
+        rate = samples * self.dt_s
         value = np.exp(1j * rate * self.centre)
-        return FirstOrder(value, 1j * rate * value, 0.5 * (rate * h) ** 2, h)
+        remainder = 0.5 * (rate * self.half_width) ** 2
+        return FirstOrder(value, 1j * rate * value, remainder, self.half_width)
 
     def cleared(self, count: int) -> FirstOrder:
-        """(z - 1)^count for positive, 1/(z - 1)^|count| for negative count."""
+        """Expansion (F,) of (z - 1)^count; a negative count gives 1/(z - 1)^|count|."""
+        factor = self.zero(0.0) if count > 0 else self.pole(0.0)
         result = self.constant(1.0)
         for _ in range(abs(count)):
-            result = result.times(self.zero(0.0) if count > 0 else self.pole(0.0))
+            result = result.times(factor)
         return result
 
 
 @dataclass(frozen=True, eq=False)
 class FirstOrder:
-    """value, slope: (F,) or, for Q functions at once, (F, Q); remainder (F,), of their Euclidean norm;
-    half_width (F,)."""
+    """Value, slope and bound of the remainder of one function, or of Q functions at once, on F intervals.
+
+    Parameters
+    ----------
+    value, slope : (F,) or (F, Q) complex array
+        At the middle of each interval; the slope in 1/(rad/s).
+    remainder : (F,) array
+        Bound of the Euclidean norm over the Q functions of what the linear part leaves.
+    half_width : (F,) array
+        Half the interval in rad/s.
+    """
 
     value: Complex
     slope: Complex
@@ -92,6 +135,7 @@ class FirstOrder:
     half_width: Real
 
     def __add__(self, other: FirstOrder) -> FirstOrder:
+        """Sum of two expansions of one shape on the same intervals."""
         return FirstOrder(
             self.value + other.value,
             self.slope + other.slope,
@@ -100,52 +144,78 @@ class FirstOrder:
         )
 
     def times(self, other: FirstOrder) -> FirstOrder:
-        """Product; `self` must be (F,), `other` may hold Q functions."""
-        a0, a1 = self.value, self.slope
+        """Product of this expansion, which must be (F,), and another one, (F,) or (F, Q).
+
+        The remainder holds the product of the two changes, and each remainder times the largest the other
+        linear part can be.
+        """
+        value = self.value
+        slope = self.slope
         if other.value.ndim == 2:
-            a0, a1 = a0[:, None], a1[:, None]
-        h = self.half_width
-        size, change = np.abs(self.value), np.abs(self.slope) * h
-        size_b, change_b = _norm(other.value), _norm(other.slope) * h
+            value = value[:, None]
+            slope = slope[:, None]
+        size = np.abs(self.value)
+        change = np.abs(self.slope) * self.half_width
+        other_size = _norm(other.value)
+        other_change = _norm(other.slope) * self.half_width
         remainder = (
-            change * change_b
+            change * other_change
             + (size + change) * other.remainder
-            + (size_b + change_b) * self.remainder
+            + (other_size + other_change) * self.remainder
             + self.remainder * other.remainder
         )
-        return FirstOrder(a0 * other.value, a0 * other.slope + a1 * other.value, remainder, h)
+        product_slope = value * other.slope + slope * other.value
+        return FirstOrder(value * other.value, product_slope, remainder, self.half_width)
 
     def scaled(self, factor: complex) -> FirstOrder:
-        """Times a constant."""
+        """Expansion times a constant."""
         return FirstOrder(
             self.value * factor, self.slope * factor, self.remainder * abs(factor), self.half_width
         )
 
     def end(self, side: int) -> Complex:
-        """The linear part at the upper (side = 1) or lower (side = -1) end of the interval."""
-        h = self.half_width if self.value.ndim == 1 else self.half_width[:, None]
-        return np.asarray(self.value + side * h * self.slope, dtype=np.complex128)
+        """Linear part, (F,) or (F, Q), at the upper (side = 1) or lower (side = -1) end of the intervals; at
+        the middle for side = 0."""
+        half_width = self.half_width if self.value.ndim == 1 else self.half_width[:, None]
+        return np.asarray(self.value + side * half_width * self.slope, dtype=np.complex128)
 
     def change(self) -> Real:
-        """Upper bound of the distance from the value at the middle, (F,)."""
+        """Upper bound (F,) of the distance from the value at the middle, over the interval."""
         return _norm(self.slope) * self.half_width + self.remainder
 
     def largest(self) -> Real:
-        """Upper bound of the modulus over the interval, (F,). The modulus of a linear function is convex."""
+        """Upper bound (F,) of the modulus over the interval. The modulus of a linear function is convex, so
+        that it is largest at one of the ends."""
         return np.maximum(_norm(self.end(1)), _norm(self.end(-1))) + self.remainder
 
 
 def _norm(value: Complex) -> Real:
+    """Modulus (F,) of values (F,), or Euclidean norm (F,) of values (F, Q)."""
     if value.ndim == 1:
         return np.abs(value)
-    squares = (np.einsum("fq,fq->f", part, part) for part in (value.real, value.imag))
-    return np.asarray(np.sqrt(sum(squares)))
+    real_square = np.einsum("fq,fq->f", value.real, value.real)
+    imag_square = np.einsum("fq,fq->f", value.imag, value.imag)
+    return np.asarray(np.sqrt(real_square + imag_square))
 
 
 @dataclass(frozen=True, eq=False)
 class RationalResponse:
-    """gain z^-delay_samples prod (z - q)/prod (z - p)/(z - 1)^integrators; zeros_minus_1 and poles_minus_1
-    hold q - 1 and p - 1, so that slow poles keep their digits."""
+    """A rational response by its factors: gain z^-delay_samples prod (z - q)/prod (z - p)/(z -
+    1)^integrators.
+
+    Parameters
+    ----------
+    gain : float
+        Factor of the products.
+    zeros_minus_1, poles_minus_1 : (N,), (M,) complex array
+        q - 1 and p - 1, so that slow roots keep their digits; without integrators.
+    integrators : int
+        Poles at z = 1.
+    dt_s : float
+        Sampling period in seconds.
+    delay_samples : int
+        Whole samples.
+    """
 
     gain: float
     zeros_minus_1: Complex
@@ -156,74 +226,99 @@ class RationalResponse:
 
     @classmethod
     def from_state_space(cls, system: control.StateSpace, integrators: int) -> RationalResponse:
-        """Zeros and poles of a SISO discrete system; its `integrators` poles nearest z = 1 are put exactly
-        there.
+        """Gain, zeros and poles of a discrete system with one input and one output.
 
+        Parameters
+        ----------
+        system : control.StateSpace
+            n states.
+        integrators : int
+            Number of its poles at z = 1: those nearest to it are put exactly there.
+
+        Notes
+        -----
         With relative degree r the zeros are the eigenvalues of A + B F, F = -C A^r/(C A^(r-1) B), on the
         subspace where C, CA, ..., C A^(r-1) vanish: exactly n - r of them, none spurious.
         """
         a, b, c = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABC")
         d = float(np.asarray(system.D)[0, 0])
+        dt_s = float(system.dt)
         n = a.shape[0]
         identity = np.eye(n)
         poles = _eigenvalues(a - identity)
-        poles = poles[np.argsort(np.abs(poles), kind="stable")][integrators:]
-        if n == 0 or abs(d) > 1e-12 * np.linalg.norm(b) * np.linalg.norm(c):
-            zeros = _eigenvalues(a - b @ c / d - identity) if d else np.zeros(0, complex)
-            return cls(d, zeros, poles, integrators, float(system.dt))
+        by_distance = np.argsort(np.abs(poles), kind="stable")
+        poles = poles[by_distance][integrators:]
+        no_zeros = np.zeros(0, complex)
+        # With a direct term there are as many zeros as poles.
+        if n == 0 or abs(d) > _ROUNDING_SHARE * np.linalg.norm(b) * np.linalg.norm(c):
+            zeros = _eigenvalues(a - b @ c / d - identity) if d else no_zeros
+            return cls(d, zeros, poles, integrators, dt_s)
+        # Rows C, CA, ... up to the first Markov parameter C A^(r-1) B that does not vanish.
         rows: list[npt.NDArray[np.float64]] = []
-        row, markov = c, 0.0
+        row = c
+        markov = 0.0
         while len(rows) < n:
             size = float(np.linalg.norm(row))
             rows.append(row / (size or 1.0))
             markov = float((row @ b)[0, 0])
-            if abs(markov) > 1e-12 * size * float(np.linalg.norm(b)):
+            if abs(markov) > _ROUNDING_SHARE * size * float(np.linalg.norm(b)):
                 break
             row = row @ a
         else:
-            return cls(0.0, np.zeros(0, complex), poles, integrators, float(system.dt))
-        inside = scipy.linalg.null_space(np.vstack(rows), rcond=1e-13)
-        zeros = _eigenvalues(inside.T @ (a - b @ (row @ a) / markov - identity) @ inside)
-        return cls(markov, zeros, poles, integrators, float(system.dt))
+            # The input does not reach the output.
+            return cls(0.0, no_zeros, poles, integrators, dt_s)
+        subspace = scipy.linalg.null_space(np.vstack(rows), rcond=_NULL_SPACE_SHARE)
+        zero_dynamics = a - b @ (row @ a) / markov - identity
+        zeros = _eigenvalues(subspace.T @ zero_dynamics @ subspace)
+        return cls(markov, zeros, poles, integrators, dt_s)
 
     @classmethod
     def from_weight(cls, weight: RationalWeight, dt_s: float) -> RationalResponse:
-        """A weight in s (up to its sign) seen through s = (2/dt) (z - 1)/(z + 1), in which s - r = (2/dt - r)
-        (z - q)/(z + 1) with q = (1 + r dt/2)/(1 - r dt/2)."""
+        """Weight W(s), up to its sign, seen through s = (2/dt) (z - 1)/(z + 1).
+
+        A root r becomes q = (1 + r dt/2)/(1 - r dt/2): s - r = (2/dt - r) (z - q)/(z + 1). Where the weight
+        has fewer zeros than poles the factors z + 1 remain as zeros at z = -1.
+        """
         gain = abs(weight.numerator[0] / weight.denominator[0])
-        roots: list[list[complex]] = []
+        roots_minus_1: list[list[complex]] = []
         for coefficients, sign in ((weight.numerator, 1), (weight.denominator, -1)):
-            found: list[complex] = []
+            mapped: list[complex] = []
             for root in np.roots(coefficients):
                 scale = 2.0 / dt_s - root
-                if abs(scale) < 1e-12 / dt_s:  # q at infinity: s - 2/dt = -(4/dt)/(z + 1)
+                # q at infinity: s - 2/dt = -(4/dt)/(z + 1).
+                if abs(scale) < _ROUNDING_SHARE / dt_s:
                     gain *= (4.0 / dt_s) ** sign
                     continue
                 gain *= float(abs(scale)) ** sign
-                found.append(complex(2.0 * root / scale))
-            roots.append(found)
-        missing = len(weight.denominator) - len(weight.numerator)
+                mapped.append(complex(2.0 * root / scale))
+            roots_minus_1.append(mapped)
+        zeros_minus_1, poles_minus_1 = roots_minus_1
+        n_missing_zeros = len(weight.denominator) - len(weight.numerator)
+        zeros_minus_1 = zeros_minus_1 + [complex(-2.0)] * n_missing_zeros
         # Integrators of a weight are roots at s = 0.
-        at_one = sum(1 for root in roots[1] if root == 0)
+        moving_poles = [root for root in poles_minus_1 if root != 0]
         return cls(
             gain,
-            np.array([*roots[0], *([-2.0] * missing)], dtype=np.complex128),
-            np.array([root for root in roots[1] if root != 0], dtype=np.complex128),
-            at_one,
+            np.array(zeros_minus_1, dtype=np.complex128),
+            np.array(moving_poles, dtype=np.complex128),
+            len(poles_minus_1) - len(moving_poles),
             dt_s,
         )
 
     def delayed(self, samples: int) -> RationalResponse:
-        """Times z^-samples."""
+        """Response times z^-samples."""
         return replace(self, delay_samples=self.delay_samples + samples)
 
     def expand(self, intervals: FrequencyIntervals, cleared: int = 0) -> FirstOrder:
-        """(z - 1)^cleared times the response, to first order on the intervals."""
+        """Expansion (F,) of the response times (z - 1)^cleared on F intervals; cleared takes integrators
+        away."""
         result = intervals.constant(self.gain)
-        zeros = self.zeros_minus_1[np.argsort(np.abs(self.zeros_minus_1), kind="stable")]
-        poles = self.poles_minus_1[np.argsort(np.abs(self.poles_minus_1), kind="stable")]
+        zero_order = np.argsort(np.abs(self.zeros_minus_1), kind="stable")
+        pole_order = np.argsort(np.abs(self.poles_minus_1), kind="stable")
+        zeros = self.zeros_minus_1[zero_order]
+        poles = self.poles_minus_1[pole_order]
+        # One pole and one zero in turn: partial products keep the size of the whole.
         for index in range(max(zeros.size, poles.size)):
-            # One pole, one zero in turn: partial products keep the size of the whole.
             if index < poles.size:
                 result = result.times(intervals.pole(complex(poles[index])))
             if index < zeros.size:
@@ -235,10 +330,12 @@ class RationalResponse:
         return result
 
     def at(self, omega_rad_s: Real) -> Complex:
-        """Values at omega (F,)."""
+        """Values (F,) complex at omega (F,) in rad/s."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        return self.expand(FrequencyIntervals(omega, np.zeros(omega.size), self.dt_s)).value
+        points = FrequencyIntervals(omega, np.zeros(omega.size), self.dt_s)
+        return self.expand(points).value
 
 
 def _eigenvalues(matrix: npt.NDArray[np.float64]) -> Complex:
+    """Eigenvalues (n,) of a real matrix (n, n), complex also where all of them are real."""
     return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)

@@ -1,4 +1,13 @@
-"""Frequency grids: a lean one for the optimiser, a dense one for its checks."""
+"""Frequency grids: a lean one for the optimiser, a dense one for its checks.
+
+A requirement must hold at every frequency; programmes and checks ask it on a grid. Between two points nothing
+narrow may hide, so a grid is logarithmic from `lowest_rad_s` to Nyquist with points around every light mode
+(`mode_points`) and around every pole and zero near the unit circle (`near_the_circle`). `programme_grid`
+gives the grid that an optimiser begins with, or that of its dense check, `checked_grid` the one a design is
+judged on. Where the uncertainty is known on frequencies of its own, grids keep to these. The functions at the
+end refine a grid where a requirement is exceeded, and give the first partition for bounds that hold on whole
+intervals.
+"""
 
 from __future__ import annotations
 
@@ -13,18 +22,48 @@ from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.plants.plant_set import Mode, UncertainPlant
 from ident.data.settings import Settings
 
-_LOWEST_ANGLE = 5e-7
-"""Lowest frequency of the grids, rad per sample (1e-4 rad/s at 200 Hz), above slower poles."""
-_BELOW_SLOWEST = 1e-2
-"""Share of the slowest root's distance from z = 1 that the grids begin at, where that is lower."""
-_INTEGRATES = 1e-9
-"""Roots nearer to z = 1 count as integrators (`count_integrators`)."""
-_WIDE = 0.1
-"""Roots farther from the circle than this, rad per sample, leave nothing narrow between grid points."""
+# Lowest frequency of the grids in rad per sample, 1e-4 rad/s at 200 Hz: a period of 17 hours, below which no
+# arm is judged. Slower poles lower it.
+_LOWEST_ANGLE_RAD = 5e-7
+
+# Where a root in z is slower, the grids begin at this share of its distance from z = 1: two decades below a
+# corner a response is flat or a pure power of frequency within 1e-4.
+_BELOW_SLOWEST_SHARE = 1e-2
+
+# Roots nearer to z = 1 count as integrators, as in `plant_set.count_integrators`: no grid begins below them.
+_INTEGRATOR_DISTANCE = 1e-9
+
+# Roots farther from the unit circle than this, in rad per sample, leave nothing narrow between the points of
+# a logarithmic grid: their bandwidth is a thirtieth of the band, some ten points wide.
+_WIDE_ANGLE_RAD = 0.1
+
+# Roots nearer than this are on the circle but for rounding: no geometric row of points converges on them.
+_ON_CIRCLE_DISTANCE = 1e-16
+
+# Smallest damping ratio that points are spread for: below it the row of points would collapse into one.
+_SMALLEST_ZETA = 1e-6
+
+# Two points nearer than this share of their frequency carry no information twice, and rows of an equation at
+# both are singular.
+_SAME_FREQUENCY_SHARE = 1e-9
+
+# Points that each mode gets at least, whatever the number of modes: ten on each flank.
+_LEAST_MODE_POINTS = 20
+
+# Share of a dense check's points that are logarithmic; the others stand around the modes.
+_DENSE_LOG_SHARE = 0.7
+_DENSE_MODE_SHARE = 0.3
+
+# First partition of the frequency axis: logarithmic edges (in all at least, and per decade) and edges around
+# each mode. Intervals on which a bound is not tight are split later, so the number changes time, no result.
+_LEAST_EDGES = 60
+_EDGES_PER_DECADE = 40
+_EDGES_PER_MODE = 40
 
 
 class GridOptions(Settings):
-    """How fine the frequency grids of a programme and of its dense check are."""
+    """How fine the frequency grids of a programme and of its dense check are; limits refuse grids too coarse
+    to show a mode, or too long for memory."""
 
     grid_points: int = Field(default=110, ge=20, le=2000, description="logarithmic points of the programme")
     mode_points: int = Field(default=60, ge=0, le=1000, description="points spread around the flexible modes")
@@ -38,33 +77,61 @@ class GridOptions(Settings):
 
 
 def lowest_rad_s(dt_s: float, roots_z: Complex) -> float:
-    """Where grids begin for a sampling time and the poles and zeros that are to be seen, rad/s."""
-    away = np.abs(np.asarray(roots_z, dtype=np.complex128) - 1.0)
-    slowest = float(np.min(away, initial=np.inf, where=away > _INTEGRATES))
-    return min(_LOWEST_ANGLE, _BELOW_SLOWEST * slowest) / dt_s
+    """Frequency in rad/s where grids begin, for a sampling period in seconds and the poles and zeros in z
+    (N,) that are to be seen."""
+    distance = np.abs(np.asarray(roots_z, dtype=np.complex128) - 1.0)
+    slowest = float(np.min(distance, initial=np.inf, where=distance > _INTEGRATOR_DISTANCE))
+    return min(_LOWEST_ANGLE_RAD, _BELOW_SLOWEST_SHARE * slowest) / dt_s
 
 
 def near_the_circle(roots_z: Complex, dt_s: float, per_decade: int = 25) -> Real:
-    """Frequencies [rad/s] around poles and zeros close to the unit circle, geometric from a tenth of their
-    distance."""
+    """Frequencies around poles and zeros close to the unit circle.
+
+    Parameters
+    ----------
+    roots_z : (N,) complex array
+        Poles and zeros in z.
+    dt_s : float
+        Sampling period in seconds.
+    per_decade : int
+        Points on each side in each decade of distance from the root's frequency.
+
+    Returns
+    -------
+    (F,) array
+        Ascending, rad/s, between 0 and Nyquist: each root's own frequency, and points on both sides at
+        distances that grow geometrically from a tenth of the root's distance from the circle.
+    """
     parts = [np.zeros(0)]
     for root in np.unique(np.asarray(roots_z, dtype=np.complex128)):
-        angle, distance = abs(float(np.angle(root))), abs(abs(complex(root)) - 1.0)
-        if not 1e-16 < distance < _WIDE:
+        angle = abs(float(np.angle(root)))
+        distance = abs(abs(complex(root)) - 1.0)
+        if not _ON_CIRCLE_DISTANCE < distance < _WIDE_ANGLE_RAD:
             continue
-        decades = np.log10(_WIDE / distance) + 1.0
-        step = np.geomspace(0.1 * distance, _WIDE, int(np.ceil(per_decade * decades)))
-        parts.append(np.concatenate([angle - step, [angle], angle + step]))
+        decades = np.log10(_WIDE_ANGLE_RAD / distance) + 1.0
+        n_points = int(np.ceil(per_decade * decades))
+        offset = np.geomspace(0.1 * distance, _WIDE_ANGLE_RAD, n_points)
+        parts.append(np.concatenate([angle - offset, [angle], angle + offset]))
     angles = np.concatenate(parts)
-    return np.asarray(np.unique(angles[(angles > 0) & (angles < np.pi)]) / dt_s, dtype=np.float64)
+    above_zero = angles > 0
+    below_nyquist = angles < np.pi
+    in_band = above_zero & below_nyquist
+    return np.asarray(np.unique(angles[in_band]) / dt_s, dtype=np.float64)
 
 
 def mode_points(mode: Mode, count: int, half_widths: float = 20.0) -> Real:
-    """Frequencies spaced like sinh within +-half_widths half-bandwidths (zeta omega) of a mode."""
-    width = max(mode.zeta, 1e-6) * mode.omega_rad_s
+    """Frequencies in rad/s within +-half_widths half-bandwidths (zeta omega) of a mode, at most `count` of
+    them.
+
+    They are spaced like sinh: evenly within the bandwidth, where phase turns, and geometrically beyond. At
+    twenty half-bandwidths the mode's own term is a twentieth of its peak, and the logarithmic grid takes
+    over.
+    """
+    half_bandwidth = max(mode.zeta, _SMALLEST_ZETA) * mode.omega_rad_s
     reach = np.arcsinh(half_widths)
-    points = mode.omega_rad_s + width * np.sinh(np.linspace(-reach, reach, count))
-    return np.asarray(points[points > 0], dtype=np.float64)
+    points = mode.omega_rad_s + half_bandwidth * np.sinh(np.linspace(-reach, reach, count))
+    is_positive = points > 0
+    return np.asarray(points[is_positive], dtype=np.float64)
 
 
 def frequency_grid(
@@ -77,22 +144,46 @@ def frequency_grid(
     extra: npt.ArrayLike = (),
     further: Sequence[Mode] = (),
 ) -> Real:
-    """Ascending grid from omega_min to Nyquist; `n_mode` points are shared out over the modes (at least 20
-    each), and as many for each of `further` that has fewer than two of these points in its bandwidth."""
-    each = max(20, n_mode // max(len(modes), 1))
+    """Grid from the lowest frequency to Nyquist, finer around modes.
+
+    Parameters
+    ----------
+    nyquist_rad_s, omega_min_rad_s : float
+        Ends of the grid; Nyquist is its last point.
+    modes : sequence of Mode
+        Modes that get points around them.
+    n_log, n_mode : int
+        Logarithmic points, and points shared out over the modes (at least twenty each).
+    extra : (E,) array
+        Further points; those outside of the ends are left out.
+    further : sequence of Mode
+        Modes that get as many points as one of `modes`, if fewer than two points of the grid lie in their
+        bandwidth.
+
+    Returns
+    -------
+    (F,) array
+        Ascending, rad/s.
+    """
+    per_mode = max(_LEAST_MODE_POINTS, n_mode // max(len(modes), 1))
     parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]
-    grid = np.concatenate([*parts, *(mode_points(mode, each) for mode in modes)])
-    hidden = [
-        mode
-        for mode in further
-        if np.count_nonzero(np.abs(grid / mode.omega_rad_s - 1.0) < max(abs(mode.zeta), 1e-6)) < 2
-    ]
-    grid = np.concatenate([grid, *(mode_points(mode, each) for mode in hidden)])
-    grid = np.unique(grid[(grid >= omega_min_rad_s) & (grid <= nyquist_rad_s)])
+    parts.extend(mode_points(mode, per_mode) for mode in modes)
+    grid = np.concatenate(parts)
+    # Modes that fall between two points so far.
+    parts = [grid]
+    for mode in further:
+        relative_distance = np.abs(grid / mode.omega_rad_s - 1.0)
+        n_inside = np.count_nonzero(relative_distance < max(abs(mode.zeta), _SMALLEST_ZETA))
+        if n_inside < 2:
+            parts.append(mode_points(mode, per_mode))
+    grid = np.concatenate(parts)
+    above_lowest = grid >= omega_min_rad_s
+    below_nyquist = grid <= nyquist_rad_s
+    in_range = above_lowest & below_nyquist
+    grid = np.unique(grid[in_range])
     grid[-1] = nyquist_rad_s
-    # Points closer than 1e-9 relative carry no information and make unwrapping rows singular.
-    keep = np.concatenate([[True], np.diff(grid) > 1e-9 * grid[1:]])
-    return np.asarray(grid[keep], dtype=np.float64)
+    is_new = np.concatenate([[True], np.diff(grid) > _SAME_FREQUENCY_SHARE * grid[1:]])
+    return np.asarray(grid[is_new], dtype=np.float64)
 
 
 def checked_grid(
@@ -104,11 +195,30 @@ def checked_grid(
     roots: npt.ArrayLike = (),
     extra: npt.ArrayLike = (),
 ) -> Real:
-    """Grid that a design is checked on: from `lowest_rad_s` of the plant and the further `roots`."""
-    low = lowest_rad_s(plant.dt_s, np.concatenate([plant.poles, np.asarray(roots, dtype=np.complex128)]))
-    n_mode, top = per_mode * len(modes), plant.nyquist_rad_s
+    """Grid (F,) in rad/s that a design is checked on, ascending from below its slowest root to Nyquist.
+
+    Parameters
+    ----------
+    plant : UncertainPlant
+        Its sampling period, poles, and the modes that its ellipses stand on.
+    modes : sequence of Mode
+        Modes of plant, controller or loop that get `per_mode` points each.
+    n_log, per_mode : int
+        Logarithmic points, and points of each mode.
+    roots : (N,) complex array
+        Poles and zeros in z beside the plant's poles, of which the slowest tells where the grid begins.
+    extra : (E,) array
+        Further points in rad/s.
+    """
+    all_roots = np.concatenate([plant.poles, np.asarray(roots, dtype=np.complex128)])
     return frequency_grid(
-        top, modes, omega_min_rad_s=low, n_log=n_log, n_mode=n_mode, extra=extra, further=plant.ellipse_modes
+        plant.nyquist_rad_s,
+        modes,
+        omega_min_rad_s=lowest_rad_s(plant.dt_s, all_roots),
+        n_log=n_log,
+        n_mode=per_mode * len(modes),
+        extra=extra,
+        further=plant.ellipse_modes,
     )
 
 
@@ -120,77 +230,161 @@ def programme_grid(
     *,
     dense: bool = False,
 ) -> Real:
-    """Frequencies of a programme, to begin with, or of its dense check."""
-    checked = int(0.7 * options.dense_points), int(0.3 * options.dense_points)
-    points = checked if dense else (options.grid_points, options.mode_points)
-    low = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
+    """Frequencies (F,) in rad/s that a programme begins with, or those of its dense check.
+
+    Parameters
+    ----------
+    plant : UncertainPlant
+        Where its uncertainty is known on frequencies of its own, the grid keeps to these within their range.
+    modes : sequence of Mode
+        Modes that get points around them.
+    options : GridOptions
+        Numbers of points, and where the grid begins.
+    extra : (E,) array
+        Further points in rad/s.
+    dense : bool
+        The dense check: more points, also around the modes that the ellipses stand on.
+    """
+    lowest = options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
+    if dense:
+        grid = frequency_grid(
+            plant.nyquist_rad_s,
+            modes,
+            omega_min_rad_s=lowest,
+            n_log=int(_DENSE_LOG_SHARE * options.dense_points),
+            n_mode=int(_DENSE_MODE_SHARE * options.dense_points),
+            extra=extra,
+            further=plant.ellipse_modes,
+        )
+        return with_own_grid(plant, grid)
     grid = frequency_grid(
-        plant.nyquist_rad_s, modes, omega_min_rad_s=low, n_log=points[0], n_mode=points[1], extra=extra,
-        further=plant.ellipse_modes if dense else (),
-    )  # fmt: skip
-    return (with_own_grid if dense else plant_grid)(plant, grid)
+        plant.nyquist_rad_s,
+        modes,
+        omega_min_rad_s=lowest,
+        n_log=options.grid_points,
+        n_mode=options.mode_points,
+        extra=extra,
+    )
+    return plant_grid(plant, grid)
 
 
-def _outside(own: Real, wanted: Real) -> Real:
-    outside = (wanted < own[0] * (1 - 1e-9)) | (wanted > own[-1] * (1 + 1e-9))
-    return np.asarray(wanted[outside], dtype=np.float64)
+def _outside(own_grid: Real, wanted: Real) -> Real:
+    """Those frequencies of `wanted` (W,) that lie outside the range of `own_grid` (F,), both in rad/s."""
+    below = wanted < own_grid[0] * (1 - _SAME_FREQUENCY_SHARE)
+    above = wanted > own_grid[-1] * (1 + _SAME_FREQUENCY_SHARE)
+    is_outside = below | above
+    return np.asarray(wanted[is_outside], dtype=np.float64)
 
 
 def with_own_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """`wanted`; of an uncertainty with its own frequencies all of these, and `wanted` outside their range."""
-    own = plant.own_grid
-    return wanted if own is None else np.union1d(own[own > 0], _outside(own, wanted))
+    """Frequencies to check a plant at, ascending in rad/s: `wanted` (W,) itself where its uncertainty is
+    known everywhere, else all positive frequencies that it is known at, and `wanted` outside their range."""
+    own_grid = plant.own_grid
+    if own_grid is None:
+        return wanted
+    is_positive = own_grid > 0
+    return np.union1d(own_grid[is_positive], _outside(own_grid, wanted))
 
 
 def plant_grid(plant: UncertainPlant, wanted: Real) -> Real:
-    """`wanted`; of an uncertainty with its own frequencies the nearest of these, and `wanted` outside their
-    range."""
-    own = plant.own_grid
-    if own is None:
+    """Frequencies to optimise a plant at, ascending in rad/s: `wanted` (W,) itself where its uncertainty is
+    known everywhere, else the next higher frequency that it is known at for each, both ends of these, and
+    `wanted` outside their range."""
+    own_grid = plant.own_grid
+    if own_grid is None:
         return wanted
-    inside = wanted[(wanted >= own[0]) & (wanted <= own[-1])]
-    index = np.unique(np.clip(np.searchsorted(own, inside), 0, own.size - 1))
-    index = np.union1d(index, np.array([0, own.size - 1]))
-    return np.union1d(own[index], _outside(own, wanted))
+    above_lowest = wanted >= own_grid[0]
+    below_highest = wanted <= own_grid[-1]
+    in_range = above_lowest & below_highest
+    last = own_grid.size - 1
+    index = np.unique(np.clip(np.searchsorted(own_grid, wanted[in_range]), 0, last))
+    index = np.union1d(index, np.array([0, last]))
+    return np.union1d(own_grid[index], _outside(own_grid, wanted))
 
 
 def local_maxima(value: Real) -> Integer:
-    """Positions of local maxima of (F,), ends included, largest value first."""
+    """Positions (M,) of local maxima of value (F,), ends included, largest value first; of equal neighbours
+    the last one."""
     padded = np.concatenate([[-np.inf], value, [-np.inf]])
-    index = np.flatnonzero((padded[1:-1] >= padded[:-2]) & (padded[1:-1] > padded[2:]))
+    middle = padded[1:-1]
+    not_below_left = middle >= padded[:-2]
+    above_right = middle > padded[2:]
+    is_maximum = not_below_left & above_right
+    index = np.flatnonzero(is_maximum)
     return np.asarray(index[np.argsort(-value[index], kind="stable")], dtype=np.int64)
 
 
 def around_maxima(omega: Real, values: Sequence[Real], most: int) -> Real:
-    """New frequencies, nine of them between the neighbours of each of the `most` largest local maxima
-    of each of the values (F,) at omega (F,); none at those of minus infinity."""
-    ends = [
-        (omega[max(at - 1, 0)], omega[min(at + 1, omega.size - 1)])
-        for value in values
-        for at in local_maxima(value)[:most]
-        if value[at] > -np.inf
-    ]
-    return np.setdiff1d([np.linspace(*both, 11)[1:-1] for both in ends], omega)
+    """Frequencies in rad/s to look at anew around the largest values, ascending, none of `omega`.
+
+    Parameters
+    ----------
+    omega : (F,) array
+        Ascending grid in rad/s.
+    values : sequence of (F,) arrays
+        What is sought the maxima of, each by itself; minus infinity where there is no value.
+    most : int
+        Largest local maxima of each that get points.
+
+    Returns
+    -------
+    (N,) array
+        Nine evenly spaced points between the two neighbours of each maximum: the maximum is located ten times
+        more finely.
+    """
+    refined = []
+    for value in values:
+        for position in local_maxima(value)[:most]:
+            if value[position] == -np.inf:
+                continue
+            left = omega[max(position - 1, 0)]
+            right = omega[min(position + 1, omega.size - 1)]
+            refined.append(np.linspace(left, right, 11)[1:-1])
+    return np.setdiff1d(refined, omega)
 
 
 def joined(
     omega: Real, values: Sequence[Any], new: Real, added: Sequence[Any]
 ) -> tuple[Real, tuple[Any, ...]]:
-    """Grid and values with others, at other frequencies."""
-    order = np.argsort(np.concatenate([omega, new]), kind="stable")
-    both = tuple(np.concatenate([a, b])[order] for a, b in zip(values, added, strict=True))
-    return np.concatenate([omega, new])[order], both
+    """Grid with new frequencies, ascending, and the values at both.
+
+    Parameters
+    ----------
+    omega, new : (F,), (N,) array
+        Frequencies in rad/s, none of them in both.
+    values, added : sequence of arrays
+        Of each quantity its values (F, ...) at omega and (N, ...) at new.
+
+    Returns
+    -------
+    tuple
+        Frequencies (F + N,), and the values (F + N, ...) of each quantity in their order.
+    """
+    all_omega = np.concatenate([omega, new])
+    order = np.argsort(all_omega, kind="stable")
+    all_values = tuple(
+        np.concatenate([old_value, new_value])[order]
+        for old_value, new_value in zip(values, added, strict=True)
+    )
+    return all_omega[order], all_values
 
 
 def with_violations(grid: Real, omega: Real, value: Real, limit: float, most: int) -> Real:
-    """The grid with the `most` largest local maxima of value (F,) at omega (F,) that exceed the limit."""
-    return np.union1d(grid, omega[[i for i in local_maxima(value) if value[i] > limit][:most]])
+    """Grid (G,) in rad/s together with those frequencies of omega (F,) at which value (F,) has its largest
+    local maxima above the limit, at most `most` of them."""
+    exceeding = [position for position in local_maxima(value) if value[position] > limit]
+    return np.union1d(grid, omega[exceeding[:most]])
 
 
 def starting_edges(plant: UncertainPlant, modes: Sequence[Mode], extra: npt.ArrayLike = ()) -> Real:
-    """Edges of a first partition of [0, Nyquist] for bounds on intervals: logarithmic, finer around modes."""
-    count = max(60, int(40 * np.log10(plant.nyquist_rad_s / lowest_rad_s(plant.dt_s, plant.poles))))
-    inner = checked_grid(plant, modes, count, 40)
-    more = np.asarray(extra, dtype=np.float64)
-    more = more[(more > 0) & (more < plant.nyquist_rad_s)]
-    return np.asarray(np.unique(np.concatenate([[0.0], inner, more])), dtype=np.float64)
+    """Edges (E,) in rad/s, ascending from 0 to Nyquist, of a first partition for bounds that hold on whole
+    intervals: logarithmic, finer around modes, with the `extra` (N,) edges between 0 and Nyquist."""
+    decades = np.log10(plant.nyquist_rad_s / lowest_rad_s(plant.dt_s, plant.poles))
+    count = max(_LEAST_EDGES, int(_EDGES_PER_DECADE * decades))
+    inner = checked_grid(plant, modes, count, _EDGES_PER_MODE)
+    further = np.asarray(extra, dtype=np.float64)
+    above_zero = further > 0
+    below_nyquist = further < plant.nyquist_rad_s
+    in_band = above_zero & below_nyquist
+    edges = np.concatenate([[0.0], inner, further[in_band]])
+    return np.asarray(np.unique(edges), dtype=np.float64)

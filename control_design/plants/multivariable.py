@@ -223,10 +223,7 @@ class MultivariablePlant(NominalPlant):
             )
         if self.ball is not None:
             li = self.ball.Li
-            if self.ball.omega_rad_s is None:
-                columns = li.ninputs
-            else:
-                columns = li.shape[2]
+            columns = li.ninputs if self.ball.omega_rad_s is None else li.shape[2]
             if self.ball.Lo.shape[0] != self.outputs or columns != self.inputs:
                 raise ValueError(
                     f"plant {self.name!r} has {self.outputs} outputs and {self.inputs} inputs; "

@@ -1,8 +1,11 @@
 """Uncertainty ellipses between frequencies: centre and generators as first-order expansions with remainder.
 
-The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, generators scaled to the level:
-rational with known poles for a posterior over coefficients. Of a response known on its own frequencies only
-the assumption between them is stated in `own_grid_set`.
+The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, the generators scaled to the
+level. For a posterior over coefficients of basis functions, centre and generators are rational with known
+poles, so they expand on whole intervals (`posterior_expansion`); a stated uncertainty brings its own
+expansion. A response known on its own frequencies only needs an assumption between them: straight lines
+(`own_grid_set`, and `StraightBetween` for who asks at single frequencies). `expandable` chooses among these
+for a channel.
 """
 
 from __future__ import annotations
@@ -15,27 +18,44 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from control_design.plants.ellipses import Complex, Real, quotient, radius_of
+from control_design.plants.ellipses import Boolean, Complex, Real, quotient, radius_of
 from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import PlantChannel, UncertainPlant
 from ident.basis.functions import block_parameters
 from ident.basis.poles import Poles
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 
+# A frequency lies in the range of a record within this share: files round to ten digits or so.
+_SAME_FREQUENCY_SHARE = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class SetExpansion:
-    """centre (F,); groups: generators (F, Q) each, every group with a unit ball of its own (sets add up)."""
+    """A set of responses on each of F intervals, to first order.
+
+    Parameters
+    ----------
+    centre : FirstOrder
+        (F,), middle of the set.
+    groups : tuple of FirstOrder
+        Generators (F, Q) each. The members of a group are its real combinations with coefficients in the unit
+        ball; the sets of several groups add up.
+    """
 
     centre: FirstOrder
     groups: tuple[FirstOrder, ...]
 
     def times(self, factor: FirstOrder) -> SetExpansion:
-        """The set times a response (F,)."""
-        return SetExpansion(factor.times(self.centre), tuple(factor.times(group) for group in self.groups))
+        """The set of every member times a response (F,)."""
+        groups = tuple(factor.times(group) for group in self.groups)
+        return SetExpansion(factor.times(self.centre), groups)
 
     def support(self, direction: Complex, side: int) -> Real:
-        """Largest Re(conj(direction) (member - centre)) of the linear part at one end, (F,)."""
+        """Largest Re(conj(direction) (member - centre)) of the linear part, (F,), at one end of the
+        intervals.
+
+        direction : (F,) complex array. side : 1 the upper, -1 the lower end, 0 the middle.
+        """
         total = np.zeros(direction.size)
         for group in self.groups:
             turned = np.real(np.conj(direction)[:, None] * group.end(side))
@@ -43,47 +63,64 @@ class SetExpansion:
         return total
 
     def remainder(self) -> Real:
-        """Everything beyond the linear part, centre and groups together, (F,)."""
-        return np.asarray(
-            self.centre.remainder + sum(group.remainder for group in self.groups), dtype=np.float64
-        )
+        """Bound (F,) of everything beyond the linear part, centre and groups together."""
+        of_groups = sum(group.remainder for group in self.groups)
+        return np.asarray(self.centre.remainder + of_groups, dtype=np.float64)
 
     def gram(self, side: int = 0) -> Real:
-        """Shape matrix P (F, 2, 2) at the centres, or of the linear part at one end (side = +-1): the ellipse
-        e^T P^-1 e <= 1, which encloses the sum of several groups."""
+        """Shape matrix P (F, 2, 2) of the ellipse e^T P^-1 e <= 1 around the linear part, at the middle
+        (side = 0) or one end (side = +-1) of the intervals; the sum of several groups lies inside of it."""
         total = np.zeros((self.centre.value.size, 2, 2))
         for group in self.groups:
             value = group.end(side)
             rows = np.stack([value.real, value.imag], axis=1)
+            # The sum of n ellipsoids lies in the one with n times the sum of their shapes (Cauchy-Schwarz).
             total += rows @ np.swapaxes(rows, 1, 2) * len(self.groups)
         return total
 
 
 Expand = Callable[[FrequencyIntervals, int], SetExpansion]
-"""Ellipses bounded between frequencies: their expansion times (z - 1)^cleared on intervals."""
+"""Gives ellipses times (z - 1)^cleared as expansions on intervals, from (intervals, cleared)."""
 
 
 @runtime_checkable
 class FirstOrderUncertainty(Protocol):
-    """What an uncertainty of one's own offers beside `at` to have it certified between frequencies.
-
-    generators: columns whose Gram matrix of real and imaginary parts is the covariance that `at` gives.
-    """
+    """What an uncertainty of one's own offers beside `at` to have it certified between frequencies."""
 
     def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
-        """(centre (F,), generators (F, Q)), both times (z - 1)^cleared."""
+        """Centre (F,) and generators (F, Q) on the intervals, both times (z - 1)^cleared.
+
+        The Gram matrix of the generators' real and imaginary parts is the covariance that `at` gives.
+        """
 
 
 def expandable(channel: PlantChannel, integrators: int, between_own_points: str) -> Expand | None:
-    """How the channel's ellipses expand, or None if nothing can be said between frequencies."""
+    """How the channel's ellipses expand, or None if nothing can be said between frequencies.
+
+    Parameters
+    ----------
+    channel : PlantChannel
+        Nominal and uncertainty of one response.
+    integrators : int
+        Poles of the nominal at z = 1.
+    between_own_points : str
+        "linear": between the frequencies of a record the response lies on straight lines (`own_grid_set`);
+        with any other word nothing is said there.
+
+    Returns
+    -------
+    Expand or None
+        None also for an uncertainty that can be evaluated but brings no `first_order`.
+    """
     uncertainty = channel.uncertainty
-    if channel.own_grid is not None and between_own_points != "linear":
-        return None
-    if uncertainty is None or channel.own_grid is not None:
+    if channel.own_grid is not None:
+        if between_own_points != "linear":
+            return None
         nominal = RationalResponse.from_state_space(channel.nominal, integrators)
-        if uncertainty is None:
-            return lambda intervals, cleared: SetExpansion(nominal.expand(intervals, cleared), ())
         return partial(own_grid_set, channel, nominal)
+    if uncertainty is None:
+        exact = RationalResponse.from_state_space(channel.nominal, integrators)
+        return lambda intervals, cleared: SetExpansion(exact.expand(intervals, cleared), ())
     first_order: Callable[[FrequencyIntervals, int], tuple[FirstOrder, FirstOrder]]
     if isinstance(uncertainty, ResponsePosterior):
         first_order = partial(posterior_expansion, uncertainty)
@@ -93,8 +130,10 @@ def expandable(channel: PlantChannel, integrators: int, between_own_points: str)
         return None
 
     def expand(intervals: FrequencyIntervals, cleared: int) -> SetExpansion:
+        """Ellipses of the channel's level on the intervals, times (z - 1)^cleared."""
         centre, generators = first_order(intervals, cleared)
-        return SetExpansion(centre, (generators.scaled(radius_of(channel.level)),))
+        scaled_generators = generators.scaled(radius_of(channel.level))
+        return SetExpansion(centre, (scaled_generators,))
 
     return expand
 
@@ -102,49 +141,76 @@ def expandable(channel: PlantChannel, integrators: int, between_own_points: str)
 def posterior_expansion(
     posterior: ResponsePosterior, intervals: FrequencyIntervals, cleared: int
 ) -> tuple[FirstOrder, FirstOrder]:
-    """`FirstOrderUncertainty.first_order` of a Gaussian over coefficients of basis functions and impulse
-    response: every column is rational."""
+    """Centre (F,) and generators (F, Q) of an identified response on F intervals, times (z - 1)^cleared.
+
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        A Gaussian over the coefficients (P,) of basis functions and impulse response, with mean (P,) and
+        covariance_factor (P, Q), behind integrators, a delay in samples and unstable poles.
+    intervals : FrequencyIntervals
+        F of them.
+    cleared : int
+        Power of z - 1 that takes integrators away.
+
+    Notes
+    -----
+    Every column of the response is rational, so it expands factor by factor. Neglected: rounding.
+    """
     value, slope, remainder = _columns(posterior, intervals)
     factor = np.array(posterior.covariance_factor)
     mean = np.array(posterior.mean)
-    h = intervals.half_width
-    centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), h)
-    spread = FirstOrder(value @ factor, slope @ factor, remainder @ np.linalg.norm(factor, axis=1), h)
-    # 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i
+    half_width = intervals.half_width
+    centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), half_width)
+    factor_size = np.linalg.norm(factor, axis=1)
+    generators = FirstOrder(value @ factor, slope @ factor, remainder @ factor_size, half_width)
+    # Integrators and delay are common to all columns: 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i.
     common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
     common = common.times(intervals.cleared(cleared - posterior.integrators))
-    # 1/B = prod (z - a)/(1 - conj(a) z)
+    # Unstable poles, by the inverse of their all-pass: 1/B = prod (z - a)/(1 - conj(a) z).
     for a in posterior.unstable.values.tolist():
-        outside = 1 / a.conjugate()
-        common = common.times(intervals.zero(a - 1.0)).times(intervals.pole(outside - 1.0).scaled(-outside))
-    return common.times(centre), common.times(spread)
+        unstable_pole = 1 / a.conjugate()
+        pole_factor = intervals.pole(unstable_pole - 1.0).scaled(-unstable_pole)
+        common = common.times(intervals.zero(a - 1.0)).times(pole_factor)
+    return common.times(centre), common.times(generators)
 
 
 def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tuple[Complex, Complex, Real]:
-    """Value, slope and remainder (F, P) of the columns of `ResponsePosterior.frequency_rows`, without
-    integrators, delay and all-pass."""
+    """Value, slope and remainder, (F, P) each, of the response's columns on F intervals.
+
+    There is one column for each coefficient of the posterior (as in `ResponsePosterior.frequency_rows`):
+    basis functions of real poles and of pairs, the feedthrough, lags of the impulse response and, for an
+    unstable plant, derivatives with respect to its unstable poles. Integrators, delay and the all-pass of the
+    unstable poles, which all columns have in common, are left out.
+    """
     columns: list[FirstOrder] = []
+    # Each basis function is a section of its own pole behind the all-passes of the poles before it.
     all_pass = intervals.constant(1.0)
     parameters = block_parameters(posterior.poles).tolist()
-    for a, (_, gain, _, _) in zip(posterior.poles.real, parameters, strict=False):
-        driven = all_pass.times(intervals.pole(complex(a - 1.0)))
+    for real_pole, (_, gain, _, _) in zip(posterior.poles.real, parameters, strict=False):
+        driven = all_pass.times(intervals.pole(complex(real_pole - 1.0)))
         columns.append(driven.scaled(gain))
-        all_pass = driven.times(_reflected_zero(complex(a), intervals))
-    pairs = parameters[posterior.poles.real.size :]
-    for p, (_, beta, gain, other) in zip(posterior.poles.pairs, pairs, strict=True):
-        driven = all_pass.times(intervals.pole(p - 1.0))
-        driven = driven.times(intervals.pole(p.conjugate() - 1.0))
+        all_pass = driven.times(_reflected_zero(complex(real_pole), intervals))
+    # A pair has two functions: one with a zero at beta, and one without, orthogonal to it.
+    pair_parameters = parameters[posterior.poles.real.size :]
+    for pair, (_, beta, gain, gain_ratio) in zip(posterior.poles.pairs, pair_parameters, strict=True):
+        driven = all_pass.times(intervals.pole(pair - 1.0))
+        driven = driven.times(intervals.pole(pair.conjugate() - 1.0))
         columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))
-        columns.append(driven.scaled(gain * other))
-        all_pass = driven.times(_reflected_zero(p, intervals))
-        all_pass = all_pass.times(_reflected_zero(p.conjugate(), intervals))
+        columns.append(driven.scaled(gain * gain_ratio))
+        all_pass = driven.times(_reflected_zero(pair, intervals))
+        all_pass = all_pass.times(_reflected_zero(pair.conjugate(), intervals))
     if posterior.has_feedthrough:
         columns.append(intervals.constant(1.0))
-    columns += [intervals.shift(-lag) for lag in range(1, posterior.fir_length + 1)]
+    for lag in range(1, posterior.fir_length + 1):
+        columns.append(intervals.shift(-lag))
+    # The derivative of (stable part)/B by an unstable pole is -(stable part)/B times that of log B.
     if posterior.unstable.order:
-        scaled = zip(columns, posterior.mean.tolist(), strict=False)
-        against = reduce(add, (column.scaled(-each) for column, each in scaled))
-        columns += [against.times(slope) for slope in _log_all_pass_slopes(posterior.unstable, intervals)]
+        coefficients = posterior.mean.tolist()
+        weighted = [column.scaled(-x) for column, x in zip(columns, coefficients, strict=False)]
+        minus_mean = reduce(add, weighted)
+        for slope in _log_all_pass_slopes(posterior.unstable, intervals):
+            columns.append(minus_mean.times(slope))
     return (
         np.stack([column.value for column in columns], axis=1),
         np.stack([column.slope for column in columns], axis=1),
@@ -153,101 +219,154 @@ def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tup
 
 
 def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list[FirstOrder]:
-    """`ident.basis.functions.log_all_pass_slopes` as expansions."""
+    """Derivatives (F,) of log B by each parameter of the unstable poles, B their all-pass.
+
+    unstable : Poles, held as their mirror images inside the circle. A real pole is one parameter; a pair is
+    two, its real and its imaginary part, in this order.
+    """
 
     def slope(p: complex) -> FirstOrder:
+        """Derivative of log B by p, which stands in z - p and in 1 - p z: 1/(z - p) - z/(1 - p z)."""
         # -z / (1 - p z) = 1/p + 1/p^2 / (z - 1/p)
-        beyond = intervals.constant(1 / p) + intervals.pole(1 / p - 1.0).scaled(1 / p**2)
-        return intervals.pole(p - 1.0) + beyond
+        mirrored = intervals.constant(1 / p) + intervals.pole(1 / p - 1.0).scaled(1 / p**2)
+        return intervals.pole(p - 1.0) + mirrored
 
-    found = [slope(complex(a)) for a in unstable.real.tolist()]
-    for p in unstable.pairs.tolist():
-        upper, lower = slope(p), slope(p.conjugate())
-        found += [upper + lower, (upper + lower.scaled(-1.0)).scaled(1j)]
-    return found
+    slopes = [slope(complex(real_pole)) for real_pole in unstable.real.tolist()]
+    for pair in unstable.pairs.tolist():
+        upper = slope(pair)
+        lower = slope(pair.conjugate())
+        slopes.append(upper + lower)
+        slopes.append((upper + lower.scaled(-1.0)).scaled(1j))
+    return slopes
 
 
 def _reflected_zero(p: complex, intervals: FrequencyIntervals) -> FirstOrder:
-    """1 - conj(p) z."""
+    """Expansion (F,) of 1 - conj(p) z, the numerator of an all-pass with the pole p."""
     q = p.conjugate()
     factor = intervals.zero(0.0).scaled(-q)
     return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
 
 
+def _in_range(grid: Real, low: Real, high: Real) -> Boolean:
+    """Whether each interval from low to high (F,) lies between the ends of grid (K,), all in rad/s."""
+    above_first = low >= grid[0] * (1 - _SAME_FREQUENCY_SHARE)
+    below_last = high <= grid[-1] * (1 + _SAME_FREQUENCY_SHARE)
+    return above_first & below_last
+
+
 def own_grid_set(
     channel: PlantChannel, nominal: RationalResponse, intervals: FrequencyIntervals, cleared: int
 ) -> SetExpansion:
-    """Ellipses on a user's own frequencies. Assumed: at fraction x of the way between neighbours the response
-    lies in (1 - x) E_k + x E_{k+1} (Minkowski sum). Outside the range the nominal response stands alone."""
-    own = channel.own_grid
-    assert own is not None
-    low, high = intervals.centre - intervals.half_width, intervals.centre + intervals.half_width
-    inside = (low >= own[0] * (1 - 1e-9)) & (high <= own[-1] * (1 + 1e-9))
-    left = np.clip(np.searchsorted(own, intervals.centre) - 1, 0, own.size - 2)
-    gap = own[left + 1] - own[left]
-    share = (intervals.centre - own[left]) / gap
-    ellipses = channel.at(own)
-    h = intervals.half_width
-    none = np.zeros(h.size)
+    """Ellipses of a response known on a user's own frequencies, on F intervals, times (z - 1)^cleared.
+
+    Parameters
+    ----------
+    channel : PlantChannel
+        Its uncertainty is a record on K frequencies of its own.
+    nominal : RationalResponse
+        The channel's nominal response, which stands alone, without uncertainty, outside their range.
+    intervals : FrequencyIntervals
+        F of them, none across a frequency of the record.
+    cleared : int
+        Power of z - 1.
+
+    Notes
+    -----
+    Assumed: at fraction x of the way between neighbours the response lies in (1 - x) E_k + x E_{k+1}
+    (Minkowski sum of their ellipses). Each of the two is a group of its own.
+    """
+    grid = channel.own_grid
+    assert grid is not None
+    half_width = intervals.half_width
+    inside = _in_range(grid, intervals.centre - half_width, intervals.centre + half_width)
+    left = np.clip(np.searchsorted(grid, intervals.centre) - 1, 0, grid.size - 2)
+    gap = grid[left + 1] - grid[left]
+    share = (intervals.centre - grid[left]) / gap
+    ellipses = channel.at(grid)
+    no_remainder = np.zeros(half_width.size)
     clear = intervals.cleared(cleared)
-    c0, c1 = ellipses.centre[left], ellipses.centre[left + 1]
-    between = clear.times(FirstOrder(c0 + share * (c1 - c0), (c1 - c0) / gap, none, h))
-    alone = nominal.expand(intervals, cleared)
-    pairs = ((getattr(between, name), getattr(alone, name)) for name in ("value", "slope", "remainder"))
-    value, slope, remainder = (np.where(inside, here, there) for here, there in pairs)
-    centre = FirstOrder(value, slope, remainder, h)
-    axes = ellipses.direction[:, None] * np.stack(
-        [ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1
+    # Centre: a straight line between the centres of both ellipses, or the nominal response outside.
+    left_centre = ellipses.centre[left]
+    right_centre = ellipses.centre[left + 1]
+    line = FirstOrder(
+        left_centre + share * (right_centre - left_centre),
+        (right_centre - left_centre) / gap,
+        no_remainder,
+        half_width,
     )
+    between = clear.times(line)
+    outside = nominal.expand(intervals, cleared)
+    centre = FirstOrder(
+        np.where(inside, between.value, outside.value),
+        np.where(inside, between.slope, outside.slope),
+        np.where(inside, between.remainder, outside.remainder),
+        half_width,
+    )
+    # Both half axes of each ellipse are its generators; those of the left one shrink as x grows.
+    half_axes = np.stack([ellipses.semi_major + 0j, 1j * ellipses.semi_minor], axis=1)
+    axes = ellipses.direction[:, None] * half_axes
     groups = []
     for index, weight, rate in ((left, 1.0 - share, -1.0 / gap), (left + 1, share, 1.0 / gap)):
-        here = axes[index] * inside[:, None]
-        groups.append(clear.times(FirstOrder(here * weight[:, None], here * rate[:, None], none, h)))
+        generators = axes[index] * inside[:, None]
+        value = generators * weight[:, None]
+        slope = generators * rate[:, None]
+        groups.append(clear.times(FirstOrder(value, slope, no_remainder, half_width)))
     return SetExpansion(centre, tuple(groups))
 
 
 @dataclass(frozen=True, eq=False)
 class StraightBetween:
-    """A response known on its own frequencies as one at any: the assumption of `own_grid_set`.
+    """A response known on its own frequencies as one at any, by the assumption of `own_grid_set`.
 
-    at: per frequency the ellipse that encloses (1 - x) E_k + x E_{k+1}; with shapes P and Q of the two and
-    p^2 = tr P, q^2 = tr Q it is (p + q)(P/p + Q/q), exact where one of them vanishes or both are alike.
+    Parameters
+    ----------
+    channel : PlantChannel
+        Its uncertainty is a record with omega_rad_s (K,), centre, covariance and level.
+
+    Notes
+    -----
+    At a frequency the fraction x between neighbours, the ellipse is one that encloses (1 - x) E_k + x
+    E_{k+1}. With shapes P and Q of the two and p^2 = tr P, q^2 = tr Q it is (p + q)(P/p + Q/q), exact where
+    one of them vanishes or both are alike.
     """
 
     channel: PlantChannel
 
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
-        """Centre and covariances at omega (F,), so that ellipses of `level` enclose those of the record."""
-        own = self.channel.own_grid
-        assert own is not None
+        """Centre and covariances at omega (F,) in rad/s, such that ellipses of `level` enclose those of the
+        record; outside its range the nominal response without uncertainty."""
+        grid = self.channel.own_grid
+        assert grid is not None
         record: Any = self.channel.uncertainty
         omega = np.asarray(omega_rad_s, dtype=np.float64)
-        inside = (omega >= own[0] * (1 - 1e-9)) & (omega <= own[-1] * (1 + 1e-9))
-        left = np.clip(np.searchsorted(own, omega, side="right") - 1, 0, own.size - 2)
-        share = np.clip((omega - own[left]) / (own[left + 1] - own[left]), 0.0, 1.0)
+        inside = _in_range(grid, omega, omega)
+        left = np.clip(np.searchsorted(grid, omega, side="right") - 1, 0, grid.size - 2)
+        share = np.clip((omega - grid[left]) / (grid[left + 1] - grid[left]), 0.0, 1.0)
+        # Inside, the nominal response is not used and may have a pole: it is asked for at half of Nyquist.
+        harmless_rad_s = np.pi / 2 / self.channel.dt_s
+        nominal = self.channel.nominal_response(np.where(inside, harmless_rad_s, omega))
         centres = np.asarray(record.centre, dtype=np.complex128)
-        centre = (1 - share) * centres[left] + share * centres[left + 1]
-        centre = np.where(
-            inside,
-            centre,
-            self.channel.nominal_response(np.where(inside, np.pi / 2 / self.channel.dt_s, omega)),
-        )
+        line = (1 - share) * centres[left] + share * centres[left + 1]
+        centre = np.where(inside, line, nominal)
+        # Covariances of the two ellipses, scaled from the record's level to the one asked for.
         scale = (radius_of(float(record.level)) / radius_of(level)) ** 2
         shapes = np.asarray(record.covariance, dtype=np.float64) * scale
-        parts = [(1 - share)[:, None, None] ** 2 * shapes[left], share[:, None, None] ** 2 * shapes[left + 1]]
-        sizes = [np.sqrt(np.trace(part, axis1=1, axis2=2)) for part in parts]
-        covariance = sum(
-            part * np.asarray(quotient(sizes[0] + sizes[1], size))[:, None, None]
-            for part, size in zip(parts, sizes, strict=True)
-        )
-        covariance = np.where(inside[:, None, None], covariance, 0.0)
+        left_shape = (1 - share)[:, None, None] ** 2 * shapes[left]
+        right_shape = share[:, None, None] ** 2 * shapes[left + 1]
+        left_size = np.sqrt(np.trace(left_shape, axis1=1, axis2=2))
+        right_size = np.sqrt(np.trace(right_shape, axis1=1, axis2=2))
+        total_size = left_size + right_size
+        left_factor = np.asarray(quotient(total_size, left_size))[:, None, None]
+        right_factor = np.asarray(quotient(total_size, right_size))[:, None, None]
+        enclosing = left_shape * left_factor + right_shape * right_factor
+        covariance = np.where(inside[:, None, None], enclosing, 0.0)
         return FrequencyUncertainty(
             omega, centre, covariance, self.channel.dt_s, level=level, method="straight between"
         )
 
 
 def with_straight_between(plant: UncertainPlant) -> UncertainPlant:
-    """The plant with `StraightBetween` in place of records on their own frequencies."""
+    """The plant with `StraightBetween` in place of every record that is known on its own frequencies only."""
     performance = plant.performance
     if performance is not None and performance.own_grid is not None:
         performance = replace(performance, uncertainty=StraightBetween(performance))
@@ -257,7 +376,7 @@ def with_straight_between(plant: UncertainPlant) -> UncertainPlant:
 
 
 def stacked(columns: Sequence[FirstOrder]) -> FirstOrder:
-    """Q expansions (F,) as one (F, Q)."""
+    """Q expansions (F,) on the same intervals as one (F, Q)."""
     squares: Any = sum(column.remainder**2 for column in columns)
     return FirstOrder(
         np.stack([column.value for column in columns], axis=1),
