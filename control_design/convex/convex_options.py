@@ -1,4 +1,9 @@
-"""How finely the convex programmes are solved."""
+"""How finely the convex programmes are solved: the bound over all controllers, and the reference filter.
+
+Both work on frequency grids and exchange violated frequencies, so both extend `GridOptions`. The limits of
+each field refuse sizes that a programme cannot be solved with. On the example link a basis of 91 instead of
+57 functions lowers the bound by 0.1 %.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +13,8 @@ from control_design.plants.frequency_grid import GridOptions
 
 
 class YoulaOptions(GridOptions):
-    """Size of the basis and of the grids; the defaults take about two seconds a plant."""
+    """Size of the basis of Q and of the grids of `youla_bracket`; the defaults take about two seconds a
+    plant."""
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
     mirrored_poles: int = Field(
@@ -25,7 +31,7 @@ class YoulaOptions(GridOptions):
 
 
 class ReferenceFilterOptions(GridOptions):
-    """Order of the reference filter and how finely it is designed."""
+    """Order of the reference filter of `design_reference_filter` and how finely it is designed."""
 
     order: int = Field(
         default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"

@@ -1,10 +1,13 @@
 """Smallest worst ratio of a convex over a concave function, many rows at once: the core of bound and
 reference filter.
 
-Every row looks at one complex number y_k = sum_i basis_ki x_i, a vector of the plane, and asks |A y + a| <=
-gamma (e + E y - |C y + c|), convex in x for fixed gamma. Dinkelbach's iteration: gamma_j = worst ratio at
-x_j, then x_{j+1} minimises the largest (|A y + a| - gamma_j m(y))/m(y_j), a convex programme, by an interior
-point.
+Every row looks at one complex number y_k = sum_i basis_ki x_i, a vector of the plane, and asks that |A y + a|
+<= gamma m(y) with m(y) = e + E y - |C y + c|: convex in x for fixed gamma. `smallest_ratio` finds the
+smallest gamma by Dinkelbach's iteration (Management Science 13, 1967): gamma_j is the worst ratio at x_j,
+then x_{j+1} minimises the largest (|A y + a| - gamma_j m(y))/m(y_j). Each of these is a convex programme,
+solved by a primal-dual interior point (`_Scaled.lower`) in coordinates in which the rows are well scaled.
+`exchanged` repeats such a programme on a grid to which the frequencies that a dense check found violated are
+added.
 """
 
 from __future__ import annotations
@@ -19,21 +22,68 @@ import scipy.linalg
 from control_design.plants.ellipses import Complex, Integer, Real, quotient
 from control_design.plants.frequency_grid import with_violations
 
-# Radii of the rounding of |.| at its kink, a thousandth of an active numerator: it changes the row by 5e-7.
-_ROUND_NUMERATOR = 1e-3
-_ROUND_REACH = 1e-4  # denominators are about one: off by at most 1e-4, at the kink alone
-_ROUND_FEASIBILITY = 1e-2  # while denominators are being made positive: their maximum may sit on the kink
-EXCHANGE_TOLERANCE = 5e-4  # relative; accepted of the dense check over the programme
-_MOST_STEPS = 200  # of the interior point in one round; 5 to 40 are usual
-# Singular values of the basis below this fraction are no directions of the search: rounding. The best Q of an
-# unstable plant with a resonance has a part at 1e-13.
-_KEPT = 1e-14
+# Radius r of the rounding sqrt(|p|^2 + r^2) of a numerator |p| at its kink, as a share of an active
+# numerator: it changes an active row by r^2/2 = 5e-7 of it.
+_NUMERATOR_ROUNDING_SHARE = 1e-3
+
+# Radius of the rounding of |C y + c|. Denominators are about one, so they are off by at most this, and at the
+# kink alone.
+_REACH_ROUNDING = 1e-4
+
+# Radius of it while denominators are being made positive: their maximum may sit on the kink, where a smaller
+# one leaves Newton's method hardly any curvature to go by.
+_FEASIBILITY_ROUNDING = 1e-2
+
+# Relative excess of the dense check over the programme that ends an exchange of frequencies: what the last
+# gamma may be too low by. Chosen well below the per cent by which bounds are compared.
+EXCHANGE_TOLERANCE = 5e-4
+
+# Most steps of the interior point in one round. Usual are 5 to 40; a round that ends early leaves a higher
+# gamma.
+_MOST_STEPS = 200
+
+# Singular values of the basis below this share of the largest are rounding, no directions of the search. The
+# best Q of an unstable plant with a resonance has a part at 1e-13.
+_SMALLEST_SINGULAR_SHARE = 1e-14
+
+# A least-squares start is shortened, up to so many times by this factor, until all denominators exceed the
+# margin: y = 0 is the loop without Q, whose denominators are about one.
+_MOST_START_SHORTENINGS = 30
+_START_SHORTENING = 0.7
+_START_MARGIN = 0.05
+
+# The search for a point with positive denominators ends when all exceed this.
+_FEASIBLE_MARGIN = 1e-3
+
+# Share of the way to the boundary that a step of the interior point goes (usual: .99 to .9995).
+_TO_BOUNDARY_SHARE = 0.99
+
+# Smallest share of the gap that the centring of a step aims at, so that slacks do not fall to zero at once.
+_LEAST_CENTRING = 1e-3
+
+# Relative increase of the diagonal of the Newton system, some thousand times its rounding.
+_REGULARISATION_SHARE = 1e-13
+
+# Shortest step that is tried where rows bend away from their linearisation.
+_SHORTEST_STEP = 1e-8
+
+# Steps to a boundary that is farther away than this many steps count as this long.
+_LONGEST_TO_BOUNDARY = 1e3
 
 
 @dataclass(frozen=True, eq=False)
 class PlaneRows:
-    """R rows on F plane vectors: at (R,) position k of each row; A (R, 2, 2), a (R, 2) numerator; e (R,),
-    E (R, 2), C (R, 2, 2), c (R, 2) denominator."""
+    """R ratios |A y + a|/(e + E y - |C y + c|), each of one of F plane vectors y (2,).
+
+    Parameters
+    ----------
+    at : (R,) integer array
+        Which of the F vectors each row looks at.
+    A, a : (R, 2, 2), (R, 2) array
+        Numerator.
+    e, E, C, c : (R,), (R, 2), (R, 2, 2), (R, 2) array
+        Denominator.
+    """
 
     at: Integer
     A: Real
@@ -45,35 +95,37 @@ class PlaneRows:
 
     @classmethod
     def stacked(cls, parts: Sequence[PlaneRows]) -> PlaneRows:
-        """All of them together."""
-        names = (field.name for field in fields(cls))
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        """Rows of all parts, which look at the same F vectors, one part after the other."""
+        values = []
+        for field in fields(cls):
+            values.append(np.concatenate([getattr(part, field.name) for part in parts]))
+        return cls(*values)
 
     def numerator(self, y: Real) -> Real:
-        """|A y + a| for y (F, 2): (R,)."""
+        """|A y + a|, (R,), for vectors y (F, 2)."""
         vector = np.einsum("rij,rj->ri", self.A, y[self.at]) + self.a
         return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))
 
     def denominator(self, y: Real) -> Real:
-        """e + E y - |C y + c| for y (F, 2): (R,)."""
+        """e + E y - |C y + c|, (R,), for vectors y (F, 2)."""
         vector = np.einsum("rij,rj->ri", self.C, y[self.at]) + self.c
-        return np.asarray(
-            self.e + np.einsum("rj,rj->r", self.E, y[self.at]) - np.hypot(vector[:, 0], vector[:, 1])
-        )
+        level = self.e + np.einsum("rj,rj->r", self.E, y[self.at])
+        return np.asarray(level - np.hypot(vector[:, 0], vector[:, 1]))
 
     def ratio(self, y: Real) -> Real:
-        """Numerator over denominator for y (F, 2): (R,); infinite where the denominator is not positive."""
+        """Numerator over denominator, (R,), for vectors y (F, 2); infinite where the denominator is not
+        positive."""
         return np.asarray(quotient(self.numerator(y), self.denominator(y), np.inf))
 
 
 def plane(value: Complex) -> Real:
-    """(R,) complex as (R, 2) real."""
+    """Complex numbers (R,) as vectors of the plane (R, 2): real and imaginary part."""
     return np.stack([value.real, value.imag], axis=-1)
 
 
 class MinimaxPoint(NamedTuple):
-    """x (n,) of the original basis, gamma = largest ratio there; infinite if no x makes every denominator
-    positive."""
+    """A point of the programme: x (n,) in the original basis, and gamma, the largest ratio there; gamma is
+    infinite if no x was found that makes every denominator positive."""
 
     x: Real
     gamma: float
@@ -87,38 +139,75 @@ def smallest_ratio(
     most_rounds: int = 30,
     accuracy: float = 1e-5,
 ) -> MinimaxPoint:
-    """Minimise the largest numerator/denominator over real x (n,), to a relative accuracy.
+    """Point with the smallest largest ratio of numerator over denominator.
 
-    basis (F, n): y = basis x. start: x (n,) to begin from; else the least-squares solution of the numerators,
-    shortened until all denominators are positive.
+    Parameters
+    ----------
+    basis : (F, n) complex array
+        The vectors are y = basis x, as complex numbers, for real x.
+    rows : PlaneRows
+        R ratios of these F vectors.
+    start : (n,) array or None
+        Where to begin, if all denominators are positive there; else at the least-squares solution of the
+        numerators, shortened until they are.
+    most_rounds : int
+        Of Dinkelbach's iteration; 3 to 8 are usual.
+    accuracy : float
+        Relative, of gamma.
+
+    Returns
+    -------
+    MinimaxPoint
+        Its gamma is the exact largest ratio at its x. Infinite where no x with positive denominators was
+        found.
     """
-    step = _Scaled(basis, rows, accuracy)
-    if start is not None and not np.min(rows.denominator(plane(basis @ start))) > 0:
-        start = None
-    z = step.least_squares() if start is None else step.back @ start
+    programme = _Scaled(basis, rows, accuracy)
+    if start is not None:
+        start_is_feasible = np.min(rows.denominator(plane(basis @ start))) > 0
+        if not start_is_feasible:
+            start = None
+    # Coordinates z of the start.
     if start is None:
-        for _ in range(30):
-            if np.min(rows.denominator(step.planar @ z)) > 0.05:
+        z = programme.least_squares()
+        for _ in range(_MOST_START_SHORTENINGS):
+            if np.min(rows.denominator(programme.planar @ z)) > _START_MARGIN:
                 break
-            z = 0.7 * z
-    if not np.isfinite(step.ratio(z)):
-        z = step.lower(z, 0.0, np.ones(rows.at.size), stop_below=-1e-3, feasibility=True)
-    gamma = step.ratio(z)
-    for _ in range(most_rounds if np.isfinite(gamma) else 0):
-        new = step.lower(z, gamma, rows.denominator(step.planar @ z))
-        reached = step.ratio(new)
-        if not reached < gamma:
+            z = _START_SHORTENING * z
+    else:
+        z = programme.back @ start
+    if not np.isfinite(programme.ratio(z)):
+        unit_scale = np.ones(rows.at.size)
+        z = programme.lower(z, 0.0, unit_scale, stop_below=-_FEASIBLE_MARGIN, feasibility=True)
+    gamma = programme.ratio(z)
+    if not np.isfinite(gamma):
+        return MinimaxPoint(programme.map @ z, gamma)
+    for _ in range(most_rounds):
+        lowered = programme.lower(z, gamma, rows.denominator(programme.planar @ z))
+        lowered_gamma = programme.ratio(lowered)
+        if not lowered_gamma < gamma:
             break
-        gain, z, gamma = gamma - reached, new, reached
-        if gain < accuracy * gamma or step.constant:
+        gain = gamma - lowered_gamma
+        z = lowered
+        gamma = lowered_gamma
+        # With constant denominators one round is the answer.
+        if gain < accuracy * gamma or programme.constant:
             break
-    return MinimaxPoint(step.map @ z, gamma)
+    return MinimaxPoint(programme.map @ z, gamma)
 
 
 @dataclass(frozen=True, eq=False)
 class Exchanged:
-    """Best x (n,) of an exchange (None: no round found one), its values (F,) on every dense grid, and the
-    gamma of the last programme."""
+    """Best point of an exchange of frequencies.
+
+    Parameters
+    ----------
+    x : (n,) array or None
+        None: no round found a point with positive denominators.
+    values : list of (F,) arrays
+        Values at x on every dense grid.
+    gamma : float
+        Of the last programme, on its lean grids.
+    """
 
     x: Real | None
     values: list[Real]
@@ -126,8 +215,8 @@ class Exchanged:
 
     @property
     def worst(self) -> float:
-        """Largest of the values; infinite without any."""
-        return max((float(np.max(each)) for each in self.values), default=float("inf"))
+        """Largest of the values on all dense grids; infinite without any."""
+        return max((float(np.max(value)) for value in self.values), default=float("inf"))
 
 
 def exchanged(
@@ -140,10 +229,30 @@ def exchanged(
     most: int,
     start: Real | None = None,
 ) -> Exchanged:
-    """Solve on the grids, check on the dense ones, add what is violated to the grids (in place), and again.
+    """Best point of a programme on lean grids to which violated frequencies of dense ones are added.
 
-    solve: from a start (n,) to the optimum on the grids as they are. check: x to its values at the
-    frequencies `dense`, of which up to `most` maxima of each grid are added. Ends when none exceeds gamma.
+    Parameters
+    ----------
+    solve : callable
+        From a start (n,), or None, to the optimum on the grids as they are.
+    check : callable
+        From x (n,) to its values (F,) at the frequencies of every dense grid.
+    grids : list of (G,) arrays
+        Lean grids in rad/s, which `solve` reads; changed in place.
+    dense : sequence of (F,) arrays
+        Dense grids in rad/s, one for each lean one.
+    rounds : int
+        Exchanges at most; the programme is solved once more than that.
+    most : int
+        Largest maxima of each dense grid that are added in a round.
+    start : (n,) array or None
+        For the first programme; each later one begins at the last optimum.
+
+    Returns
+    -------
+    Exchanged
+        The point with the smallest worst value. Ends when no value exceeds gamma by more than
+        `EXCHANGE_TOLERANCE`.
     """
     best = Exchanged(None, [], 0.0)
     for _ in range(rounds + 1):
@@ -152,10 +261,10 @@ def exchanged(
             break
         start = point.x
         values = check(start)
-        found = Exchanged(start, values, point.gamma)
-        best = found if found.worst < best.worst else replace(best, gamma=point.gamma)
+        candidate = Exchanged(start, values, point.gamma)
+        best = candidate if candidate.worst < best.worst else replace(best, gamma=point.gamma)
         limit = point.gamma * (1.0 + EXCHANGE_TOLERANCE)
-        if found.worst <= limit:
+        if candidate.worst <= limit:
             break
         for number, (omega, value) in enumerate(zip(dense, values, strict=True)):
             grids[number] = with_violations(grids[number], omega, value, limit, most)
@@ -163,64 +272,105 @@ def exchanged(
 
 
 class _Scaled:
-    """The rows in coordinates z that are orthonormal as seen by them: x = map z, z = back x, y = planar z.
+    """The rows in coordinates z (m,) that are orthonormal as seen by them, and the convex programme in z.
 
-    All rows at one frequency see the same y: what they say of z is said of y first, in the plane.
+    map (n, m) and back (m, n): x = map z, z = back x. planar (F, 2, m): y = planar z. constant: no
+    denominator depends on x. All rows at one frequency see the same y: what they say of z is said of y first,
+    in the plane, and summed over the rows there before it is taken to z.
     """
 
     def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
-        self.rows, self.accuracy = rows, accuracy
-        planar = np.stack([basis.real, basis.imag], axis=1)  # (F, 2, n)
-        seen = np.einsum("rji,rjk->rik", rows.A, rows.A) + np.einsum("rji,rjk->rik", rows.C, rows.C)
-        triangle = np.linalg.qr(_half(_summed(rows.at, seen, len(basis)), planar), mode="r")
+        """Coordinates for basis (F, n) complex and R rows; accuracy is that of gamma, relative."""
+        self.rows = rows
+        self.accuracy = accuracy
+        planar = np.stack([basis.real, basis.imag], axis=1)
+        # Gram matrix of all that rows see of x, by its factor: singular values tell which directions are
+        # rounding.
+        numerator_gram = np.einsum("rji,rjk->rik", rows.A, rows.A)
+        reach_gram = np.einsum("rji,rjk->rik", rows.C, rows.C)
+        gram = _summed(rows.at, numerator_gram + reach_gram, len(basis))
+        triangle = np.linalg.qr(_half(gram, planar), mode="r")
         _, sizes, directions = np.linalg.svd(triangle)
-        keep = sizes > _KEPT * sizes[0]
-        self.map = directions[keep].T / sizes[keep] * np.sqrt(rows.at.size)
-        self.back = (directions[keep] * sizes[keep][:, None]) / np.sqrt(rows.at.size)
-        self.planar = planar @ self.map  # (F, 2, m)
+        is_direction = sizes > _SMALLEST_SINGULAR_SHARE * sizes[0]
+        directions = directions[is_direction]
+        sizes = sizes[is_direction]
+        self.map = directions.T / sizes * np.sqrt(rows.at.size)
+        self.back = (directions * sizes[:, None]) / np.sqrt(rows.at.size)
+        self.planar = planar @ self.map
         self.constant = not (np.any(rows.C) or np.any(rows.E))
-        self._reach_rounding = _ROUND_REACH
+        self._reach_rounding = _REACH_ROUNDING
         self._fixed_reach = np.hypot(rows.c[:, 0], rows.c[:, 1])
 
     def least_squares(self) -> Real:
+        """z (m,) with the smallest sum of squared numerators."""
         rows = self.rows
         seen = np.matmul(rows.A, self.planar[rows.at]).reshape(-1, self.planar.shape[2])
         return np.asarray(np.linalg.lstsq(seen, -rows.a.reshape(-1), rcond=None)[0])
 
     def ratio(self, z: Real) -> float:
+        """Largest ratio of all rows at z (m,); infinite where a denominator is not positive."""
         return float(np.max(self.rows.ratio(self.planar @ z)))
 
     def seen(self, z: Real) -> Real:
-        """y of every row, (R, 2)."""
+        """Vector y that every row looks at, (R, 2), for z (m,)."""
         return np.asarray((self.planar @ z)[self.rows.at])
 
     def onto_z(self, vectors: Real) -> Real:
-        """Sum of forms vector y over the rows, (R, 2), as one form of z, (m,)."""
+        """Sum over the rows of the linear forms vectors (R, 2) of their y, as one linear form (m,) of z."""
         summed = _summed(self.rows.at, vectors, len(self.planar))
         return np.asarray(summed.reshape(-1) @ self.planar.reshape(-1, self.planar.shape[2]))
 
     def lower(
         self, z: Real, gamma: float, scale: Real, *, stop_below: float = -np.inf, feasibility: bool = False
     ) -> Real:
-        """z with the smallest max h, h = (|A y + a| - gamma m(y))/scale; for feasibility h = -m(y).
+        """Coordinates with the smallest largest h of all rows, h = (|A y + a| - gamma m(y))/scale.
 
-        Primal-dual interior point for min v, h - v + slack = 0, with predictor and corrector; slacks are
-        variables of their own. Ends when the gap is below a twentieth of what was gained, or at full
-        accuracy.
+        Parameters
+        ----------
+        z : (m,) array
+            Where to begin.
+        gamma : float
+            Fixed in this programme.
+        scale : (R,) array
+            Denominators m(y) at the point that gave gamma.
+        stop_below : float
+            The largest h below which the search ends.
+        feasibility : bool
+            h = -m(y) instead: to make all denominators positive.
+
+        Returns
+        -------
+        (m,) array
+            The best of the points passed.
+
+        Notes
+        -----
+        Primal-dual interior point for min v with h - v + slack = 0, predictor and corrector (Mehrotra, SIAM
+        J. Optimization 2, 1992); slacks are variables of their own. It ends when the gap is below a twentieth
+        of what was gained, as the next gamma changes the programme anyway, or at full accuracy where this is
+        the last one.
         """
-        weight = 0.0 if feasibility else 1.0
-        factor = 1.0 if feasibility else gamma
-        self._reach_rounding = _ROUND_FEASIBILITY if feasibility else _ROUND_REACH
+        if feasibility:
+            weight = 0.0
+            factor = 1.0
+            self._reach_rounding = _FEASIBILITY_ROUNDING
+        else:
+            weight = 1.0
+            factor = gamma
+            self._reach_rounding = _REACH_ROUNDING
         n = z.size
         h = self._values(z, weight, factor, scale)
         begin = float(np.max(h))
+        # Slacks to begin with are a tenth of the size of gamma, duals their inverses.
         v = begin + 0.1 * factor
         slack = v - h
         dual = 1.0 / slack
         dual /= np.sum(dual)
-        best, best_value = z, begin
-        final = feasibility or self.constant
+        best = z
+        best_value = begin
+        is_last_programme = feasibility or self.constant
         for _ in range(_MOST_STEPS):
+            # Newton system of z and v, with the slacks and duals eliminated.
             by_row, blocks = self._derivatives(z, weight, factor, scale, dual)
             miss = h - v + slack
             ratio = dual / slack
@@ -228,12 +378,16 @@ class _Scaled:
             blocks += by_row[:, :, None] * weighted[:, None, :]
             half = _half(_summed(self.rows.at, blocks, len(self.planar)), self.planar)
             matrix = np.empty((n + 1, n + 1))
-            matrix[:n, :n] = half.T @ half  # of an array with itself: half the work
-            matrix[:n, n] = matrix[n, :n] = -self.onto_z(weighted)
+            # A product of an array with itself is half the work.
+            matrix[:n, :n] = half.T @ half
+            coupling = -self.onto_z(weighted)
+            matrix[:n, n] = coupling
+            matrix[n, :n] = coupling
             matrix[n, n] = np.sum(ratio)
-            matrix[np.diag_indices(n + 1)] *= 1.0 + 1e-13
+            matrix[np.diag_indices(n + 1)] *= 1.0 + _REGULARISATION_SHARE
             factored = scipy.linalg.lu_factor(matrix, check_finite=False)
             gap = float(np.mean(dual * slack))
+            # Predictor towards a gap of zero, then corrector towards the share of the gap that it left.
             target: Real | float = 0.0
             for corrector in (False, True):
                 pull = target / slack + ratio * miss
@@ -246,109 +400,133 @@ class _Scaled:
                 primal_length = _to_boundary(slack, slack_step)
                 dual_length = _to_boundary(dual, dual_step)
                 if not corrector:
-                    ahead = slack + min(1.0, primal_length) * slack_step
-                    reached = float(np.mean(ahead * (dual + min(1.0, dual_length) * dual_step)))
-                    share = min(1.0, max(reached / gap, 0.0)) ** 3
-                    target = max(share, 1e-3) * gap - slack_step * dual_step
+                    predicted_slack = slack + min(1.0, primal_length) * slack_step
+                    predicted_dual = dual + min(1.0, dual_length) * dual_step
+                    predicted_gap = float(np.mean(predicted_slack * predicted_dual))
+                    share = min(1.0, max(predicted_gap / gap, 0.0)) ** 3
+                    target = max(share, _LEAST_CENTRING) * gap - slack_step * dual_step
+            # The system has become singular to working precision: the best point stands.
             if not np.all(np.isfinite(step)):
-                break  # the system has become singular to working precision: the best point stands
-            length = min(1.0, 0.99 * min(primal_length, dual_length))
+                break
+            length = min(1.0, _TO_BOUNDARY_SHARE * min(primal_length, dual_length))
             # What convex rows lie above their linearisation is its error: far from the kinks steps would run
             # away.
-            allowed = float(np.max(slack))
-            h_new = self._values(z + length * step[:n], weight, factor, scale)
-            while np.max(h_new - h - length * rise) > allowed and length > 1e-8:
+            largest_error = float(np.max(slack))
+            new_h = self._values(z + length * step[:n], weight, factor, scale)
+            while np.max(new_h - h - length * rise) > largest_error and length > _SHORTEST_STEP:
                 length *= 0.5
-                h_new = self._values(z + length * step[:n], weight, factor, scale)
-            z, v = z + length * step[:n], v + length * float(step[n])
-            slack, dual = slack + length * slack_step, dual + length * dual_step
-            h = h_new
+                new_h = self._values(z + length * step[:n], weight, factor, scale)
+            z = z + length * step[:n]
+            v = v + length * float(step[n])
+            slack = slack + length * slack_step
+            dual = dual + length * dual_step
+            h = new_h
             largest = float(np.max(h))
             if largest < best_value:
-                best, best_value = z, largest
-            gained = max(begin - best_value, 0.0)
-            enough = (0.3 if final else 0.1) * self.accuracy * factor
-            enough = enough if final else max(0.05 * gained, enough)
-            if best_value < stop_below or (
-                float(dual @ slack) < enough
-                and largest - best_value < enough
-                and np.max(h - v + slack) < enough
-            ):
+                best = z
+                best_value = largest
+            # What gap and error end the programme: a fraction of the accuracy asked for, in units of gamma.
+            if is_last_programme:
+                small = 0.3 * self.accuracy * factor
+            else:
+                gained = max(begin - best_value, 0.0)
+                small = max(0.05 * gained, 0.1 * self.accuracy * factor)
+            gap_is_closed = float(dual @ slack) < small and largest - best_value < small
+            if best_value < stop_below or (gap_is_closed and np.max(h - v + slack) < small):
                 break
         return best
 
     def _parts(self, z: Real, rounding: Real) -> tuple[Real, Real, Real, Real, Real]:
-        """Vectors A y + a and C y + c, their rounded sizes, and e + E y."""
-        r, y = self.rows, self.seen(z)
-        p = np.einsum("rij,rj->ri", r.A, y) + r.a
+        """Parts of all rows at z (m,): vectors p = A y + a and q = C y + c (R, 2), their sizes (R,) rounded
+        at the kink, and e + E y (R,). rounding (R,): radius for the numerators. For constant denominators q
+        is not used and stands for p."""
+        rows = self.rows
+        y = self.seen(z)
+        p = np.einsum("rij,rj->ri", rows.A, y) + rows.a
         size_p = np.sqrt(p[:, 0] ** 2 + p[:, 1] ** 2 + rounding**2)
         if self.constant:
-            return p, p, size_p, self._fixed_reach, r.e
-        q = np.einsum("rij,rj->ri", r.C, y) + r.c
+            return p, p, size_p, self._fixed_reach, rows.e
+        q = np.einsum("rij,rj->ri", rows.C, y) + rows.c
         size_q = np.sqrt(q[:, 0] ** 2 + q[:, 1] ** 2 + self._reach_rounding**2)
-        return p, q, size_p, size_q, r.e + np.sum(r.E * y, axis=1)
+        level = rows.e + np.sum(rows.E * y, axis=1)
+        return p, q, size_p, size_q, level
 
     def _values(self, z: Real, weight: float, gamma: float, scale: Real) -> Real:
-        _, _, size_p, size_q, level = self._parts(z, _ROUND_NUMERATOR * gamma * scale)
+        """h (R,) of all rows at z (m,): (weight |A y + a| - gamma m(y))/scale with rounded kinks."""
+        rounding = _NUMERATOR_ROUNDING_SHARE * gamma * scale
+        _, _, size_p, size_q, level = self._parts(z, rounding)
         return np.asarray((weight * size_p - gamma * (level - size_q)) / scale)
 
     def _derivatives(
         self, z: Real, weight: float, gamma: float, scale: Real, dual: Real
     ) -> tuple[Real, Real]:
-        """Gradients of h by y (R, 2), and dual times its Hessians (R, 2, 2).
+        """Gradients (R, 2) of h by the y of each row, and dual (R,) times its Hessians (R, 2, 2), at z (m,).
 
-        The Hessian of sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
+        The Hessian of size = sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
         """
-        r, rounding = self.rows, _ROUND_NUMERATOR * gamma * scale
+        rows = self.rows
+        rounding = _NUMERATOR_ROUNDING_SHARE * gamma * scale
         p, q, size_p, size_q, _ = self._parts(z, rounding)
         share = dual / scale
-        gradient, hessian = _norm_derivatives(r.A, p, size_p, rounding, weight * share)
+        gradient, hessian = _norm_derivatives(rows.A, p, size_p, rounding, weight * share)
         gradient *= (weight / scale)[:, None]
         if not self.constant:
-            reach, curved = _norm_derivatives(
-                r.C, q, size_q, np.full(size_q.size, self._reach_rounding), gamma * share
+            reach_rounding = np.full(size_q.size, self._reach_rounding)
+            reach_gradient, reach_hessian = _norm_derivatives(
+                rows.C, q, size_q, reach_rounding, gamma * share
             )
-            gradient += (gamma / scale)[:, None] * (reach - r.E)
-            hessian += curved
+            gradient += (gamma / scale)[:, None] * (reach_gradient - rows.E)
+            hessian += reach_hessian
         return gradient, hessian
 
 
 def _summed(at: Integer, values: Real, count: int) -> Real:
-    """Sum of values (R, ...) over the rows at each of count frequencies, (count, ...)."""
+    """Sum of values (R, ...) over the rows that look at each of `count` vectors, (count, ...); at (R,)."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(at, weights=column, minlength=count) for column in flat.T]
     return np.asarray(np.stack(columns, axis=1).reshape(count, *values.shape[1:]), dtype=np.float64)
 
 
 def _half(blocks: Real, planar: Real) -> Real:
-    """H (2 F, m) with H^T H = sum of P^T B P over the frequencies, B (F, 2, 2) not negative, P (F, 2, m)."""
-    first, both, second = blocks[:, 0, 0], blocks[:, 0, 1], blocks[:, 1, 1]
-    root = np.sqrt(first)
-    beside = np.divide(both, root, out=np.zeros_like(root), where=root > 0)
-    rest = np.sqrt(np.maximum(second - beside**2, 0.0))
+    """H (2 F, m) with H^T H = sum over F of P^T B P, for blocks B (F, 2, 2), symmetric and not negative, and
+    planar P (F, 2, m): each B by its Cholesky factor."""
+    first_root = np.sqrt(blocks[:, 0, 0])
+    cross = np.divide(blocks[:, 0, 1], first_root, out=np.zeros_like(first_root), where=first_root > 0)
+    second_root = np.sqrt(np.maximum(blocks[:, 1, 1] - cross**2, 0.0))
     half = np.empty((2, *planar.shape[::2]))
-    np.multiply(root[:, None], planar[:, 0], out=half[0])
-    half[0] += beside[:, None] * planar[:, 1]
-    np.multiply(rest[:, None], planar[:, 1], out=half[1])
+    np.multiply(first_root[:, None], planar[:, 0], out=half[0])
+    half[0] += cross[:, None] * planar[:, 1]
+    np.multiply(second_root[:, None], planar[:, 1], out=half[1])
     return half.reshape(-1, planar.shape[2])
 
 
 def _to_boundary(value: Real, step: Real) -> float:
-    """Largest length of the step for which all values stay positive, at most a long way."""
+    """Largest length of a step (R,) for which all positive values (R,) stay so, at most
+    `_LONGEST_TO_BOUNDARY`."""
     falling = step < 0
-    return float(np.min(-value[falling] / step[falling], initial=1e3))
+    return float(np.min(-value[falling] / step[falling], initial=_LONGEST_TO_BOUNDARY))
 
 
 def _norm_derivatives(
     forms: Real, vector: Real, size: Real, rounding: Real, weight: Real
 ) -> tuple[Real, Real]:
-    """Gradients (R, 2) of the rounded norms of vector = forms y, weight times their Hessians (R, 2, 2)."""
+    """Gradients (R, 2) by y of the rounded norms of R plane vectors, and weight times their Hessians (R, 2,
+    2).
+
+    vector (R, 2) = forms (R, 2, 2) y + a constant; size (R,) = sqrt(|vector|^2 + rounding^2); weight (R,).
+    Where a vector is zero its direction does not matter, and the first axis is taken.
+    """
     length = np.hypot(vector[:, 0], vector[:, 1])
-    u = np.where(length[:, None] > 0, vector, [1.0, 0.0]) / np.where(length > 0, length, 1.0)[:, None]
-    along = u[:, 0, None] * forms[:, 0] + u[:, 1, None] * forms[:, 1]
+    is_positive = length > 0
+    direction = np.where(is_positive[:, None], vector, [1.0, 0.0])
+    direction = direction / np.where(is_positive, length, 1.0)[:, None]
+    u_x = direction[:, 0, None]
+    u_y = direction[:, 1, None]
+    along = u_x * forms[:, 0] + u_y * forms[:, 1]
+    across = u_x * forms[:, 1] - u_y * forms[:, 0]
     gradient = along * (length / size)[:, None]
-    across = u[:, 0, None] * forms[:, 1] - u[:, 1, None] * forms[:, 0]
-    each = weight / size
-    hessian = each[:, None, None] * across[:, :, None] * across[:, None, :]
-    hessian += (each * (rounding / size) ** 2)[:, None, None] * along[:, :, None] * along[:, None, :]
+    curvature = weight / size
+    hessian = curvature[:, None, None] * across[:, :, None] * across[:, None, :]
+    along_curvature = curvature * (rounding / size) ** 2
+    hessian += along_curvature[:, None, None] * along[:, :, None] * along[:, None, :]
     return gradient, hessian

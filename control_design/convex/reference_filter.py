@@ -1,9 +1,10 @@
 """Second degree of freedom: u = K (F r - y), F chosen so that every member of the ellipses follows a model.
 
-The error of a member G is W (F T - T_ref), T = G K/(1 + G K), affine in F: with chosen poles a convex minimax
-over boundary samples of the ellipses, where the worst member lies (T is free of poles by robust stability).
-The certified error is exact at every frequency of a dense grid: |a G + b| <= h |1 + k G| is a disc or the
-outside of one.
+The error of a member G is W (F T - T_ref), T = G K/(1 + G K), which is affine in F. With chosen poles of F it
+is a convex minimax over samples of the ellipses' boundaries, where the worst member lies (T is free of poles
+by robust stability); poles that are not given are searched by a simplex around it. The certified error is not
+sampled: `worst_matching_error` is exact at every frequency of a dense grid. `design_reference_filter` is the
+way in, `ReferenceFilter` the result.
 """
 
 from __future__ import annotations
@@ -32,15 +33,55 @@ from ident.basis.functions import basis_state_space
 from ident.basis.poles import Poles
 from ident.data.arrays import factor_matrices, readonly
 
-_BOUNDARY_SAMPLES = 24  # of every ellipse
-_ACCURACY = 1e-7  # of the certified errors, which are rounded up
+# Points on the boundary of every ellipse in the programme; the search of poles takes half of them. The
+# inscribed polygon misses 1 - cos(pi/24) = 0.9 % of the half axis, and the dense check is exact.
+_BOUNDARY_SAMPLES = 24
+
+# Relative accuracy of the certified errors, which are rounded up.
+_ACCURACY = 1e-7
+
+# The search of poles takes every third frequency of the grids.
+_SEARCH_THINNING = 3
+
+# Decay rates that are searched lie between these shares of the Nyquist frequency; starts keep the distance
+# from both ends in logarithms.
+_SLOWEST_SHARE = 1e-5
+_FASTEST_SHARE = 0.95
+_LOG_DISTANCE_FROM_ENDS = 0.1
+
+# Starts of the simplex: the poles are spread by factors of four around the model's corner times each of
+# these.
+_POLE_SPREAD = 4.0
+_START_FACTORS = (0.3, 1.0, 4.0)
+
+# Evaluations of the simplex for each pole, and its tolerances: 1 % of a decay rate, 1e-4 of the error.
+_EVALUATIONS_PER_POLE = 30
+_LOG_RATE_TOLERANCE = 1e-2
+_ERROR_TOLERANCE = 1e-4
+
+# Frequencies that are added to each plant's grid in a round, at most.
+_MOST_ADDED = 12
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFilter(Law):
-    """r_filtered = F r: x+ = A x + B r, C x + D r, SISO and stable. error_before, error_after: largest
-    weighted model-matching error over all plants and ellipses with F = 1 and with F, on the dense grid;
-    worst_rad_s: where."""
+    """Reference filter x+ = A x + B r, filtered reference = C x + D r, one input and one output, stable.
+
+    Beside the matrices and dt_s of `Law` it holds what its design reached:
+
+    Parameters
+    ----------
+    error_before, error_after : float
+        Largest weighted model-matching error over all plants and ellipses, without a filter (F = 1) and with
+        it, on the dense grid.
+    worst_rad_s : float
+        Frequency of the largest error with the filter.
+
+    Raises
+    ------
+    ValueError
+        For a filter that is not stable, or a negative error or frequency.
+    """
 
     kind = "reference filter"
     equations = "x+ = A x + B r; filtered reference = C x + D r"
@@ -50,6 +91,7 @@ class ReferenceFilter(Law):
     worst_rad_s: float
 
     def __post_init__(self) -> None:
+        """Check stability and the reached errors."""
         super().__post_init__()
         if self.order and not np.max(np.abs(self.poles)) < 1:
             raise ValueError("the reference filter is not stable")
@@ -58,7 +100,8 @@ class ReferenceFilter(Law):
                 raise ValueError(f"reference filter {name} must not be negative; got {getattr(self, name)}")
 
     def filtered(self, reference: Real) -> Real:
-        """The reference (T,) behind the filter, from rest: what `closed_loop.simulate` takes."""
+        """Reference (T,) behind the filter, from rest: what `closed_loop.simulate` takes. Raises ValueError
+        for an array of another shape."""
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
             raise ValueError(f"reference must be (T,); got {reference.shape}")
@@ -67,14 +110,20 @@ class ReferenceFilter(Law):
 
 @lru_cache(maxsize=8)
 def _filtered(law: ReferenceFilter, reference: bytes) -> Real:
-    # Trials of one loop have one reference; stepping through it in Python takes longer than the loop.
+    """Filtered reference (T,) for the bytes of a reference (T,) of doubles. Kept, because trials of one loop
+    have one reference, and stepping through it in Python takes longer than the loop."""
     outputs = control.forced_response(law.to_control(), inputs=np.frombuffer(reference)).outputs
     return np.asarray(readonly(outputs))
 
 
 def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: Ellipses) -> Real:
-    """max over G in E of |F G k/(1 + G k) - T_ref| at every frequency, (F,); inf where a member puts the loop
-    on -1. Controller k, follow F, model T_ref: (F,). The error is |(F - T_ref) k G - T_ref|/|1 + k G|."""
+    """Largest |F G k/(1 + G k) - T_ref| over G in each ellipse, (F,); inf where a member puts the loop on -1.
+
+    k, follow, model : (F,) complex arrays
+        Controller, reference filter F and model T_ref at the frequencies of the ellipses.
+
+    The error is |(F - T_ref) k G - T_ref|/|1 + k G|, a `largest_ratio`.
+    """
     return largest_ratio((follow - model) * k, -model, k, ellipses, accuracy=_ACCURACY)
 
 
@@ -88,9 +137,30 @@ def design_reference_filter(
 ) -> ReferenceFilter:
     """Reference filter with the smallest worst-case |W (F T - T_ref)| over all plants and their ellipses.
 
-    model: T_ref(s), weight: W(s) or None for 1, both at the Tustin frequency. Poles that are not given are
-    searched by a simplex from the model's corner. Raises ValueError if an ellipse reaches -1, sampling times
-    differ, or a pole is not in (0, Nyquist).
+    Parameters
+    ----------
+    controller : Controller
+        Of a loop that is robustly stable with every plant.
+    plants : UncertainPlant or sequence of them
+        With the controller's sampling period.
+    model : RationalWeight
+        T_ref(s), at the Tustin frequency.
+    options : ReferenceFilterOptions or None
+        Order or poles of F, and grids. Poles that are not given are searched by a simplex from the model's
+        corner.
+    weight : RationalWeight or None
+        W(s), at the Tustin frequency; None: 1.
+
+    Returns
+    -------
+    ReferenceFilter
+        With its certified error on the dense grid.
+
+    Raises
+    ------
+    ValueError
+        Without a plant, if an ellipse reaches -1, sampling times differ, a nominal loop is unstable, or a
+        pole is not between 0 and Nyquist.
     """
     options = options or ReferenceFilterOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
@@ -100,7 +170,7 @@ def design_reference_filter(
 
 
 class _Matching:
-    """Grids and loops of one reference filter design."""
+    """Grids and loops of one reference filter design, and the programmes on them."""
 
     def __init__(
         self,
@@ -110,8 +180,14 @@ class _Matching:
         weight: RationalWeight | None,
         options: ReferenceFilterOptions,
     ) -> None:
-        self.controller, self.plants, self.options = controller, plants, options
-        self.model, self.weight, self.dt_s = model, weight or constant_weight(1.0), controller.dt_s
+        """Grids of every plant; refuses loops that are not robustly stable (see
+        `design_reference_filter`)."""
+        self.controller = controller
+        self.plants = plants
+        self.options = options
+        self.model = model
+        self.weight = weight or constant_weight(1.0)
+        self.dt_s = controller.dt_s
         self.grids: list[Real] = []
         self.dense: list[Ellipses] = []
         for plant in plants:
@@ -131,26 +207,32 @@ class _Matching:
                 )
 
     def solve(self) -> ReferenceFilter:
-        poles = self._given_poles()
+        """The filter with the poles of the options, or searched ones."""
+        poles = self._stated_poles()
         if poles is None:
             poles = self._searched_poles()
-        before = max(float(np.max(each)) for each in self._errors(Poles(), np.ones(1)))
+        error_before = max(float(np.max(errors)) for errors in self._errors(Poles(), np.ones(1)))
         best = exchanged(
             lambda _: self._coefficients(poles, self.grids, _BOUNDARY_SAMPLES),
             lambda x: self._errors(poles, self._full(poles, x)),
             self.grids,
             self._omegas,
             rounds=self.options.exchange_rounds,
-            most=12,
+            most=_MOST_ADDED,
         )
+        # Denominators of this programme are constant, so there always is a point.
         assert best.x is not None
-        full, errors = self._full(poles, best.x), np.concatenate(best.values)
-        where = float(np.concatenate(self._omegas)[np.argmax(errors)])
+        coefficients = self._full(poles, best.x)
+        errors = np.concatenate(best.values)
+        worst_rad_s = float(np.concatenate(self._omegas)[np.argmax(errors)])
         a, b, _, _ = basis_state_space(poles)
-        d = np.array([[full[0]]])
-        return ReferenceFilter(a, b, full[None, 1:], d, self.dt_s, before, best.worst, where)
+        c = coefficients[None, 1:]
+        d = np.array([[coefficients[0]]])
+        return ReferenceFilter(a, b, c, d, self.dt_s, error_before, best.worst, worst_rad_s)
 
-    def _given_poles(self) -> Poles | None:
+    def _stated_poles(self) -> Poles | None:
+        """Poles in z that the options state: from decay rates in rad/s, none for order 0; None: to be
+        searched. Raises ValueError for a rate outside of (0, Nyquist)."""
         rates = self.options.poles_rad_s
         if rates is None:
             return Poles() if self.options.order == 0 else None
@@ -162,99 +244,140 @@ class _Matching:
         return Poles(np.exp(-self.dt_s * np.array(rates)))
 
     def _searched_poles(self) -> Poles:
-        """Simplex search of the logarithmic decay rates on thinned grids, half the samples."""
-        thin = [grid[::3] for grid in self.grids]
-        samples = _BOUNDARY_SAMPLES // 2
+        """Real poles in z by a simplex over the logarithms of their decay rates, on thinned grids with half
+        the samples; the best of three starts."""
+        thin_grids = [grid[::_SEARCH_THINNING] for grid in self.grids]
+        n_samples = _BOUNDARY_SAMPLES // 2
+        n_poles = self.options.order
         nyquist = np.pi / self.dt_s
-        low, high = np.log(1e-5 * nyquist), np.log(0.95 * nyquist)
+        low = np.log(_SLOWEST_SHARE * nyquist)
+        high = np.log(_FASTEST_SHARE * nyquist)
 
-        def cost(logs: Real) -> float:
-            outside = float(np.sum(np.maximum(low - logs, 0) + np.maximum(logs - high, 0)))
-            poles = Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(logs), low, high))))
-            return self._coefficients(poles, thin, samples).gamma + outside
+        def poles_of(log_rates: Real) -> Poles:
+            """Poles in z for logarithms of decay rates (N,), which are brought into their limits."""
+            rates = np.exp(np.clip(np.sort(log_rates), low, high))
+            return Poles(np.exp(-self.dt_s * rates))
 
-        # Where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency.
+        def cost(log_rates: Real) -> float:
+            """Smallest error with these poles, and how far rates lie outside of their limits."""
+            excess = np.maximum(low - log_rates, 0) + np.maximum(log_rates - high, 0)
+            outside = float(np.sum(excess))
+            return self._coefficients(poles_of(log_rates), thin_grids, n_samples).gamma + outside
+
+        # Corner of the model: where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency,
+        # or a tenth of the highest one where it falls nowhere.
         omega = self.grids[0]
         size = np.abs(self._model_at(omega))
-        below = np.flatnonzero(size < size[0] / np.sqrt(2))
-        corner = float(omega[below[0]] if below.size else 0.1 * omega[-1])
-        spread = np.log(corner) + np.log(4.0) * (np.arange(self.options.order) - (self.options.order - 1) / 2)
-        answers = [
-            scipy.optimize.minimize(
-                cost,
-                np.clip(spread + shift, low + 0.1, high - 0.1),
-                method="Nelder-Mead",
-                options={"maxfev": 30 * self.options.order, "xatol": 1e-2, "fatol": 1e-4},
+        fallen = np.flatnonzero(size < size[0] / np.sqrt(2))
+        corner = float(omega[fallen[0]] if fallen.size else 0.1 * omega[-1])
+        from_middle = np.arange(n_poles) - (n_poles - 1) / 2
+        spread = np.log(corner) + np.log(_POLE_SPREAD) * from_middle
+        answers = []
+        for shift in np.log(_START_FACTORS):
+            start = np.clip(spread + shift, low + _LOG_DISTANCE_FROM_ENDS, high - _LOG_DISTANCE_FROM_ENDS)
+            answers.append(
+                scipy.optimize.minimize(
+                    cost,
+                    start,
+                    method="Nelder-Mead",
+                    options={
+                        "maxfev": _EVALUATIONS_PER_POLE * n_poles,
+                        "xatol": _LOG_RATE_TOLERANCE,
+                        "fatol": _ERROR_TOLERANCE,
+                    },
+                )
             )
-            for shift in np.log([0.3, 1.0, 4.0])
-        ]
         best = min(answers, key=lambda answer: float(answer.fun))
-        return Poles(np.exp(-self.dt_s * np.exp(np.clip(np.sort(best.x), low, high))))
+        return poles_of(best.x)
 
     def _model_at(self, omega: Real) -> Complex:
+        """T_ref (F,) complex at omega (F,) in rad/s."""
         return self.model.at(imaginary_axis(omega, self.dt_s))
 
     def _weight_at(self, omega: Real) -> Complex:
+        """W (F,) complex at omega (F,) in rad/s."""
         return self.weight.at(imaginary_axis(omega, self.dt_s))
 
     def _at_zero(self, poles: Poles) -> Real:
-        """Values of all basis functions at z = 1."""
+        """Values (1 + B,) of the constant and all basis functions at zero frequency, z = 1."""
         return np.asarray(np.real(with_constant(poles, np.zeros(1), self.dt_s)[0]))
 
     def _coefficients(self, poles: Poles, grids: Sequence[Real], samples: int) -> MinimaxPoint:
-        """Best free coefficients; with unit gain F = 1 + sum c_i (L_i - L_i(1)), else all of them."""
+        """Free coefficients of F with the smallest largest error at samples of all ellipses.
+
+        Parameters
+        ----------
+        poles : Poles
+            Of F, with B basis functions L_i.
+        grids : sequence of (G,) arrays
+            Frequencies of every plant in rad/s.
+        samples : int
+            Points on the boundary of each ellipse.
+
+        Returns
+        -------
+        MinimaxPoint
+            With unit gain F = 1 + sum c_i (L_i - L_i(1)), x (B,); else F = c_0 + sum c_i L_i, x (1 + B,).
+        """
         angle = 2 * np.pi * np.arange(samples) / samples
-        parts, bases, count = [], [], 0
+        parts = []
+        bases = []
+        n_frequencies = 0
         for plant, omega in zip(self.plants, grids, strict=True):
             ellipses = plant.at(omega)
             k = self.controller.response(omega)
             loop = ellipses.points(np.cos(angle)[:, None], np.sin(angle)[:, None]) * k
             tracking = loop / (1 + loop)
-            w, target = self._weight_at(omega), self._model_at(omega)
+            weight = self._weight_at(omega)
+            target = self._model_at(omega)
             basis = with_constant(poles, omega, self.dt_s)
+            # Error without any coefficient: T - T_ref for unit gain, as F begins at 1, else -T_ref.
             offset = np.zeros_like(tracking)
             if self.options.unit_gain:
-                offset, basis = tracking, basis[:, 1:] - self._at_zero(poles)[1:]
-            at = np.tile(np.arange(omega.size) + count, samples)
-            size, zero = at.size, np.zeros((at.size, 2))
+                offset = tracking
+                basis = basis[:, 1:] - self._at_zero(poles)[1:]
+            at = np.tile(np.arange(omega.size) + n_frequencies, samples)
+            no_slope = np.zeros((at.size, 2))
             parts.append(
                 PlaneRows(
-                    at,
-                    factor_matrices((w * tracking).ravel()),
-                    plane((w * (offset - target)).ravel()),
-                    np.ones(size),
-                    zero,
-                    np.zeros((size, 2, 2)),
-                    zero,
+                    at=at,
+                    A=factor_matrices((weight * tracking).ravel()),
+                    a=plane((weight * (offset - target)).ravel()),
+                    e=np.ones(at.size),
+                    E=no_slope,
+                    C=np.zeros((at.size, 2, 2)),
+                    c=no_slope,
                 )
             )
             bases.append(basis)
-            count += omega.size
+            n_frequencies += omega.size
         rows = PlaneRows.stacked(parts)
-        whole = np.concatenate(bases)
-        if whole.shape[1] == 0:
-            return MinimaxPoint(np.zeros(0), float(np.max(rows.numerator(np.zeros((whole.shape[0], 2))))))
-        return smallest_ratio(whole, rows)
+        whole_basis = np.concatenate(bases)
+        # Unit gain and no poles: F = 1, nothing to choose.
+        if whole_basis.shape[1] == 0:
+            errors = rows.numerator(np.zeros((whole_basis.shape[0], 2)))
+            return MinimaxPoint(np.zeros(0), float(np.max(errors)))
+        return smallest_ratio(whole_basis, rows)
 
     def _full(self, poles: Poles, x: Real) -> Real:
-        """Coefficients of the constant and all functions."""
+        """Coefficients (1 + B,) of the constant and all basis functions for free coefficients x: with unit
+        gain the constant is what makes F(1) = 1."""
         if not self.options.unit_gain:
             return x
-        return np.concatenate([[1.0 - float(x @ self._at_zero(poles)[1:])], x])
+        constant = 1.0 - float(x @ self._at_zero(poles)[1:])
+        return np.concatenate([[constant], x])
 
     @property
     def _omegas(self) -> list[Real]:
+        """Frequencies (F,) of every plant's dense grid in rad/s."""
         return [ellipses.omega_rad_s for ellipses in self.dense]
 
-    def _errors(self, poles: Poles, full: Real) -> list[Real]:
-        """Exact weighted errors of F on the dense grids."""
-        return [
-            np.abs(self._weight_at(omega))
-            * worst_matching_error(
-                self.controller.response(omega),
-                with_constant(poles, omega, self.dt_s) @ full,
-                self._model_at(omega),
-                e,
-            )
-            for omega, e in zip(self._omegas, self.dense, strict=True)
-        ]
+    def _errors(self, poles: Poles, coefficients: Real) -> list[Real]:
+        """Exact weighted errors (F,) of F on every plant's dense grid, for coefficients (1 + B,)."""
+        errors = []
+        for omega, ellipses in zip(self._omegas, self.dense, strict=True):
+            follow = with_constant(poles, omega, self.dt_s) @ coefficients
+            k = self.controller.response(omega)
+            error = worst_matching_error(k, follow, self._model_at(omega), ellipses)
+            errors.append(np.abs(self._weight_at(omega)) * error)
+        return errors

@@ -1,6 +1,6 @@
 """What any controller could reach: bounds on the worst case over the ellipses that know no order.
 
-Every controller that stabilises the nominal plant is K = (X + M Q)/(Y - N Q) with Q stable, and K S, S are
+Every controller that stabilises the nominal plant is K = (X + M Q)/(Y - N Q) with Q stable, and K S and S are
 affine in Q. For a member G = G_0 + D of the ellipse, S_G = S/(1 + D K S) and K S_G = K S/(1 + D K S), so with
 q = K S of the centre the worst case is at most gamma where
 
@@ -8,9 +8,10 @@ q = K S of the centre the worst case is at most gamma where
 
 For a disc of radius r, m = 1 - r |q| and the problem is convex: the disc inscribed in the ellipse gives a
 value that no controller goes below, the enclosing one a value some controller reaches. For the ellipse m =
-max over t of Re(e^{-jt}) - |half-axes of e^{-jt} q|, convex in Q for fixed t: from the enclosing disc's
-answer, t and Q in turn lead down to a local optimum, a controller's value again. A larger basis lowers all
-three a little: 0.1 % on the example link from 57 to 91 functions.
+max over t of Re(e^{-jt}) - |half axes of e^{-jt} q|, convex in Q for fixed t: from the enclosing disc's
+answer, t and Q in turn lead down to a local optimum, a controller's value again. `youla_bracket` gives these
+three values for every plant, `BracketProblem` also the controller on a grid that attains one. A larger basis
+lowers all three a little: 0.1 % on the example link from 57 to 91 functions.
 """
 
 from __future__ import annotations
@@ -38,16 +39,39 @@ from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import factor_matrices
 from ident.data.shown import Shown
 
-_ELLIPSE_ROUNDS = 20  # turns of angles and Q
+# Turns of angles and Q at most; it ends earlier once a turn gains less than ten times the accuracy. A local
+# optimum that is not reached leaves a value that is a little too high, and still some controller's.
+_ELLIPSE_ROUNDS = 20
+
+# The angles are searched by refinement: so many times, on so many points, each time within an eighth of the
+# width before: from a quarter turn down to 5e-5 of it. The margin is flat at its maximum, so this is exact to
+# 1e-8.
+_ANGLE_REFINEMENTS = 6
+_ANGLE_POINTS = 21
+_ANGLE_NARROWING = 8.0
+
+# Ellipses whose centres differ from the base plant by less than this, relative to the loop, stand on it.
+_ON_BASE_SHARE = 1e-12
+
+# A pole nearer to the unit circle than this is not stable: the loop is parametrised by coprime factors.
+_UNSTABLE_DISTANCE = 1e-9
+
+# Frequencies that are added to the programme's grid in a round, at most.
+_MOST_ADDED = 24
+
 Region = Literal["inscribed", "ellipse", "enclosing"]
+"""What of each ellipse is looked at: the disc inside of it, itself, or the disc around it."""
 
 
 @dataclass(frozen=True)
 class PlantBracket:
-    """Values for one plant, each the largest on the dense grid, by a Q of the basis: a longer one may lie a
-    little lower, by a per cent at most on the plants tried; inf where nothing was found to be robustly
-    stable. Of unstable plants whose ellipses are not about the nominal response `inscribed` is a local
-    optimum."""
+    """What controllers reach on one plant: weighted worst cases, each the largest on the dense grid.
+
+    plant : its name. inscribed : no controller goes below. ellipse, enclosing : some controller reaches it.
+    Each is by a Q of the basis: a longer one may lie a little lower, by a per cent at most on the plants
+    tried. inf where nothing was found to be robustly stable. For unstable plants whose ellipses are not about
+    the nominal response, `inscribed` is a local optimum.
+    """
 
     plant: str
     inscribed: float
@@ -57,21 +81,25 @@ class PlantBracket:
 
 @dataclass(frozen=True, repr=False)
 class YoulaBracket(Shown):
-    """What any controller could reach, the worst over the plants; each may need a Q of its own, so that with
-    several these are lower bounds of what one controller can do."""
+    """What any controller could reach, the worst over the plants. Each may need a Q of its own, so that with
+    several plants these are lower bounds of what one controller can do."""
 
     plants: tuple[PlantBracket, ...]
 
     @property
     def inscribed(self) -> float:
+        """Largest over the plants of the values that no controller goes below."""
         return max(plant.inscribed for plant in self.plants)
 
     @property
     def ellipse(self) -> float:
+        """Largest over the plants of the values that some controller reaches on the ellipses."""
         return max(plant.ellipse for plant in self.plants)
 
     @property
     def enclosing(self) -> float:
+        """Largest over the plants of the values that some controller reaches on the discs around the
+        ellipses."""
         return max(plant.enclosing for plant in self.plants)
 
     @property
@@ -89,9 +117,31 @@ def youla_bracket(
 ) -> YoulaBracket:
     """Bracket of the smallest possible worst case over the ellipses, whatever the controller's order.
 
-    Only weighted requirements count, so that the values are lower bounds for what is asked further. Functions
-    with the member as a factor (G S, T) enter the inscribed value by the centre alone, the others by the
-    largest |G|. Raises SpecificationError if specification and plants contradict each other.
+    Parameters
+    ----------
+    plants : UncertainPlant or sequence of them
+        Each is bracketed by itself.
+    specification : Specification
+        Only its weighted requirements count, so that the values are lower bounds for what is asked further.
+    options : YoulaOptions or None
+        Sizes of basis and grids.
+    progress : callable or None
+        Told the finished share and a line of words.
+
+    Returns
+    -------
+    YoulaBracket
+        A value for each plant and region.
+
+    Raises
+    ------
+    SpecificationError
+        If specification and plants contradict each other.
+
+    Notes
+    -----
+    Functions with the member as a factor (G S, T) enter the inscribed value by the centre alone, the others
+    by the largest |G|: the bracket is a little wider for them.
     """
     options = options or YoulaOptions()
     listed = (plants,) if isinstance(plants, UncertainPlant) else tuple(plants)
@@ -106,7 +156,7 @@ def youla_bracket(
 
 
 class BracketProblem:
-    """One plant: parametrisation, grids and the three problems."""
+    """The three programmes of one plant, with its grids and the parametrisation of its controllers."""
 
     def __init__(
         self,
@@ -116,22 +166,28 @@ class BracketProblem:
         *,
         accuracy: float = 1e-5,
     ) -> None:
-        self.plant, self.spec, self.options = plant, specification, options
+        """Grids, loop and basis of one plant; accuracy is that of each programme's gamma, relative."""
+        self.plant = plant
+        self.spec = specification
+        self.options = options
         self.accuracy = accuracy
         self.grids = Grids((plant,), specification, options)
         self.factors: Factors | None = None
-        if np.any(np.abs(plant.poles) >= 1.0 - 1e-9):
+        if np.any(np.abs(plant.poles) >= 1.0 - _UNSTABLE_DISTANCE):
             self.factors = coprime_factors(delayed(plant.nominal, specification.computational_delay_samples))
         self.dense = self.grids.dense[0]
-        if np.any(self.dense.largest(LoopFunction.EFFORT) > 0):  # then Q does not invert up to Nyquist
+        # A weight on the effort keeps Q from inverting the plant up to Nyquist.
+        if np.any(self.dense.largest(LoopFunction.EFFORT) > 0):
             options = options.model_copy(update={"mirrored_poles": 0})
         self.poles = chosen_poles(plant, self.grids.scale_rad_s, options)
         self.dense_loop = self._loop(self.dense)
         self.dense_basis = self._basis(self.dense)
 
     def solve(self) -> PlantBracket:
+        """The three values of this plant. The same Q does no worse on a smaller region, so none may exceed
+        that of a larger one."""
         (ellipse, _), (enclosing, _), (inscribed, _) = self.answers()
-        ellipse = min(ellipse, enclosing)  # the same Q does no worse on a smaller region
+        ellipse = min(ellipse, enclosing)
         return PlantBracket(
             self.plant.name,
             min(inscribed, ellipse),
@@ -140,136 +196,209 @@ class BracketProblem:
         )
 
     def answers(self) -> list[tuple[float, Real]]:
-        """Of ellipses, enclosing and inscribed discs: see `exchanged`."""
+        """(value, x (n,)) for ellipses, enclosing and inscribed discs, in this order; see `exchanged`."""
         enclosing = self.exchanged("enclosing", None)
-        # Where the enclosing discs cannot be stabilised, the ellipses may be: started from the inscribed.
         inscribed = self.exchanged("inscribed", None)
-        start = enclosing if np.isfinite(enclosing[0]) else inscribed
-        return [self.exchanged("ellipse", start[1]), enclosing, inscribed]
+        # Where the enclosing discs cannot be stabilised, the ellipses may be: started from the inscribed.
+        enclosing_value, start = enclosing
+        if not np.isfinite(enclosing_value):
+            _, start = inscribed
+        return [self.exchanged("ellipse", start), enclosing, inscribed]
 
     def controller(self, x: Real) -> tuple[Real, Complex]:
-        """Frequencies (F,) of the programme and K (F,) there."""
+        """Frequencies (F,) of the programme in rad/s and the controller's values K (F,) there, for x (n,)."""
         lean = self.grids.lean()[0]
-        loop, q = self._loop(lean), self._basis(lean) @ x
+        loop = self._loop(lean)
+        q = self._basis(lean) @ x
         sensitivity = loop.sensitivity + loop.sensitivity_slope * q
         return lean.ellipses.omega_rad_s, (loop.effort + loop.effort_slope * q) / sensitivity
 
     def exchanged(self, region: Region, start: Real | None) -> tuple[float, Real]:
-        """Optimum with violated frequencies added: (value on the dense grid, x)."""
+        """Value on the dense grid and x (n,) of the optimum for a region, with violated frequencies added.
+
+        start : x to begin from, or None. Where no x is found the start is given back with an infinite value,
+        or zeros.
+        """
 
         def solve(begin: Real | None) -> MinimaxPoint:
+            """Optimum on the lean grid as it is."""
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
             rows = self._rows(lean, region, self._loop(lean))
             return smallest_ratio(self._basis(lean), rows, begin, accuracy=self.accuracy)
 
-        found = exchanged(
+        best = exchanged(
             solve,
             lambda x: [self._dense_values(x, region)],
             self.grids.grids,
             [self.dense.ellipses.omega_rad_s],
             rounds=self.options.exchange_rounds,
-            most=24,
+            most=_MOST_ADDED,
             start=start,
         )
-        x = start if found.x is None else found.x
-        return found.worst, np.zeros(self.dense_basis.shape[1]) if x is None else x
+        x = start if best.x is None else best.x
+        if x is None:
+            x = np.zeros(self.dense_basis.shape[1])
+        return best.worst, x
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
-        basis, loop = self._basis(data), self._loop(data)
-        point = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
+        """Local optimum for the ellipses on the grid of `data`: the best normals for x, then the best x for
+        these normals, in turn. start : x (n,), or None: the normals begin along the real axis."""
+        basis = self._basis(data)
+        loop = self._loop(data)
+        best = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
         for _ in range(_ELLIPSE_ROUNDS):
-            angles = None if start is None else _best_angles(loop, data, basis @ start)
+            angles = None
+            if start is not None:
+                angles = _best_angles(loop, data, basis @ start)
             rows = self._rows(data, "ellipse", loop, angles)
-            new = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
-            before = point.gamma
-            if new.gamma < before:
-                point, start = new, new.x
-            if not new.gamma < before * (1 - 10 * self.accuracy):
+            point = smallest_ratio(basis, rows, start, accuracy=self.accuracy)
+            gamma_before = best.gamma
+            if point.gamma < gamma_before:
+                best = point
+                start = point.x
+            if not point.gamma < gamma_before * (1 - 10 * self.accuracy):
                 break
-        return point
+        return best
 
     def _loop(self, data: PlantData) -> AffineLoop:
-        if self.factors is None:  # a stable plant: M = Y = 1, X = 0, hence K S = Q and S = 1 - G Q
-            response = data.ellipses.centre * data.delay
-            one, zero = np.ones_like(response), np.zeros_like(response)
-            return AffineLoop(response, zero, one, one, -response)
-        return self.factors.loop(data.ellipses.omega_rad_s)
+        """How the loop depends on Q at the frequencies of `data`."""
+        if self.factors is not None:
+            return self.factors.loop(data.ellipses.omega_rad_s)
+        # A stable plant needs no factors: M = Y = 1 and X = 0, hence K S = Q and S = 1 - G Q.
+        response = data.ellipses.centre * data.delay
+        return AffineLoop(
+            base=response,
+            effort=np.zeros_like(response),
+            effort_slope=np.ones_like(response),
+            sensitivity=np.ones_like(response),
+            sensitivity_slope=-response,
+        )
 
     def _basis(self, data: PlantData) -> Complex:
+        """Values (F, n) of the basis of Q at the frequencies of `data`."""
         return with_constant(self.poles, data.ellipses.omega_rad_s, self.plant.dt_s)
 
     def _rows(
         self, data: PlantData, region: Region, loop: AffineLoop, angles: Real | None = None
     ) -> PlaneRows:
-        """Rows of one region on a grid, where the loop is this, in the plane of Q = basis x."""
-        e = data.ellipses
-        size = e.omega_rad_s.size
+        """Rows of the programme of one region on a grid, as ratios of y = Q.
+
+        Parameters
+        ----------
+        data : PlantData
+            Ellipses, delay and weights at F frequencies.
+        region : Region
+            What of the ellipses counts.
+        loop : AffineLoop
+            K S and S as they depend on Q, at these frequencies.
+        angles : (F,) array or None
+            t of the normal for the ellipse, radians; None: zero. Discs do not depend on it.
+
+        Notes
+        -----
+        Numerators are |W S| and |W K S|. Denominators are m = Re(e^{-jt} (1 + offset q)) - |half axes of
+        e^{-jt} q|, with q = K S and offset the distance of the ellipse's centre from the base plant.
+        """
+        ellipses = data.ellipses
+        size = ellipses.omega_rad_s.size
         turn = np.exp(-1j * (np.zeros(size) if angles is None else angles))
-        offset = e.centre * data.delay - loop.base
-        if np.max(np.abs(offset * loop.effort_slope), initial=0.0) < 1e-12:
+        offset = ellipses.centre * data.delay - loop.base
+        if np.max(np.abs(offset * loop.effort_slope), initial=0.0) < _ON_BASE_SHARE:
             offset = np.zeros(size, complex)
-        major, minor = e.semi_major, e.semi_minor
-        if region != "ellipse":
-            major = minor = minor if region == "inscribed" else major
-        # e^{-jt} q u in the ellipse's own axes: Re * major, Im * minor.
-        along = turn * e.direction * data.delay
+        major = ellipses.semi_major
+        minor = ellipses.semi_minor
+        if region == "inscribed":
+            major = minor
+        elif region == "enclosing":
+            minor = major
+        # Denominator: e^{-jt} q u in the ellipse's own axes, its real part times the major, its imaginary
+        # part times the minor half axis.
+        along = turn * ellipses.direction * data.delay
         axes = np.stack([major, minor], axis=-1)[:, :, None]
         reach = axes * factor_matrices(along * loop.effort_slope)
-        reach_0 = axes[:, :, 0] * plane(along * loop.effort)
+        reach_offset = axes[:, :, 0] * plane(along * loop.effort)
         lift = turn * offset * loop.effort_slope
         level = np.real(turn * (1.0 + offset * loop.effort))
         slope = np.stack([lift.real, -lift.imag], axis=-1)
-        at = np.arange(size)
-        far = {"inscribed": np.abs(e.centre), "enclosing": np.abs(e.centre) + e.semi_major}
-        rows_of, extra = [], []  # weight, value, change with Q, share of the ellipse that moves
-        for own, with_member, value, change in (
+        # Largest |G| of the region, by which a function with the member as a factor is bounded.
+        if region == "inscribed":
+            largest_member = np.abs(ellipses.centre)
+        elif region == "enclosing":
+            largest_member = np.abs(ellipses.centre) + ellipses.semi_major
+        else:
+            largest_member = ellipses.farthest()
+        # Each numerator: weight, value without Q, slope with Q, and whether the denominator has its reach.
+        numerators = []
+        centre_numerators = []
+        for function, function_times_member, value, change in (
             (LoopFunction.SENSITIVITY, LoopFunction.DISTURBANCE, loop.sensitivity, loop.sensitivity_slope),
             (LoopFunction.EFFORT, LoopFunction.COMPLEMENTARY, loop.effort, loop.effort_slope),
         ):
-            weight, still = data.largest(own), data.largest(with_member)
-            if np.any(still > 0):
-                still = still * (far[region] if region in far else e.farthest())
-                if region == "inscribed":  # by the centre alone: at no distance from the others
-                    extra.append((still, value, change, 0.0))
+            weight = data.largest(function)
+            weight_with_member = data.largest(function_times_member)
+            if np.any(weight_with_member > 0):
+                weight_with_member = weight_with_member * largest_member
+                if region == "inscribed":
+                    # By the centre alone: a lower bound has no distance to the other members.
+                    centre_numerators.append((weight_with_member, value, change, 0.0))
                 else:
-                    weight = np.maximum(weight, still)
-            rows_of.append((weight, value, change, 1.0))
+                    weight = np.maximum(weight, weight_with_member)
+            numerators.append((weight, value, change, 1.0))
+        positions = np.arange(size)
         parts: list[PlaneRows] = []
-        for weight, value, change, moved in rows_of + extra:
+        for weight, value, change, reach_factor in numerators + centre_numerators:
             use = weight > 0
-            numerator = factor_matrices(weight * change)[use], plane(weight * value)[use]
-            below = level[use], slope[use], moved * reach[use], moved * reach_0[use]
-            parts.append(PlaneRows(at[use], *numerator, *below))
+            parts.append(
+                PlaneRows(
+                    at=positions[use],
+                    A=factor_matrices(weight * change)[use],
+                    a=plane(weight * value)[use],
+                    e=level[use],
+                    E=slope[use],
+                    C=reach_factor * reach[use],
+                    c=reach_factor * reach_offset[use],
+                )
+            )
         return PlaneRows.stacked(parts)
 
     def _dense_values(self, x: Real, region: Region) -> Real:
-        """Worst case per frequency of the dense grid: exact geometry for the ellipse, the rows for discs."""
-        y, loop = self.dense_basis @ x, self.dense_loop
+        """Worst case (F,) at each frequency of the dense grid for x (n,): by exact geometry for the ellipse,
+        by the rows for discs."""
+        q = self.dense_basis @ x
+        loop = self.dense_loop
         if region == "ellipse":
-            sensitivity = loop.sensitivity + loop.sensitivity_slope * y
-            k = (loop.effort + loop.effort_slope * y) / np.where(sensitivity == 0, 1e-300, sensitivity)
+            sensitivity = loop.sensitivity + loop.sensitivity_slope * q
+            nonzero_sensitivity = np.where(sensitivity == 0, 1e-300, sensitivity)
+            k = (loop.effort + loop.effort_slope * q) / nonzero_sensitivity
             return worst_of(self.dense.weighted(k))
-        rows, values = self._rows(self.dense, region, loop), np.zeros(y.size)
-        np.maximum.at(values, rows.at, rows.ratio(plane(y)))
+        rows = self._rows(self.dense, region, loop)
+        values = np.zeros(q.size)
+        np.maximum.at(values, rows.at, rows.ratio(plane(q)))
         return values
 
 
 def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
-    """Angle t of the supporting normal that gives the exact distance, (F,): largest m(t)."""
-    e = data.ellipses
+    """Angles t (F,) in radians of the supporting normals that give the exact distance: those of the largest
+    m(t), for Q = y (F,) complex."""
+    ellipses = data.ellipses
     q = loop.effort + loop.effort_slope * y
-    c = 1.0 + (e.centre * data.delay - loop.base) * q
-    v = q * e.direction * data.delay
-    best, width = np.angle(c), np.pi / 2
-    for _ in range(6):
-        trial = best[:, None] + width * np.linspace(-1, 1, 21)
+    # Centre and major axis of the ellipse of 1 + D q, as complex numbers.
+    centre = 1.0 + (ellipses.centre * data.delay - loop.base) * q
+    axis = q * ellipses.direction * data.delay
+    angles = np.angle(centre)
+    width = np.pi / 2
+    for _ in range(_ANGLE_REFINEMENTS):
+        trial = angles[:, None] + width * np.linspace(-1, 1, _ANGLE_POINTS)
         turned = np.exp(-1j * trial)
-        reach = turned * v[:, None]
-        margin = np.real(turned * c[:, None]) - np.hypot(
-            e.semi_major[:, None] * reach.real, e.semi_minor[:, None] * reach.imag
+        turned_axis = turned * axis[:, None]
+        reach = np.hypot(
+            ellipses.semi_major[:, None] * turned_axis.real,
+            ellipses.semi_minor[:, None] * turned_axis.imag,
         )
-        best = np.take_along_axis(trial, np.argmax(margin, axis=1)[:, None], axis=1)[:, 0]
-        width /= 8.0
-    return np.asarray(best)
+        margin = np.real(turned * centre[:, None]) - reach
+        best = np.argmax(margin, axis=1)
+        angles = np.take_along_axis(trial, best[:, None], axis=1)[:, 0]
+        width /= _ANGLE_NARROWING
+    return np.asarray(angles)
