@@ -174,7 +174,7 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
     # From the largest reference gain (a slow integrator alone is corrected) down to where V fails.
     lowest = min(_least_reference(law), highest)
     steps = int(np.ceil(np.log(max(highest / lowest, 1.0)) / np.log(_SCAN_FACTOR))) + 1 if highest > 0 else 0
-    tried: list[tuple[float, float, Real]] = []  # violation, reference gain, gain
+    trials: list[tuple[float, float, Real]] = []  # violation, reference gain, gain
     passed: tuple[float, Real] | None = None
     failed = 0.0
     for reference in np.geomspace(highest, lowest, steps) if steps else ():
@@ -182,7 +182,7 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
         if gain is None:
             continue
         short = violation(gain)
-        tried.append((short, float(reference), gain))
+        trials.append((short, float(reference), gain))
         if short <= _ROUNDING:
             passed = (float(reference), gain)
         elif passed is not None:
@@ -196,8 +196,8 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
                 passed = (middle, gain)
             else:
                 failed = middle
-    if passed is None and tried:
-        _, reference, gain = min(tried, key=lambda trial: trial[0])
+    if passed is None and trials:
+        _, reference, gain = min(trials, key=lambda trial: trial[0])
         passed = (reference, gain)
     if passed is not None and slower != 1.0:
         slowed = _spectral_gain(law, slower * passed[0])

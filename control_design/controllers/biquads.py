@@ -1,9 +1,15 @@
 """Structured controllers: a cascade of first- and second-order sections in the Tustin plane.
 
-With p = (2/dt)(z - 1)/(z + 1)/scale (on the circle p = j (2/dt) tan(omega dt/2)/scale) the controller is K =
-prod (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b) times, for odd orders, (n1 p + n0)/(p + e^a), times (n1 p +
-n0)/p for an integrator, times notches (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b). Every parameter vector is
-stable.
+With p = (2/dt)(z - 1)/(z + 1)/scale, on the unit circle p = j (2/dt) tan(omega dt/2)/scale, a section is
+
+    second order  (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b)
+    first order   (n1 p + n0)/(p + e^a)
+    integrator    (n1 p + n0)/p
+    notch         (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b)
+
+and the controller is their product. Denominators are searched by their logarithms, so that every parameter
+vector gives a stable controller (but for an integrator). `Cascade` is the structure; its methods read a
+parameter vector: as coefficients, as a frequency response, as roots, and as a discrete state space.
 """
 
 from __future__ import annotations
@@ -17,16 +23,35 @@ import numpy as np
 from control_design.plants.ellipses import Complex, Real
 
 SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
+
+# How many parameters of each kind of section belong to its numerator and to its denominator.
 _NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
 _DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2, "notch": 2}
 
+# Kinds with a pair of poles, whose denominator has the parameters (a, b).
+_PAIR_KINDS = ("second_order", "notch")
+
+# Relative amount by which a bound on the denominators may be missed: ten times the solver's acceptable
+# tolerance.
 SOLVER_SLACK = 1e-3
-"""Relative; a bound on the denominators may be off by the solver's acceptable tolerance (1e-4)."""
+
+# A root of p nearer to 1/h than this is at infinity in z: it is what a missing zero becomes.
+_INFINITE_ROOT_DISTANCE = 1e-12
 
 
 @dataclass(frozen=True)
 class Cascade:
-    """Structure of the controller: section kinds, sampling time and frequency scale of p."""
+    """Structure of a controller; the values are a parameter vector x that its methods take.
+
+    Parameters
+    ----------
+    sections : tuple of SectionKind
+        In the order of the parameter vector and of the signal.
+    dt_s : float
+        Sampling period in seconds.
+    scale_rad_s : float
+        Frequency at which p = j, about that of the controller's corners: parameters are of size one.
+    """
 
     sections: tuple[SectionKind, ...]
     dt_s: float
@@ -34,106 +59,148 @@ class Cascade:
 
     @property
     def order(self) -> int:
-        return sum(2 if kind in ("second_order", "notch") else 1 for kind in self.sections)
+        """Number of states: two for each section with a pair of poles, one for each other."""
+        return sum(2 if kind in _PAIR_KINDS else 1 for kind in self.sections)
 
     @property
     def parameters(self) -> int:
-        """Length of the parameter vector: numerators then log denominators, section by section."""
+        """Length of the parameter vector: section by section the numerator, then logarithms of the
+        denominator."""
         return sum(_NUMERATORS[kind] + _DENOMINATORS[kind] for kind in self.sections)
 
     @property
     def pair_positions(self) -> tuple[int, ...]:
-        """Where the log denominator (a, b) of each second-order section starts in the parameter vector."""
-        positions, at = [], 0
+        """Positions in the parameter vector at which (a, b) of each section with a pair of poles starts."""
+        positions = []
+        section_start = 0
         for kind in self.sections:
-            if kind in ("second_order", "notch"):
-                positions.append(at + _NUMERATORS[kind])
-            at += _NUMERATORS[kind] + _DENOMINATORS[kind]
+            if kind in _PAIR_KINDS:
+                positions.append(section_start + _NUMERATORS[kind])
+            section_start += _NUMERATORS[kind] + _DENOMINATORS[kind]
         return tuple(positions)
 
     def least_damping(self, x: Sequence[float] | Real) -> float:
-        """Smallest damping ratio of the second-order denominators in p; infinite without any."""
+        """Smallest damping ratio of the pairs of poles in p, e^a/(2 e^(b/2)); infinite without any. x
+        (P,)."""
         values = np.asarray(x, dtype=np.float64)
-        ratios = [0.5 * np.exp(values[at] - 0.5 * values[at + 1]) for at in self.pair_positions]
+        ratios = []
+        for position in self.pair_positions:
+            a = values[position]
+            b = values[position + 1]
+            ratios.append(0.5 * np.exp(a - 0.5 * b))
         return float(min(ratios, default=np.inf))
 
     def split(self, x: Sequence[float] | Real) -> list[tuple[Real, Real]]:
-        """(numerator, denominator) coefficients in p of every section, highest power first."""
+        """Numerator and denominator of every section: coefficients of p, highest power first, of one length.
+
+        x : (P,) parameter vector. Raises ValueError for another length.
+        """
         values = np.asarray(x, dtype=np.float64)
         if values.shape != (self.parameters,):
             raise ValueError(f"need {self.parameters} parameters for {self.sections}; got {values.shape}")
-        return [(np.array(top), np.array(bottom)) for top, bottom in self.split_with(values, np.exp)]
+        sections = []
+        for numerator, denominator in self.split_with(values, np.exp):
+            sections.append((np.array(numerator), np.array(denominator)))
+        return sections
 
     def split_with(self, x: Any, exp: Callable[[Any], Any]) -> list[tuple[list[Any], list[Any]]]:
-        """`split` of a vector of numbers or symbols."""
-        pairs, at = [], 0
+        """Numerator and denominator of every section as lists, for a vector x of numbers or symbols.
+
+        exp : the exponential of such an element. Nothing is checked; see `split`.
+        """
+        sections = []
+        section_start = 0
         for kind in self.sections:
-            logs = at + _NUMERATORS[kind]
-            numerator = [x[i] for i in range(at, logs)]
-            tail = [exp(x[i]) for i in range(logs, logs + _DENOMINATORS[kind])]
-            if kind == "notch":  # parameters: log of the numerator's damping term, then the log denominator
-                numerator = [1.0, exp(x[at]), tail[1]]
-            pairs.append((numerator, [1.0, *(tail or [0.0])]))
-            at = logs + _DENOMINATORS[kind]
-        return pairs
+            logarithms_start = section_start + _NUMERATORS[kind]
+            section_end = logarithms_start + _DENOMINATORS[kind]
+            numerator = [x[i] for i in range(section_start, logarithms_start)]
+            tail = [exp(x[i]) for i in range(logarithms_start, section_end)]
+            # A notch states the logarithm of its numerator's damping term; its frequency is the
+            # denominator's.
+            if kind == "notch":
+                numerator = [1.0, exp(x[section_start]), tail[1]]
+            # An integrator has no parameter in its denominator p.
+            if not tail:
+                tail = [0.0]
+            sections.append((numerator, [1.0, *tail]))
+            section_start = section_end
+        return sections
 
     def response(self, x: Sequence[float] | Real, omega_rad_s: Real) -> Complex:
-        """K(e^{j omega dt}), (F,); omega below pi/dt (at Nyquist p is infinite: the limit is used)."""
+        """K(e^{j omega dt}), (F,) complex, for parameters x (P,) and omega (F,) in rad/s up to pi/dt. At
+        Nyquist p is infinite, and the limit is used."""
         p = 1j * tustin_frequency(omega_rad_s, self.dt_s) / self.scale_rad_s
         value = np.ones(p.shape, dtype=np.complex128)
         for numerator, denominator in self.split(x):
-            # Divide both by the leading power, so that p ~ 1e16 at Nyquist stays exact.
+            # Where |p| > 1 both polynomials are divided by their leading power and evaluated in q = 1/p, so
+            # that p ~ 1e16 at Nyquist stays exact. Each form is fed harmless values where the other one
+            # counts.
             big = np.abs(p) > 1.0
             q = np.where(big, 1.0 / np.where(big, p, 1.0), 0.0)
-            direct = np.polyval(numerator, np.where(big, 0.0, p)) / np.where(
-                big, 1.0, np.polyval(denominator, np.where(big, 1.0, p))
-            )
+            direct_denominator = np.polyval(denominator, np.where(big, 1.0, p))
+            direct_denominator = np.where(big, 1.0, direct_denominator)
+            direct = np.polyval(numerator, np.where(big, 0.0, p)) / direct_denominator
             inverted = np.polyval(numerator[::-1], q) / np.polyval(denominator[::-1], q)
             value = value * np.where(big, inverted, direct)
         return value
 
     def roots(self, x: Sequence[float] | Real) -> Complex:
-        """Zeros and poles of all sections in z, (n,); those at infinity left out."""
+        """Zeros and poles of all sections in z, (N,) complex together, for parameters x (P,); those at
+        infinity are left out. z = (1 + h p)/(1 - h p) with h = dt scale/2."""
         h = self.dt_s * self.scale_rad_s / 2.0
-        p = np.concatenate([np.roots(part) for pair in self.split(x) for part in pair])
-        p = p[np.abs(1.0 - h * p) > 1e-12]
+        roots = []
+        for numerator, denominator in self.split(x):
+            roots.append(np.roots(numerator))
+            roots.append(np.roots(denominator))
+        p = np.concatenate(roots)
+        is_finite = np.abs(1.0 - h * p) > _INFINITE_ROOT_DISTANCE
+        p = p[is_finite]
         return np.asarray((1.0 + h * p) / (1.0 - h * p), dtype=np.complex128)
 
     def state_space(self, x: Sequence[float] | Real) -> tuple[Real, Real, Real, Real]:
-        """Discrete (A, B, C, D) of the cascade, every section by the trapezoidal rule: x' = F x + g u becomes
-        A = (I - F h)^-1 (I + F h), h = dt scale/2."""
+        """Discrete state space A (n, n), B (n, 1), C (1, n), D (1, 1) of the cascade, for parameters x (P,).
+
+        Every section is taken to z by the trapezoidal rule: x' = F x + g u becomes A = (I - F h)^-1 (I + F
+        h), with h = dt scale/2. The states are those of the sections in their order.
+        """
         h = self.dt_s * self.scale_rad_s / 2.0
         a: Real = np.zeros((0, 0))
         b: Real = np.zeros((0, 1))
         c: Real = np.zeros((1, 0))
         d: Real = np.ones((1, 1))
         for numerator, denominator in self.split(x):
-            aj, bj, cj, dj = _tustin_section(numerator, denominator, h)
-            n, m = a.shape[0], aj.shape[0]
-            a = np.block([[a, np.zeros((n, m))], [bj @ c, aj]])
-            b = np.vstack([b, bj @ d])
-            c = np.hstack([dj @ c, cj])
-            d = dj @ d
+            section_a, section_b, section_c, section_d = _tustin_section(numerator, denominator, h)
+            # The output of the cascade so far drives the section.
+            no_coupling = np.zeros((a.shape[0], section_a.shape[0]))
+            a = np.block([[a, no_coupling], [section_b @ c, section_a]])
+            b = np.vstack([b, section_b @ d])
+            c = np.hstack([section_d @ c, section_c])
+            d = section_d @ d
         return a, b, c, d
 
 
 def tustin_frequency(omega_rad_s: Real, dt_s: float) -> Real:
-    """v = (2/dt) tan(omega dt/2): the imaginary axis of the Tustin plane."""
+    """v = (2/dt) tan(omega dt/2) in rad/s, (F,): where omega (F,) in rad/s lies on the imaginary axis of the
+    Tustin plane."""
     return np.asarray(2.0 / dt_s * np.tan(np.asarray(omega_rad_s) * dt_s / 2.0), dtype=np.float64)
 
 
 def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
-    """s = j (2/dt) tan(omega dt/2), where weights and sections are evaluated."""
+    """s = j (2/dt) tan(omega dt/2), (F,) complex in rad/s, where weights and sections are evaluated at omega
+    (F,)."""
     return np.asarray(1j * tustin_frequency(omega_rad_s, dt_s), dtype=np.complex128)
 
 
 def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real, Real, Real, Real]:
-    """Balanced companion of numerator/denominator in p, mapped by the trapezoidal rule with step 2 h.
+    """Discrete state space (A, B, C, D) of a section numerator/denominator in p, with one or two states.
 
-    The rule needs (I - h F)^-1; for one or two states it is written out, since searches build many loops.
-    The symmetric split sqrt(2h) on input and output keeps both of one size.
+    numerator, denominator : (2,) or (3,) coefficients, highest power first, the denominator's first one is 1.
+    It is a balanced companion form, mapped by the trapezoidal rule with step 2 h. The rule needs (I - h
+    F)^-1; for one or two states it is written out, since searches build many loops. The symmetric split
+    sqrt(2 h) on input and output keeps both of one size.
     """
     direct = float(numerator[0])
+    # Numerator of what is left beside the direct term.
     tail = [float(value) for value in numerator[1:] - direct * denominator[1:]]
     root = float(np.sqrt(2.0 * h))
     if denominator.size == 2:
@@ -147,13 +214,20 @@ def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real,
         )
     # States (w0 x, x') with w0 = sqrt(e^b): both of one size around the section's own frequency.
     # F = [[0, w0], [-w0, -d]], g = (0, 1)', row = (tail1/w0, tail0).
-    w0, d = float(np.sqrt(denominator[2])), float(denominator[1])
+    w0 = float(np.sqrt(denominator[2]))
+    d = float(denominator[1])
     v = h * w0
-    scale = 1.0 / (1.0 + h * d + v * v)  # 1/det(I - h F)
-    inverse_2 = np.array([[(1.0 + h * d) * scale, v * scale], [-v * scale, scale]])
-    through = np.array([[tail[1] / w0, tail[0]]]) @ inverse_2
+    determinant_inverse = 1.0 / (1.0 + h * d + v * v)
+    inverse_matrix = np.array(
+        [
+            [(1.0 + h * d) * determinant_inverse, v * determinant_inverse],
+            [-v * determinant_inverse, determinant_inverse],
+        ]
+    )
+    output_row = np.array([[tail[1] / w0, tail[0]]]) @ inverse_matrix
     # (I - hF)^-1 (I + hF) = 2 (I - hF)^-1 - I
-    a = 2.0 * inverse_2
+    a = 2.0 * inverse_matrix
     a[0, 0] -= 1.0
     a[1, 1] -= 1.0
-    return a, root * inverse_2[:, 1:], root * through, np.array([[direct + h * float(through[0, 1])]])
+    feedthrough = np.array([[direct + h * float(output_row[0, 1])]])
+    return a, root * inverse_matrix[:, 1:], root * output_row, feedthrough

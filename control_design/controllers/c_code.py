@@ -1,4 +1,10 @@
-"""The controller as C99 source: the same state-space loop, limits and anti-windup where it has any."""
+"""The controller as C99 source: the same state-space loop, limits and anti-windup where it has any.
+
+`c_header` and `c_source` fill two templates that stand beside this file. A line of a template that begins
+with `@what:` is written only for controllers that have it (limits, friction, several loops). Single precision
+may change what a law does: `law_in` chooses states that survive it, or refuses. The order of operations is
+that of `ControllerStepper`, so that a simulation and the processor agree to rounding.
+"""
 
 from __future__ import annotations
 
@@ -18,30 +24,52 @@ if TYPE_CHECKING:
     from control_design.plants.ellipses import Real
 
 Number = Literal["double", "float"]
-_ROUNDED = 0.01  # of the response: more than this, 0.1 dB, single precision must not change it
-_NO_LIMIT = 3e38  # written for an actuator without a limit beside others that have one; fits a float
+
+# Largest relative change of the response that single precision may make: 0.1 dB, far below what margins
+# leave.
+_LARGEST_ROUNDING_SHARE = 0.01
+
+# Written for an actuator without a limit beside others that have one: close to the largest float.
+_NO_LIMIT = 3e38
+
+# Frequencies at which single precision is compared with double: from 1e-4 of Nyquist on, a hundred a decade.
+_COMPARED_FREQUENCIES = 400
+_LOWEST_NYQUIST_SHARE = 1e-4
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How C code is written: what its names begin with, a C identifier, and the type of its numbers."""
+    """How C code is written.
+
+    prefix : what its names begin with, a C identifier. number : type of its numbers, "double" or "float".
+    Raises ValueError for other values.
+    """
 
     prefix: str = "controller"
     number: Number = "double"
 
     def __post_init__(self) -> None:
+        """Check both."""
         if self.number not in get_args(Number):
             raise ValueError(f"number must be 'double' or 'float'; got {self.number!r:.80}")
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", self.prefix):
             raise ValueError(f"prefix must be a C identifier; got {self.prefix!r:.80}")
 
     def beside(self, name: str) -> Dialect:
-        """That of a second piece of code in the same program."""
-        return Dialect(name if self.prefix == "controller" else f"{self.prefix}_{name}", self.number)
+        """Dialect of a second piece of code, called `name`, in the same program: its names begin with another
+        prefix."""
+        prefix = name
+        if self.prefix != "controller":
+            prefix = f"{self.prefix}_{name}"
+        return Dialect(prefix, self.number)
 
 
 def c_header(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
-    """Declarations to include: the state, `<prefix>_reset` and `<prefix>_step`. Raises ValueError."""
+    """Declarations to include, as C text: the state, `<prefix>_reset` and `<prefix>_step`.
+
+    The arguments are those of `c_source`. Raises ValueError for a prefix that is no C identifier, or another
+    number.
+    """
     Dialect(prefix, number)
     return _filled(
         "controller.h.in",
@@ -57,25 +85,39 @@ def c_header(controller: Controller, prefix: str = "controller", number: Number 
 
 
 def _ascii(text: str) -> str:
-    """As it may stand in a comment."""
+    """The text as it may stand in a comment of C: printable ASCII that does not end the comment; other
+    characters become "?"."""
     return re.sub(r"[^ -~]|\*/", "?", text)
 
 
 def c_source(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
-    """A self-contained C99 translation unit (it repeats the declarations of `c_header`).
+    """A self-contained C99 translation unit of the controller (it repeats the declarations of `c_header`).
 
+    Parameters
+    ----------
     controller : Controller
-    prefix : str. Start of every name, a C identifier.
-    number : "double" or "float". Type of states, coefficients and arithmetic.
+        With its limits, anti-windup and feed-forward.
+    prefix : str
+        Start of every name, a C identifier.
+    number : "double" or "float"
+        Type of states, coefficients and arithmetic.
 
-    `<prefix>_step(&state, error)` returns the command for the error at this sample. One call every `dt_s`;
-    order n costs (n + 1)^2 multiplications. A controller with limits has them and the anti-windup in
-    the code, and its state keeps in `limited` whether one was active. A controller of Y errors and U commands
-    has `<prefix>_step(&state, error, command)` with arrays of these lengths. With a friction feed-forward it
-    is `<prefix>_step(&state, error, reference)`.
+    Returns
+    -------
+    str
+        `<prefix>_step(&state, error)` returns the command for the error at this sample. One call every
+        `dt_s`; order n costs (n + 1)^2 multiplications. A controller with limits has them and the anti-windup
+        in the code, and its state keeps in `limited` whether one was active. A controller of Y errors and U
+        commands has `<prefix>_step(&state, error, command)` with arrays of these lengths. With a friction
+        feed-forward it is `<prefix>_step(&state, error, reference)`.
 
-    Raises ValueError if the prefix is no C identifier, the number is neither, or does not hold the law.
+    Raises
+    ------
+    ValueError
+        If the prefix is no C identifier, the number is neither, or does not hold the law.
 
+    Notes
+    -----
     Same law and same order of operations as `ControllerStepper`: x+ = A x + B e + M (u_limited - u). In
     `double` the two differ by the rounding of sums only; `float` may have other states: see `law_in`. The
     code is `K_without_delay` of `Controller.to_control`: the computational delay, which margins are about, is
@@ -94,122 +136,178 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
     Dialect(prefix, number)
     controller = law_in(number, controller)
     assert controller.anti_windup_gain is not None
-    kind: type[np.floating[Any]] = np.float32 if number == "float" else np.float64
-    suffix = "f" if number == "float" else ""
+    number_type: type[np.floating[Any]] = np.float64
+    suffix = ""
+    if number == "float":
+        number_type = np.float32
+        suffix = "f"
 
     def literal(value: float) -> str:
-        # The shortest decimal that reads back as the same number.
+        """Shortest decimal that reads back as the same number of the C type."""
         with np.errstate(over="ignore", under="ignore"):
-            text = str(kind(value))
-        return text + suffix if any(mark in text for mark in ".e") else f"{text}.0{suffix}"
+            text = str(number_type(value))
+        # A C literal without point and exponent would be an integer.
+        if not any(mark in text for mark in ".e"):
+            text += ".0"
+        return text + suffix
 
     def constant(what: str, value: float) -> str:
+        """Literal of a value that must neither overflow nor vanish in the C type; raises ValueError."""
         with np.errstate(over="ignore", under="ignore"):
-            if value and not 0 < abs(float(kind(value))) < np.inf:
-                raise ValueError(f"{what} = {value:.6g} does not fit in a C {number}; use number = 'double'")
+            rounded = abs(float(number_type(value)))
+        if value and not 0 < rounded < np.inf:
+            raise ValueError(f"{what} = {value:.6g} does not fit in a C {number}; use number = 'double'")
         return literal(value)
 
     def vector(values: Real) -> str:
-        return "{" + ", ".join(literal(value) for value in (values if values.size else [0.0])) + "}"
-
-    values = {"f": suffix}
-    if (given := controller.feedforward) is not None:
-        own: dict[str, float] = {
-            "level": given.level,
-            "turn": given.turn(controller.dt_s),
-            "share": given.share(controller.dt_s),
-        }
-        own |= {"excess": given.excess, "fall": given.fall * controller.dt_s}
-        values |= {name: constant(f"feedforward {name}", value) for name, value in own.items()}
-    one = controller.D.size == 1
+        """Initialiser of an array (N,); C has no arrays of length zero, so none is one zero."""
+        if not values.size:
+            values = np.zeros(1)
+        return "{" + ", ".join(literal(value) for value in values) + "}"
 
     def table(matrix: Real) -> str:
-        return ",\n    ".join(vector(row) for row in matrix) or vector(np.zeros(matrix.shape[1]))
+        """Initialisers of the rows of a matrix (N, M); of no rows one row of zeros."""
+        if not len(matrix):
+            return vector(np.zeros(matrix.shape[1]))
+        return ",\n    ".join(vector(row) for row in matrix)
 
+    is_single_loop = controller.D.size == 1
+    constants = {"f": suffix}
+    feedforward = controller.feedforward
+    if feedforward is not None:
+        friction_values = {
+            "level": feedforward.level,
+            "turn": feedforward.turn(controller.dt_s),
+            "share": feedforward.share(controller.dt_s),
+            "excess": feedforward.excess,
+            "fall": feedforward.fall * controller.dt_s,
+        }
+        for name, value in friction_values.items():
+            constants[name] = constant(f"feedforward {name}", value)
     for name, key, factor in (
         ("input_limit", "input_limit", 1.0),
         ("rate_limit", "largest_change", controller.dt_s),
     ):
         if getattr(controller, name) is not None:
-            most = np.minimum(factor * controller.limits(name), _NO_LIMIT)
-            values[key] = constant(name, float(most[0])) if one else vector(most)
+            limits = np.minimum(factor * controller.limits(name), _NO_LIMIT)
+            constants[key] = constant(name, float(limits[0])) if is_single_loop else vector(limits)
+    # The code of one loop has vectors and a number where that of several has matrices.
+    if is_single_loop:
+        matrices = {
+            "B": vector(controller.B[:, 0]),
+            "C": vector(controller.C[0]),
+            "D": literal(float(controller.D[0, 0])),
+            "M": vector(controller.anti_windup_gain[:, 0]),
+        }
+    else:
+        matrices = {
+            "B": table(controller.B),
+            "C": table(controller.C),
+            "D": table(controller.D),
+            "M": table(controller.anti_windup_gain),
+        }
     return _filled(
         "controller.c.in",
         controller,
         header=c_header(controller, prefix, number),
         A=table(controller.A) if controller.order else vector(controller.C[0]),
-        B=vector(controller.B[:, 0]) if one else table(controller.B),
-        C=vector(controller.C[0]) if one else table(controller.C),
-        D=literal(float(controller.D[0, 0])) if one else table(controller.D),
-        M=vector(controller.anti_windup_gain[:, 0]) if one else table(controller.anti_windup_gain),
         name=prefix,
         number=number,
-        **values,
+        **matrices,
+        **constants,
     )
 
 
 def law_in(number: Number, controller: Controller) -> Controller:
-    """The controller in the states that its code has: its own, or those of `in_sections` where `float` would
-    change what it does by rounding its own. Raises ValueError where it does in both."""
+    """The controller in states that its code may have: its own, or those of `in_sections` where `float` would
+    change what it does by rounding its own.
+
+    Parameters
+    ----------
+    number : "double" or "float"
+        Type of the code's numbers.
+    controller : Controller
+        Any order.
+
+    Raises
+    ------
+    ValueError
+        Where single precision changes the response by more than 1 %, or lets a pole leave the circle, in both
+        forms.
+    """
     if number == "double" or controller.order == 0:
         return controller
     assert controller.anti_windup_gain is not None
-    own, there, back = in_sections(controller.A)
+    section_a, to_states, to_sections = in_sections(controller.A)
     sections = replace(
         controller,
-        A=own,
-        B=back @ controller.B,
-        C=controller.C @ there,
-        anti_windup_gain=back @ controller.anti_windup_gain,
+        A=section_a,
+        B=to_sections @ controller.B,
+        C=controller.C @ to_states,
+        anti_windup_gain=to_sections @ controller.anti_windup_gain,
     )
-    omega = np.geomspace(1e-4, 1.0, 400) * np.pi / controller.dt_s
+    nyquist_shares = np.geomspace(_LOWEST_NYQUIST_SHARE, 1.0, _COMPARED_FREQUENCIES)
+    omega = nyquist_shares * np.pi / controller.dt_s
     exact = controller.response(omega).reshape(omega.size, -1)
-    size = _ROUNDED * np.linalg.norm(exact, axis=1)
-    radius = max(1.0, _radius(controller)) * (1 + np.finfo(np.float32).eps)
+    allowed_error = _LARGEST_ROUNDING_SHARE * np.linalg.norm(exact, axis=1)
+    # Integrators may stay on the circle, but for the rounding of a number near one.
+    allowed_radius = max(1.0, _radius(controller)) * (1 + np.finfo(np.float32).eps)
     for form in (controller, sections):
-        rounded: dict[str, Any] = {
-            name: np.clip(getattr(form, name), -_NO_LIMIT, _NO_LIMIT).astype(np.float32)
-            for name in ("A", "B", "C", "D", "anti_windup_gain")
-        }
+        rounded: dict[str, Any] = {}
+        for name in ("A", "B", "C", "D", "anti_windup_gain"):
+            within_float = np.clip(getattr(form, name), -_NO_LIMIT, _NO_LIMIT)
+            rounded[name] = within_float.astype(np.float32)
+        # Without limits, whose check would refuse a gain that rounding has spoilt.
         law = replace(controller, **rounded, input_limit=None, rate_limit=None)
-        off = np.linalg.norm(law.response(omega).reshape(exact.shape) - exact, axis=1)
-        if np.all(off <= size) and _radius(law) <= radius:
+        error = np.linalg.norm(law.response(omega).reshape(exact.shape) - exact, axis=1)
+        if np.all(error <= allowed_error) and _radius(law) <= allowed_radius:
             return form
     raise ValueError(
-        f"single precision changes the response of {controller.name!r} by more than {_ROUNDED:.0%}: use "
-        "number = 'double', or give the controller in sections"
+        f"single precision changes the response of {controller.name!r} by more than "
+        f"{_LARGEST_ROUNDING_SHARE:.0%}: use number = 'double', or give the controller in sections"
     )
 
 
 def _radius(law: Controller) -> float:
-    """Of the poles, with a limit active or not."""
+    """Largest modulus of the law's poles: those of A, and those of A - M C while a limit is active."""
     assert law.anti_windup_gain is not None
-    return float(np.max(np.abs(np.linalg.eigvals([law.A, law.A - law.anti_windup_gain @ law.C]))))
+    limited_a = law.A - law.anti_windup_gain @ law.C
+    return float(np.max(np.abs(np.linalg.eigvals([law.A, limited_a]))))
 
 
 def _filled(template: str, controller: Controller, **values: object) -> str:
-    """A template with its values. A line that begins with `@what:` is for controllers that have it (`!what`:
-    that have it not; several with commas: all of them)."""
-    given = controller.feedforward
+    """Text of a template file with its values.
+
+    A line that begins with `@what:` is written for controllers that have it, with `@!what:` for those that
+    have it not; several conditions, with commas, must all hold.
+    """
+    feedforward = controller.feedforward
     has = {
         "input_limit": controller.input_limit is not None,
         "rate_limit": controller.rate_limit is not None,
         "limits": controller.input_limit is not None or controller.rate_limit is not None,
-        "friction": given is not None,
-        "breakaway": given is not None and given.excess != 0,
+        "friction": feedforward is not None,
+        "breakaway": feedforward is not None and feedforward.excess != 0,
         "matrix": controller.D.size > 1,
         "signals": bool(controller.signals),
         "delay": controller.computational_delay_samples > 0,
     }
     lines = []
     for line in _template(template):
-        tags, _, text = line[1:].partition(":") if line.startswith("@") else ("", "", line)
-        if all(has[tag.lstrip("!")] is not tag.startswith("!") for tag in tags.split(",") if tag):
+        if not line.startswith("@"):
+            lines.append(line)
+            continue
+        conditions, _, text = line[1:].partition(":")
+        holds = []
+        for condition in conditions.split(","):
+            is_negated = condition.startswith("!")
+            holds.append(has[condition.lstrip("!")] is not is_negated)
+        if all(holds):
             lines.append(text)
-    # C has no arrays of length zero.
     commands, errors = controller.D.shape
     shape = {
         "order": controller.order,
+        # C has no arrays of length zero.
         "size": max(controller.order, 1),
         "commands": commands,
         "errors": errors,
@@ -219,4 +317,5 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
 
 @cache
 def _template(name: str) -> tuple[str, ...]:
+    """Lines of a template file of this package, with their line ends."""
     return tuple((files("control_design.controllers") / name).read_text("ascii").splitlines(keepends=True))

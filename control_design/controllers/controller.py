@@ -1,5 +1,12 @@
-"""The controller as it runs: discrete state space with saturation, rate limit, anti-windup, one sample of
-delay, and what dry friction takes off the command given back from the reference."""
+"""The controller as it runs: a discrete state space with limits, anti-windup, delay and friction
+feed-forward.
+
+`Controller` is the law with everything that a machine needs beside its matrices: saturation and rate limit of
+the command, what an active limit does to the states, the computational delay, and a feed-forward that gives
+back what dry friction takes off the command. It answers for analysis (`response`, `to_control`) and converts
+units (`in_units`). `ControllerStepper` runs it sample by sample, in the same order of operations as the C
+code. `FrictionFeedforward` is the friction's part.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +25,42 @@ from ident.data.arrays import lock
 if TYPE_CHECKING:
     import control
 
-    Limit = Any  # whoever has one loop reads a number
+    # Whoever has one loop reads a number, whoever has several a tuple.
+    Limit = Any
 else:
     Limit = float | tuple[float | None, ...] | None
 
 
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
-    """u = K (r - y): x+ = A x + B e + M (u_limited - u), u = C x + D e, of Y errors and U commands.
+    """Controller u = K (r - y) of Y errors and U commands: x+ = A x + B e + M (u_limited - u), u = C x + D e.
 
-    A (n, n), B (n, Y), C (U, n), D (U, Y); dt_s > 0. input_limit, rate_limit: saturation (both signs) and
-    largest change per second of the command, or None; with U > 1 a tuple of these. anti_windup_gain M (n, U):
-    what an active limit does to the states, A - M C stable; None takes that of `anti_windup`.
-    computational_delay_samples: from measurement to command. feedforward: joins u before it is limited, or
-    None. signals: the columns and units of error and command, in words.
+    Parameters
+    ----------
+    A, B, C, D : (n, n), (n, Y), (U, n), (U, Y) array
+        The law that a processor runs, `K_without_delay`: the machine adds the computational delay. Margins
+        and certificates are about `K_with_delay` = z^-computational_delay_samples K_without_delay.
+    dt_s : float
+        Sampling period in seconds, positive.
+    computational_delay_samples : int
+        From measurement to command.
+    input_limit : float, tuple of them, or None
+        Saturation of the command, both signs, in its units; with U > 1 a tuple.
+    rate_limit : float, tuple of them, or None
+        Largest change of the command per second; with U > 1 a tuple.
+    anti_windup_gain : (n, U) array or None
+        M: what an active limit does to the states, with A - M C stable; None takes that of `anti_windup`.
+    name : str
+        Stands in files and errors.
+    feedforward : FrictionFeedforward or None
+        Joins u before it is limited; for one loop only.
+    signals : str
+        Columns and units of error and command, in words.
 
-    A, B, C, D are `K_without_delay`, the law that a processor runs: the machine adds the computational delay.
-    Margins and certificates are about `K_with_delay` = z^-computational_delay_samples K_without_delay.
+    Raises
+    ------
+    ValueError
+        For matrices, limits, delay or gain that do not fit, or a gain that would wind up.
     """
 
     kind = "controller"
@@ -52,6 +78,7 @@ class Controller(Law):
     signals: str = field(default="", metadata={"since": 8})
 
     def __post_init__(self) -> None:
+        """Check limits and delay, and find the anti-windup gain where none is stated."""
         super().__post_init__()
         delay = self.computational_delay_samples
         if not (delay >= 0 and int(delay) == delay):
@@ -71,8 +98,9 @@ class Controller(Law):
         assert self.anti_windup_gain is not None
         shape = (self.order, self.D.shape[0])
         if self.anti_windup_gain.shape != shape or not np.all(np.isfinite(self.anti_windup_gain)):
-            found = self.anti_windup_gain.shape
-            raise ValueError(f"anti_windup_gain must be finite and {shape}; got shape {found}")
+            raise ValueError(
+                f"anti_windup_gain must be finite and {shape}; got shape {self.anti_windup_gain.shape}"
+            )
 
         # One that leaves the states a mode that grows while a limit is active is refused.
         if self.order and self.limited_commands.any():
@@ -83,26 +111,29 @@ class Controller(Law):
                 )
 
     def _checked_limit(self, name: str) -> Limit:
-        """A limit as a number or None, of several commands as a tuple of them. Raises ValueError."""
+        """The limit of that name as a number or None, for a sequence as a tuple of these, one for each
+        command. Raises ValueError for a wrong number of values, or one that is not positive."""
         value = getattr(self, name)
         inputs = self.D.shape[0]
-        several = isinstance(value, tuple | list) or np.ndim(value) > 0
-        if not several:
-            if value is not None and inputs > 1:
-                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
-            each: tuple[float | None, ...] = (None if value is None else float(value),)
+        is_sequence = isinstance(value, tuple | list) or np.ndim(value) > 0
+        limits: tuple[float | None, ...]
+        if is_sequence:
+            limits = tuple(None if limit is None else float(limit) for limit in value)
+            wrong_count = len(limits) != inputs
         else:
-            each = tuple(None if limit is None else float(limit) for limit in value)
-            if len(each) != inputs:
-                raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
-        if not all(limit is None or limit > 0 for limit in each):
+            limits = (None if value is None else float(value),)
+            wrong_count = value is not None and inputs > 1
+        if wrong_count:
+            raise ValueError(f"{name} needs one value for each of {inputs} actuators; got {value!r:.80}")
+        if not all(limit is None or limit > 0 for limit in limits):
             raise ValueError(f"{name} must be positive or None; got {value}")
-        return each if several else each[0]
+        return limits if is_sequence else limits[0]
 
     def gain_for_limits(self, slower: float = 1.0) -> Real:
-        """Anti-windup gain (n, U) that suits the limits: of the commands that have one, zero without.
+        """Anti-windup gain (n, U) that suits the limits; zero for commands without one.
 
-        slower: as of `anti_windup.anti_windup_gain`. Raises ValueError where there is none.
+        slower : the factor of `anti_windup.anti_windup_gain` by which the states follow a limit more slowly.
+        Raises ValueError where no gain makes A - M C stable.
         """
         gain = np.zeros((self.order, self.D.shape[0]))
         limited = self.limited_commands
@@ -114,45 +145,69 @@ class Controller(Law):
             except ValueError:
                 if limited.all():
                     raise
-                # A mode that only commands without a limit show: it cannot wind up, but A - M C needs them.
+                # A mode that only commands without a limit show: it cannot wind up, but A - M C needs a gain
+                # for them as well.
                 return anti_windup_gain(self.A, self.B, self.C, self.D, slower=slower)
         return gain
 
     @property
     def limited_commands(self) -> Boolean:
-        """Whether a command has a limit, (U,)."""
-        return np.asarray(np.isfinite(np.minimum(self.limits("input_limit"), self.limits("rate_limit"))))
+        """Whether each command has a saturation or a rate limit, (U,)."""
+        smaller_limit = np.minimum(self.limits("input_limit"), self.limits("rate_limit"))
+        return np.asarray(np.isfinite(smaller_limit))
 
     @classmethod
     def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
-        """u = gain e, without states; further settings as fields."""
-        return cls(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[gain]]), dt_s, **settings)
+        """Controller u = gain e without states at a period dt_s in seconds; settings are further fields."""
+        no_states = np.zeros((0, 0))
+        no_input = np.zeros((0, 1))
+        no_output = np.zeros((1, 0))
+        return cls(no_states, no_input, no_output, np.array([[gain]]), dt_s, **settings)
 
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
-        """K(e^{j omega dt}), (F,) or (F, U, Y), times z^-delay unless with_delay is False."""
+        """K(e^{j omega dt}) at omega (F,) in rad/s: (F,) complex, of several errors or commands (F, U, Y).
+
+        With its computational delay, `K_with_delay`, unless with_delay is False.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         value = super().response(omega)
         if with_delay:
-            late = np.exp(-1j * omega * self.dt_s * self.computational_delay_samples)
-            value = value * (late if value.ndim == 1 else late[:, None, None])
+            delay = np.exp(-1j * omega * self.dt_s * self.computational_delay_samples)
+            if value.ndim == 3:
+                delay = delay[:, None, None]
+            value = value * delay
         return value
 
     def limits(self, name: str) -> Real:
-        """input_limit or rate_limit of every actuator (U,), infinite where there is none."""
+        """Limits of every actuator (U,), infinite where there is none; name: "input_limit" or
+        "rate_limit"."""
         value = getattr(self, name)
-        each = value if isinstance(value, tuple) else (value,) * self.D.shape[0]
-        return np.array([np.inf if one is None else one for one in each], dtype=np.float64)
+        limits = value if isinstance(value, tuple) else (value,) * self.D.shape[0]
+        return np.array([np.inf if limit is None else limit for limit in limits], dtype=np.float64)
 
     def in_units(self, error: Real, command: Real) -> Controller:
-        """The same in other units: old = error (Y,) * new, old = command (U,) * new, of either sign."""
-        given, own = self.feedforward, dict[str, Any]()
+        """Controller of the same machine with its signals in other units.
+
+        error : (Y,) array, old error over new one. command : (U,) array, old command over new one. Factors
+        may be negative: a signal that counts the other way.
+        """
+        limits: dict[str, Any] = {}
         for name in ("input_limit", "rate_limit"):
-            most = tuple(None if one == np.inf else float(one) for one in self.limits(name) / np.abs(command))
-            own[name] = most if isinstance(getattr(self, name), tuple) else most[0]
-        if given is not None:
-            size, worth = abs(float(error[0])), float(np.sign(error[0]) / command[0])
-            given = FrictionFeedforward(
-                worth * given.level, given.width / size, given.lag_s, worth * given.excess, given.fall / size
+            scaled = []
+            for limit in self.limits(name) / np.abs(command):
+                scaled.append(None if limit == np.inf else float(limit))
+            limits[name] = tuple(scaled) if isinstance(getattr(self, name), tuple) else scaled[0]
+        feedforward = self.feedforward
+        if feedforward is not None:
+            # Friction is a command that goes with the sign of the reference's speed.
+            reference_factor = abs(float(error[0]))
+            friction_factor = float(np.sign(error[0]) / command[0])
+            feedforward = FrictionFeedforward(
+                level=friction_factor * feedforward.level,
+                width=feedforward.width / reference_factor,
+                lag_s=feedforward.lag_s,
+                excess=friction_factor * feedforward.excess,
+                fall=feedforward.fall / reference_factor,
             )
         assert self.anti_windup_gain is not None
         return replace(
@@ -161,8 +216,8 @@ class Controller(Law):
             C=self.C / command[:, None],
             D=self.D * error / command[:, None],
             anti_windup_gain=self.anti_windup_gain * command,
-            feedforward=given,
-            **own,
+            feedforward=feedforward,
+            **limits,
         )
 
     def to_control(self, *, include_delay: bool = False) -> control.StateSpace:
@@ -185,94 +240,140 @@ class Controller(Law):
         return system
 
     def named_systems(self) -> dict[str, dict[str, Any]]:
-        """`K_without_delay` and `K_with_delay` of `to_control` for files: each as A, B, C, D and dt_s [s]."""
+        """`K_without_delay` and `K_with_delay` of `to_control` for files: each a dictionary of the matrices
+        A, B, C, D and of dt_s in seconds."""
         systems = {
             "K_without_delay": self.to_control(),
             "K_with_delay": self.to_control(include_delay=True),
         }
-        return {
-            name: {matrix: np.asarray(getattr(system, matrix)) for matrix in "ABCD"} | {"dt_s": self.dt_s}
-            for name, system in systems.items()
-        }
+        described: dict[str, dict[str, Any]] = {}
+        for name, system in systems.items():
+            described[name] = {matrix: np.asarray(getattr(system, matrix)) for matrix in "ABCD"}
+            described[name]["dt_s"] = self.dt_s
+        return described
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`, as of `Law`; a file may lack feed-forward, signals and `named_systems`."""
-        given = data.get("feedforward")
-        try:
-            made = None if given is None else FrictionFeedforward(**given)
-        except TypeError as error:
-            raise ValueError(
-                f"feedforward needs level, width, lag_s, excess and fall; got {given!r:.80}"
-            ) from error
-        return super().from_dict({"signals": "", **data, "feedforward": made})
+        """Controller that `to_dict` wrote; a file may lack feed-forward, signals and `named_systems`. Raises
+        ValueError for what is no such file, naming the key."""
+        values = data.get("feedforward")
+        feedforward = None
+        if values is not None:
+            try:
+                feedforward = FrictionFeedforward(**values)
+            except TypeError as error:
+                raise ValueError(
+                    f"feedforward needs level, width, lag_s, excess and fall; got {values!r:.80}"
+                ) from error
+        return super().from_dict({"signals": "", **data, "feedforward": feedforward})
 
     def stepper(self) -> ControllerStepper:
-        """A fresh machine-side instance at rest."""
+        """A running instance of the controller, at rest."""
         return ControllerStepper(self)
 
 
 class ControllerStepper:
-    """One running controller: feed the error at t_k, get the limited command computed at t_k; of several
-    commands the errors (Y,) and commands (U,), each limited by itself, without a friction feed-forward.
+    """One running controller: it takes the error at t_k and gives the limited command computed at t_k.
 
-    The computational delay belongs to whoever applies the command (`closed_loop.simulate` queues it): a
-    real-time loop has it by itself.
+    Of several loops it takes the errors (Y,) and gives the commands (U,), each limited by itself, without a
+    friction feed-forward. The computational delay belongs to whoever applies the command
+    (`closed_loop.simulate` queues it): a real-time loop has it by itself.
     """
 
     def __init__(self, controller: Controller) -> None:
-        self._k, self._given = controller, controller.feedforward
+        """A stepper of the controller at rest."""
+        self._controller = controller
+        self._feedforward = controller.feedforward
         self._limit = controller.limits("input_limit")
-        self._change = controller.limits("rate_limit") * controller.dt_s
+        self._largest_change = controller.limits("rate_limit") * controller.dt_s
         self.reset()
 
     def reset(self) -> None:
-        """Back to rest: zero state, previous command zero."""
-        self._x, self._last = np.zeros(self._k.order), np.zeros(self._k.D.shape[0])
-        self._reference, self._smoothed = 0.0, 0.0
-        self.limited = np.zeros(self._last.size, dtype=bool)
+        """Go back to rest: states, previous command and previous reference are zero."""
+        self._states = np.zeros(self._controller.order)
+        self._last_command = np.zeros(self._controller.D.shape[0])
+        self._last_reference = 0.0
+        self._smoothed_friction = 0.0
+        self.limited = np.zeros(self._last_command.size, dtype=bool)
 
     def step(self, error: Any, reference: float = 0.0) -> Any:
-        """Command for the error at this sample, a number for a number; `limited` (U,) tells where a limit was
-        active.
+        """Command for the error at this sample: a number for a number, (U,) for errors (Y,).
 
-        reference: the set point, which the feed-forward (if any) looks at; it rested at zero before. An error
-        that is not finite gives NaN, whatever the limits; states keep it until `reset`.
+        Parameters
+        ----------
+        error : float or (Y,) array
+            Reference minus measurement. One that is not finite gives NaN, whatever the limits, which the
+            states keep until `reset`.
+        reference : float
+            The set point, which the feed-forward (if any) looks at; it rested at zero before.
+
+        Notes
+        -----
+        Afterwards `limited` (U,) tells where a limit was active.
         """
-        k, errors = self._k, np.atleast_1d(np.asarray(error, dtype=np.float64))
-        assert k.anti_windup_gain is not None
-        if self._given is not None:
-            moved = reference - self._reference
-            friction = float(self._given.friction(np.asarray(moved), k.dt_s)) if moved else 0.0
-            self._smoothed += self._given.share(k.dt_s) * (friction - self._smoothed)
-        self._reference = reference
-        wanted = k.C @ self._x + k.D @ errors + np.sum(errors - errors) + self._smoothed
-        command = wanted  # compared as the code in C compares, also what is not a number
+        law = self._controller
+        errors = np.atleast_1d(np.asarray(error, dtype=np.float64))
+        assert law.anti_windup_gain is not None
+        if self._feedforward is not None:
+            moved = reference - self._last_reference
+            friction = 0.0
+            if moved:
+                friction = float(self._feedforward.friction(np.asarray(moved), law.dt_s))
+            self._smoothed_friction += self._feedforward.share(law.dt_s) * (
+                friction - self._smoothed_friction
+            )
+        self._last_reference = reference
+        # An error that is infinite or NaN becomes NaN in every command: errors - errors is zero for all
+        # others.
+        not_a_number = np.sum(errors - errors)
+        wanted = law.C @ self._states + law.D @ errors + not_a_number + self._smoothed_friction
+        # Compared as the code in C compares, also what is not a number: the rate limit first, then the
+        # saturation.
+        command = wanted
         for low, high in (
-            (self._last - self._change, self._last + self._change),
+            (self._last_command - self._largest_change, self._last_command + self._largest_change),
             (-self._limit, self._limit),
         ):
-            command = np.where(command > high, high, np.where(command < low, low, command))
+            raised = np.where(command < low, low, command)
+            command = np.where(command > high, high, raised)
         self.limited = command != wanted
-        self._x = k.A @ self._x + k.B @ errors + k.anti_windup_gain @ (command - wanted)
-        self._last = command
-        return command if np.ndim(error) else float(command[0])
+        limit_excess = command - wanted
+        self._states = law.A @ self._states + law.B @ errors + law.anti_windup_gain @ limit_excess
+        self._last_command = command
+        if np.ndim(error):
+            return command
+        return float(command[0])
 
 
 @dataclass(frozen=True)
 class FrictionFeedforward:
-    """Friction at the reference's speed v, smoothed, as late as the loop follows.
+    """Friction at the reference's speed, smoothed, as late as the loop follows: it joins the command.
 
-    sign(v) (level + excess exp(-|v| / fall)), Coulomb's and Stribeck's; the sign turns round while the speed
-    goes through +-width / lag_s, at which the reference moves by the pre-sliding deflection `width` while the
-    loop answers. Through a first-order lag of lag_s, the delay of the closed loop towards standstill, it
-    joins the command: p+ = p + share (friction - p). No feedback: poles and margins stay, and it dies out at
-    rest.
+    Parameters
+    ----------
+    level : float
+        Coulomb's friction in units of the command; negative where a positive command moves the output down.
+    width : float
+        Pre-sliding deflection, in units of the reference, positive.
+    lag_s : float
+        Delay of the closed loop towards standstill in seconds, positive.
+    excess : float
+        Stribeck's excess at standstill, in units of the command, of the sign of `level`.
+    fall : float
+        Speed over which the excess falls by a factor of e, in units of the reference per second, positive.
 
-    level, excess in units of the command, both below 0 where a positive command moves the output down; width
-    > 0 of the reference, fall > 0 of the reference per second, lag_s > 0. Neglected: friction that depends on
-    position or load; motion that something other than the reference causes; a reference that comes in steps
-    longer than a sample.
+    Raises
+    ------
+    ValueError
+        For level and excess of different signs, other values that are not positive, or not finite.
+
+    Notes
+    -----
+    At the reference's speed v it is sign(v) (level + excess exp(-|v|/fall)). The sign turns round while the
+    speed goes through +-width/lag_s, at which the reference moves by `width` while the loop answers. It
+    passes a first-order lag of lag_s, p+ = p + share (friction - p). There is no feedback in it: poles and
+    margins stay, and it dies out at rest. Neglected: friction that depends on position or load; motion that
+    something other than the reference causes; a reference that comes in steps longer than a sample.
     """
 
     level: float
@@ -282,31 +383,38 @@ class FrictionFeedforward:
     fall: float = 1.0
 
     def __post_init__(self) -> None:
+        """Take numpy scalars as numbers of Python, and check all values."""
         for name, value in vars(self).items():
-            if isinstance(value, np.generic):  # whose truths are not those of Python
+            if isinstance(value, np.generic):
                 object.__setattr__(self, name, value.item())
-        good = self.level * self.excess >= 0 and min(self.width, self.lag_s, self.fall) > 0
-        if not (good and np.all(np.isfinite(list(vars(self).values())))):
+        one_sign = self.level * self.excess >= 0
+        positive = min(self.width, self.lag_s, self.fall) > 0
+        if not (one_sign and positive and np.all(np.isfinite(list(vars(self).values())))):
             raise ValueError(
                 f"a friction feed-forward needs level, excess of one sign, width, lag_s, fall > 0; got {self}"
             )
 
     def share(self, dt_s: float) -> float:
-        """Of its way that the lag goes in a sample."""
+        """Share of its way that the lag goes in a sample of dt_s seconds, 1 - exp(-dt_s/lag_s)."""
         return float(-np.expm1(-dt_s / self.lag_s))
 
     def turn(self, dt_s: float) -> float:
-        """Motion of the reference in a sample from which on its sign is whole."""
+        """Motion of the reference in a sample of dt_s seconds, in its units, from which on the sign of its
+        speed counts in full."""
         return self.width * dt_s / self.lag_s
 
     def friction(self, moved: Real, dt_s: float) -> Real:
-        """At the motion (T,) of the reference in each sample, before the lag."""
+        """Friction (T,) before the lag, in units of the command, for the motion (T,) of the reference in each
+        sample of dt_s seconds."""
         strength = self.level + self.excess * np.exp(-np.abs(moved) / (self.fall * dt_s))
-        return np.asarray(np.minimum(np.maximum(moved / self.turn(dt_s), -1.0), 1.0) * strength)
+        smooth_sign = np.minimum(np.maximum(moved / self.turn(dt_s), -1.0), 1.0)
+        return np.asarray(smooth_sign * strength)
 
     def signal(self, reference: Real, dt_s: float) -> Real:
-        """What joins the command, (T,), for a reference (T,) that rested at zero before."""
-        from scipy.signal import lfilter  # here: every command would wait for it
+        """What joins the command, (T,) in its units, for a reference (T,) that rested at zero before, sampled
+        every dt_s seconds."""
+        # Imported here: every command would wait for it.
+        from scipy.signal import lfilter
 
         share = self.share(dt_s)
         friction = self.friction(np.diff(reference, prepend=0.0), dt_s)

@@ -1,4 +1,10 @@
-"""What controller and reference filter have in common: a checked state space, kept as JSON."""
+"""What controller and reference filter have in common: a checked state space, kept as JSON.
+
+A `Law` is a discrete state space with named fields that its class adds. It is checked once, when it is built;
+its arrays are read-only. `to_dict` and `to_json` write it with all digits, `from_dict` and `from_json` read
+it back to the same law and refuse in one line what is not one, and `to_mat` writes a MATLAB file.
+`in_sections` is another form of its states, in which single precision does little harm.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +25,30 @@ from ident.data.mat_files import mat_bytes
 if TYPE_CHECKING:
     import control
 
+# Fields that files hold as nested lists and the law as arrays.
 _ARRAYS = ("A", "B", "C", "D", "anti_windup_gain")
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """x+ = A x + B e, C x + D e: A (n, n), B (n, Y), C (U, n), D (U, Y), read-only; dt_s > 0."""
+    """Discrete law x+ = A x + B e, output C x + D e, of n states, Y inputs and U outputs.
+
+    Parameters
+    ----------
+    A, B, C, D : (n, n), (n, Y), (U, n), (U, Y) array
+        Finite; read-only in the law.
+    dt_s : float
+        Sampling period in seconds, positive.
+
+    Raises
+    ------
+    ValueError
+        For shapes that do not fit, values that are not finite, or a period that is not positive.
+
+    Notes
+    -----
+    A class of laws says what it is (`kind`) and what its fields mean (`equations`); both go into its files.
+    """
 
     kind: ClassVar[str]
     equations: ClassVar[str]
@@ -36,6 +60,7 @@ class Law:
     dt_s: float
 
     def __post_init__(self) -> None:
+        """Lock the matrices and check them."""
         lock(self, *"ABCD")
         n = self.A.shape[0]
         shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
@@ -47,39 +72,45 @@ class Law:
                 raise ValueError(f"{self.kind} matrix {name} has a value that is not finite")
         if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
             raise ValueError(f"dt_s must be positive; got {self.dt_s}")
-        object.__setattr__(self, "dt_s", float(self.dt_s))  # of numpy: not as C or JSON would have it
+        # A numpy scalar is written otherwise in C and JSON.
+        object.__setattr__(self, "dt_s", float(self.dt_s))
 
     @property
     def order(self) -> int:
+        """Number of states n."""
         return int(self.A.shape[0])
 
     @property
     def poles(self) -> Complex:
-        """Poles in z, (n,)."""
+        """Poles in z, (n,) complex."""
         if self.order == 0:
             return np.zeros(0, dtype=np.complex128)
         return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
 
     def to_control(self) -> control.StateSpace:
-        """As `control.StateSpace`."""
-        import control  # here, because it brings a plotting library with it
+        """The law as a discrete `control.StateSpace`."""
+        # Imported here, because it brings a plotting library with it.
+        import control
 
         return control.ss(np.array(self.A), np.array(self.B), np.array(self.C), np.array(self.D), self.dt_s)
 
     def response(self, omega_rad_s: Real) -> Complex:
-        """Response at z = e^{j omega dt}, (F,) of one loop, else (F, U, Y)."""
-        found = matrix_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
-        return found[:, 0, 0] if self.D.size == 1 else found
+        """Response at z = e^{j omega dt} for omega (F,) in rad/s: (F,) complex for one input and one output,
+        else (F, U, Y)."""
+        response = matrix_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
+        if self.D.size == 1:
+            return response[:, 0, 0]
+        return response
 
     def to_dict(self) -> dict[str, Any]:
-        """JSON-able; `from_dict` restores it exactly (floats are written with all their digits)."""
-        plain = {
-            key: value.tolist() if isinstance(value, np.ndarray) else value
-            for key, value in asdict(self).items()
-        }
+        """All fields and `named_systems` as numbers, words and lists for JSON; `from_dict` restores the law
+        exactly, as floats are written with all their digits."""
+        plain: dict[str, Any] = {"format": self.format_name(), "law": self.equations}
+        for key, value in asdict(self).items():
+            plain[key] = value.tolist() if isinstance(value, np.ndarray) else value
         for name, system in self.named_systems().items():
             plain[name] = {key: value.tolist() if key in _ARRAYS else value for key, value in system.items()}
-        return {"format": self.format_name(), "law": self.equations, **plain}
+        return plain
 
     def named_systems(self) -> dict[str, dict[str, Any]]:
         """State spaces (A, B, C, D, dt_s) that files hold by name beside the fields; reading ignores them."""
@@ -87,20 +118,28 @@ class Law:
 
     @classmethod
     def format_name(cls) -> str:
-        """What a file of this kind says it is."""
+        """Name of the format that a file of this kind says it has."""
         return f"flexlink-{cls.kind.replace(' ', '_')}-1"
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Inverse of `to_dict`; ValueError if it is not of this format, naming a key it lacks."""
+        """Law that `to_dict` wrote.
+
+        Raises
+        ------
+        ValueError
+            For another format, a key that is missing, or a value of the wrong type or size; the line names
+            it.
+        """
         if data.get("format") != cls.format_name():
-            found = f"format is {data.get('format')!r:.80}, expected {cls.format_name()!r}"
-            raise ValueError(f"not a {cls.kind} file: {found}")
+            difference = f"format is {data.get('format')!r:.80}, expected {cls.format_name()!r}"
+            raise ValueError(f"not a {cls.kind} file: {difference}")
         missing = [field.name for field in fields(cls) if field.name not in data]
         if missing:
             raise ValueError(f"{cls.kind} file lacks the key {missing[0]!r}")
         hints = get_type_hints(cls)
         values = {field.name: cls._read(field.name, hints[field.name], data) for field in fields(cls)}
+        # Lists lose the shape of an empty matrix: it follows from the sizes of D and C.
         u, y = values["D"].shape if values["D"].ndim == 2 and values["D"].size else (1, 1)
         n = values["C"].size // u
         shapes = {"A": (n, n), "B": (n, y), "C": (u, n), "D": (u, y), "anti_windup_gain": (n, u)}
@@ -114,9 +153,11 @@ class Law:
 
     @classmethod
     def _read(cls, name: str, hint: Any, data: Mapping[str, Any]) -> Any:
-        """A field of a file: an array of numbers, or what its annotation says."""
+        """Value of the field `name` of a file: an array of numbers, or of the type that its annotation `hint`
+        says. Raises ValueError naming the field, what was expected and what came."""
         value = data[name]
-        if value is None and name == "anti_windup_gain":  # to be found from the rest
+        # A gain that is not stated is found from the other fields.
+        if value is None and name == "anti_windup_gain":
             return None
         try:
             if _holds_truth(value):
@@ -129,27 +170,32 @@ class Law:
             raise ValueError(f"{cls.kind} file: {name}: expected {expected}, got {value!r:.80}") from None
 
     def to_json(self) -> str:
-        """Readable JSON text."""
+        """The law as readable JSON text, ending in a new line."""
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def to_mat(self) -> bytes:
-        """MATLAB 5 file of all fields and `named_systems` (structs); a limit that is None is infinite (one
-        per actuator: a row), a feed-forward that is None and signals that nobody named are left out."""
+        """The law as a MATLAB 5 file of all fields and `named_systems`, these as structs.
+
+        A limit that is None is infinite (for several actuators a row); a feed-forward that is None and
+        signals that nobody named are left out.
+        """
         values: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        given = values.pop("feedforward", None)
-        if given is not None:
-            values["feedforward"] = vars(given)
+        feedforward = values.pop("feedforward", None)
+        if feedforward is not None:
+            values["feedforward"] = vars(feedforward)
         if not values.get("signals"):
             values.pop("signals", None)
         for name, value in values.items():
             if isinstance(value, tuple):
-                values[name] = np.array([np.inf if one is None else one for one in value])
-        values = {name: np.inf if value is None else value for name, value in values.items()}
+                values[name] = np.array([np.inf if limit is None else limit for limit in value])
+            elif value is None:
+                values[name] = np.inf
         return mat_bytes(values | self.named_systems(), f"flexlink {self.kind}")
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Inverse of `to_json`; ValueError with one line on bad input."""
+        """Law that `to_json` wrote. Raises ValueError with one line for text that is no JSON or no such
+        law."""
         try:
             data = json_value(text)
         except ValueError as error:
@@ -160,16 +206,25 @@ class Law:
 
 
 def in_sections(A: Real) -> tuple[Real, Real, Real]:
-    """(S, T, T^-1), A = T S T^-1 for states in real Schur form: sections in a row, whose poles rounding moves
-    by as much as it rounds, however close together they are."""
-    from scipy.linalg import matrix_balance, schur  # here: every command would wait for it
+    """Real Schur form of the states of A (n, n): matrices S, T and T^-1, each (n, n), with A = T S T^-1.
+
+    S is block triangular: sections of first and second order in a row, whose poles rounding moves by as much
+    as it rounds, however close together they are.
+    """
+    # Imported here: every command would wait for it.
+    from scipy.linalg import matrix_balance, schur
 
     balanced, (size, _) = matrix_balance(A, permute=False, separate=True)
-    own, turn = schur(balanced)
-    return own, size[:, None] * turn, turn.T / size
+    sections, rotation = schur(balanced)
+    return sections, size[:, None] * rotation, rotation.T / size
 
 
 def _holds_truth(value: Any) -> bool:
-    """Whether there is a `true` or `false`, which is no number, in a value of JSON."""
-    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return isinstance(value, bool) or any(map(_holds_truth, parts))
+    """Whether a value of JSON is or holds a `true` or `false`, which Python would take for a number."""
+    if isinstance(value, bool):
+        return True
+    if isinstance(value, dict):
+        return any(_holds_truth(part) for part in value.values())
+    if isinstance(value, list):
+        return any(_holds_truth(part) for part in value)
+    return False
