@@ -251,7 +251,7 @@ def _in_range(grid: Real, low: Real, high: Real) -> Boolean:
     """Whether each interval from low to high (F,) lies between the ends of grid (K,), all in rad/s."""
     above_first = low >= grid[0] * (1 - _SAME_FREQUENCY_SHARE)
     below_last = high <= grid[-1] * (1 + _SAME_FREQUENCY_SHARE)
-    return above_first & below_last
+    return np.asarray(above_first & below_last)
 
 
 def own_grid_set(
