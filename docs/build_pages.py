@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import html
 import inspect
 import os
 import re
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +16,8 @@ from typing import Any, get_args
 
 import jupytext
 import nbformat
+from docstring_parser import DocstringStyle, parse
+from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 from nbclient import NotebookClient
 from nbconvert import MarkdownExporter
@@ -268,13 +271,82 @@ def settings(thing: Any) -> str:
 
 
 def docstring(name: str, thing: Any) -> str:
-    """Signature and docstring."""
+    """Signature and numpydoc docstring of a function or class as Markdown.
+
+    Parameters, what is returned and what is raised become tables; text stays text, with its formulas: those
+    behind `.. math::` as MathML, which browsers draw without a script, others as they are written.
+    """
     try:
         signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
     except (TypeError, ValueError):
         signature = ""
-    text = inspect.cleandoc(thing.__doc__ or "")
-    return f"```python\n{name}{signature}\n```\n\n```text\n{text}\n```"
+    described = parse(inspect.cleandoc(thing.__doc__ or ""), DocstringStyle.NUMPYDOC)
+    parts = [f"```python\n{name}{signature}\n```", prose(described.short_description)]
+    parts.append(prose(described.long_description))
+    parameters = [
+        (f"`{parameter.arg_name}`", parameter.type_name, parameter.description)
+        for parameter in described.params
+        if parameter.args[0] != "attribute"
+    ]
+    parts.append(cells("Parameters", ("name", "type", "meaning"), parameters))
+    returned = [(part.return_name or "", part.type_name, part.description) for part in described.many_returns]
+    parts.append(cells("Returns", ("name", "type", "meaning"), returned))
+    raised = [(part.type_name, part.description) for part in described.raises]
+    parts.append(cells("Raises", ("error", "when"), raised))
+    for part in described.meta:
+        section = part.args[0].capitalize()
+        if section in ("Notes", "References", "See also"):
+            parts.append(f"**{section}**\n\n{prose(part.description)}")
+    if described.examples:
+        code = "\n".join(example.snippet or example.description or "" for example in described.examples)
+        parts.append(f"**Examples**\n\n```python\n{code}\n```")
+    return "\n\n".join(part for part in parts if part)
+
+
+def cells(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | None]]) -> str:
+    """A titled Markdown table of the rows, without columns that are empty in all of them; nothing for no
+    rows."""
+    if not rows:
+        return ""
+    used = [number for number in range(len(columns)) if any(values[number] for values in rows)]
+    lines = [" | ".join(columns[number] for number in used), " | ".join("---" for _ in used)]
+    for values in rows:
+        texts = [" ".join(prose(values[number]).split()).replace("|", "\\|") for number in used]
+        lines.append(" | ".join(texts))
+    return f"**{title}**\n\n" + "\n".join(f"| {line} |" for line in lines)
+
+
+# A formula of its own: `.. math::` and the indented lines behind it.
+DISPLAYED = re.compile(r"^\.\. math::[ ]*([^\n]*)\n?((?:[ ]+[^\n]*\n?|\n)*)", re.MULTILINE)
+
+
+def prose(text: str | None) -> str:
+    """Text of a docstring as Markdown: what Markdown would take for a mark of its own stays as it is
+    written."""
+    parts = []
+    end = 0
+    for formula in DISPLAYED.finditer(text or ""):
+        parts.append(escaped((text or "")[end : formula.start()]))
+        latex = " ".join(f"{formula[1]} {formula[2]}".split())
+        parts.append(f"\n\n<div>{convert(latex, display='block')}</div>\n\n")
+        end = formula.end()
+    parts.append(escaped((text or "")[end:]))
+    return "".join(parts).strip()
+
+
+def escaped(text: str) -> str:
+    """Text in which `*`, `_`, `<` and brackets are themselves, but for code in backticks and indented
+    lines."""
+    lines = []
+    for line in text.split("\n"):
+        if line.startswith("    "):
+            lines.append(line)
+            continue
+        pieces = line.split("`")
+        for number in range(0, len(pieces), 2):
+            pieces[number] = re.sub(r"([*_\[\]])", r"\\\1", html.escape(pieces[number], quote=False))
+        lines.append("`".join(pieces))
+    return "\n".join(lines)
 
 
 def gallery() -> str:

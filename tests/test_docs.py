@@ -185,6 +185,39 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_docstring_becomes_tables_text_and_drawn_formulas():
+    def gain(k, limit=None):
+        """Largest gain of a *loop* <1 rad/s>.
+
+        Parameters
+        ----------
+        k : (F,) array
+            Controller, |k| at most `limit`.
+
+        Raises
+        ------
+        ValueError
+            For nan.
+
+        Notes
+        -----
+        It is
+
+        .. math::
+
+            S = (1 + G K)^{-1}
+        """
+
+    page = pages().docstring("gain", gain)
+    assert "gain(k, limit=None)" in page
+    assert r"| `k` | (F,) array | Controller, \|k\| at most `limit`. |" in page
+    assert "| ValueError | For nan. |" in page
+    # Markdown would take a star for emphasis and an angle for a tag.
+    assert r"\*loop\* &lt;1 rad/s&gt;" in page
+    assert "<math" in page
+    assert "^{-1}" not in page
+
+
 @pytest.mark.slow
 def test_the_site_is_built_whole_and_asks_no_network(site):
     made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
