@@ -1,9 +1,11 @@
-"""Repeats of one experiment at one amplitude or several: what scatters, and what the amplitude changes,
-without a model.
+"""Repeats of one experiment, at one amplitude or several: how they scatter, and what the amplitude changes.
 
-Records whose excitation (the reference of a closed loop, else the input) has the same course are one
-experiment; its size is its amplitude. Repeats of an amplitude differ by noise and change from run to run. Of
-a linear arm the response does not depend on amplitude.
+Records whose excitation (the reference of a closed loop, else the input) has the same course are repeats of
+one experiment, and the size of the excitation is its amplitude. `repeats_of` sorts records into experiments
+and estimates a frequency response from each record, without a model. The response of a linear arm does not
+depend on the amplitude, so `Repeats.amplitude_effects` compares the largest with the smallest amplitude, band
+by band, by Dempster's test of two samples of many variables (Annals of Mathematical Statistics 29(4), 1958).
+Assumed: repeats differ by noise and by random changes from run to run, which are independent between records.
 """
 
 from __future__ import annotations
@@ -21,22 +23,45 @@ from ident.data.finding import TEST_LEVEL
 from ident.data.nonparametric import spectra_of
 from ident.data.record import Record, in_groups
 
-# Lines averaged for one estimate: five.
-_HALF_WIDTH = 2
-# Bands in which it is looked for, a decade.
-_PER_DECADE = 8
-_FEWEST = 3  # frequencies in a band: of fewer there is no slope beside its mean
+# Spectral lines on either side of the middle one of an averaging width: five lines make one estimate, as in
+# `empirical_frf` for a single record. More of them smear resonances, fewer leave estimates noisier.
+HALF_WIDTH_LINES = 2
+# Bands per decade in which amplitudes are compared: a band is 1.33 times as high as it is low, about the
+# width of a resonance with 15 % damping. Twice as many halve the frequencies that each test has.
+BANDS_PER_DECADE = 8
+# Frequencies that a band needs: with fewer, a mean and a slope describe the change exactly, and nothing is
+# left to judge them by.
+FEWEST_FREQUENCIES = 3
+# Averaging widths that an experiment needs, so that it has one band at least.
+FEWEST_WIDTHS = 3
 
 
 @dataclass(frozen=True)
 class AmplitudeBand:
-    """Largest against smallest amplitude in a band, as shares of the response, RMS.
+    """How the response at the largest amplitude differs from that at the smallest, in one band.
 
-    difference: between the means, noise taken off; chance: by the scatter of the repeats alone; scatter: of
-    one repeat, mean of both; gain: mean relative change; shift: relative change of the frequencies of
-    resonances and zeros that fits the rest best; level_share, shift_share: of the difference's power, what
-    one change of gain and phase for the band explains, and the shift; probability: of so large a difference
-    by chance.
+    Sizes are root mean squares over the band as shares of the response; frequencies count by the power that
+    the response has there.
+
+    Attributes
+    ----------
+    from_rad_s, to_rad_s : float
+        Ends of the band, rad/s.
+    difference : float
+        Between the means of the two amplitudes, with the noise of the means taken off; at least 0.
+    chance : float
+        What the noise of the means alone would make of it, by the scatter of the repeats.
+    scatter : float
+        Standard deviation of one repeat, mean square of both amplitudes.
+    gain : float
+        Mean relative change of the response over the band.
+    shift : float
+        Relative change of the frequencies of resonances and zeros that fits the remaining change best.
+    level_share, shift_share : float
+        Shares of the power of the difference that one change of gain and phase for the whole band explains,
+        and that the shift explains.
+    probability : float
+        Of so large a difference by chance.
     """
 
     from_rad_s: float
@@ -53,10 +78,18 @@ class AmplitudeBand:
 
 @dataclass(frozen=True, eq=False)
 class Repeats:
-    """One experiment: C amplitudes rms (C,) of the excitation, ascending, each recorded at least twice.
+    """One experiment that was recorded at C amplitudes, at least twice at each.
 
-    omega_rad_s (F,): middles of the averaging widths; responses: per amplitude (K, F), one row a record;
-    names: of the records, per amplitude.
+    Attributes
+    ----------
+    rms : tuple of float
+        C amplitudes, ascending: standard deviation of the excitation, in its units.
+    names : tuple of tuple of str
+        Names of the records, per amplitude.
+    omega_rad_s : ndarray, shape (F,)
+        Middles of the averaging widths, rad/s, ascending.
+    responses : tuple of ndarray, shape (K, F) each
+        Complex responses, output over input, per amplitude: one row for each of its K records.
     """
 
     rms: tuple[float, ...]
@@ -65,48 +98,100 @@ class Repeats:
     responses: tuple[ComplexArray, ...]
 
     def scatter(self, amplitude: int) -> float:
-        """Of one repeat at an amplitude, over the response, median over frequency."""
-        each = self.responses[amplitude]
-        return float(np.median(each.std(axis=0, ddof=1) / np.abs(each.mean(axis=0))))
+        """Return the standard deviation of one repeat over the size of the response, median over frequency.
+
+        Parameters
+        ----------
+        amplitude : int
+            Index into `rms`.
+        """
+        repeats = self.responses[amplitude]
+        deviation = repeats.std(axis=0, ddof=1)
+        size = np.abs(repeats.mean(axis=0))
+        return float(np.median(deviation / size))
 
     @property
     def amplitude_effects(self) -> tuple[AmplitudeBand, ...]:
-        """Where the response differs between amplitudes by more than chance at 99 %, all bands together:
-        by eighths of a decade; none with one amplitude."""
-        low, high = self.omega_rad_s[0] * (1 - 1e-9), self.omega_rad_s[-1] * (1 + 1e-9)
-        edges = np.geomspace(low, high, max(round(_PER_DECADE * np.log10(high / low)), 1) + 1).tolist()
-        bands = [self.across_amplitudes(*ends) for ends in pairwise(edges)]
-        limit = (1 - TEST_LEVEL) / max(sum(band is not None for band in bands), 1)
-        return tuple(band for band in bands if band is not None and band.probability < limit)
+        """Bands in which the response differs between amplitudes by more than chance.
+
+        The level of 99 % holds for all bands together, as each is tested at its share of the error
+        (Bonferroni). Bands are eighths of a decade. Empty with one amplitude.
+        """
+        # The first and the last frequency belong to the bands in spite of rounding.
+        low = self.omega_rad_s[0] * (1 - 1e-9)
+        high = self.omega_rad_s[-1] * (1 + 1e-9)
+        n_bands = max(round(BANDS_PER_DECADE * np.log10(high / low)), 1)
+        edges = np.geomspace(low, high, n_bands + 1).tolist()
+
+        bands = []
+        for low_rad_s, high_rad_s in pairwise(edges):
+            band = self.across_amplitudes(low_rad_s, high_rad_s)
+            if band is not None:
+                bands.append(band)
+        largest_probability = (1 - TEST_LEVEL) / max(len(bands), 1)
+        return tuple(band for band in bands if band.probability < largest_probability)
 
     def across_amplitudes(self, low_rad_s: float, high_rad_s: float) -> AmplitudeBand | None:
-        """None with one amplitude, or fewer than three frequencies in the band.
+        """Compare the responses at the largest and the smallest amplitude in the band low <= omega < high.
 
-        Frequencies count by the power of their response. Dempster's test (Annals of Mathematical Statistics
-        29(4), 1958): power of the difference over that of the scatter, against F(2 r, 2 r n), n complex
-        degrees of freedom of the repeats (Welch's) and r = tr(S)^2 / tr(S^2) independent errors in the band,
-        S their covariance between frequencies, freed of the bias of few repeats.
+        Parameters
+        ----------
+        low_rad_s, high_rad_s : float
+            Ends of the band, rad/s.
+
+        Returns
+        -------
+        AmplitudeBand or None
+            None with one amplitude, or with fewer than three frequencies in the band.
+
+        Notes
+        -----
+        Dempster's test: the power of the difference over that of its scatter follows F(2 r, 2 r n). n are the
+        complex degrees of freedom of the repeats of both amplitudes (Welch's), r is the number of
+        independent errors among the frequencies of the band (`_independent_errors`).
+        Neglected: amplitudes between the largest and the smallest; changes of second order.
         """
-        at = (self.omega_rad_s >= low_rad_s) & (self.omega_rad_s < high_rad_s)
-        if len(self.rms) < 2 or np.count_nonzero(at) < _FEWEST:
+        in_band = (self.omega_rad_s >= low_rad_s) & (self.omega_rad_s < high_rad_s)
+        if len(self.rms) < 2 or np.count_nonzero(in_band) < FEWEST_FREQUENCIES:
             return None
-        first, last = (self.responses[end][:, at] for end in (0, -1))
-        middle = 0.5 * (first.mean(axis=0) + last.mean(axis=0))
-        change = (last.mean(axis=0) - first.mean(axis=0)) / middle
-        weight = np.abs(middle) ** 2 / np.sum(np.abs(middle) ** 2)
-        apart = [(each - each.mean(axis=0)) / middle * np.sqrt(weight) for each in (first, last)]
-        variances = [float(np.sum(np.abs(each) ** 2)) / (len(each) - 1) for each in apart]
-        parts = np.array(variances) / [len(first), len(last)]
-        power, noise = float(weight @ np.abs(change) ** 2), float(parts.sum())
-        freedom = noise**2 / float(np.sum(parts**2 / [len(first) - 1, len(last) - 1]))
-        independent = _independent(np.vstack(apart), len(first) + len(last) - 2)
-        slope = -np.gradient(
-            np.log(np.abs(middle)) + 1j * np.unwrap(np.angle(middle)), np.log(self.omega_rad_s[at])
-        )
-        slope -= weight @ slope  # a constant slope cannot be told from a change of the whole band
-        level, steep = complex(weight @ change), float(weight @ np.abs(slope) ** 2)
-        shift = float(weight @ (change * slope.conj()).real) / steep
-        beyond = max(power - noise, np.finfo(np.float64).tiny)
+        smallest = self.responses[0][:, in_band]
+        largest = self.responses[-1][:, in_band]
+
+        # Relative change of the mean response; frequencies count by the power of the response.
+        mean_at_smallest = smallest.mean(axis=0)
+        mean_at_largest = largest.mean(axis=0)
+        middle = 0.5 * (mean_at_smallest + mean_at_largest)
+        change = (mean_at_largest - mean_at_smallest) / middle
+        middle_power = np.abs(middle) ** 2
+        weight = middle_power / np.sum(middle_power)
+
+        # Weighted deviations of the repeats from their mean, and the variance of one repeat in all of them.
+        deviations = []
+        variances = []
+        for responses, mean in ((smallest, mean_at_smallest), (largest, mean_at_largest)):
+            deviation = (responses - mean) / middle * np.sqrt(weight)
+            deviations.append(deviation)
+            variances.append(float(np.sum(np.abs(deviation) ** 2)) / (len(responses) - 1))
+
+        # Noise of the difference of the two means, and its degrees of freedom.
+        n_repeats = np.array([len(smallest), len(largest)])
+        variances_of_means = np.array(variances) / n_repeats
+        noise = float(variances_of_means.sum())
+        freedom = noise**2 / float(np.sum(variances_of_means**2 / (n_repeats - 1)))
+        n_independent = _independent_errors(np.vstack(deviations), int(n_repeats.sum()) - 2)
+        power = float(weight @ np.abs(change) ** 2)
+        probability = f.sf(power / noise, 2 * n_independent, 2 * n_independent * freedom)
+
+        # What a shift of all frequencies by a common factor 1 + s does: G(w / (1 + s)) is G (1 + s slope),
+        # with slope = -d ln G / d ln w. A constant slope cannot be told from a change of the whole band.
+        log_response = np.log(np.abs(middle)) + 1j * np.unwrap(np.angle(middle))
+        slope = -np.gradient(log_response, np.log(self.omega_rad_s[in_band]))
+        slope -= weight @ slope
+        slope_power = float(weight @ np.abs(slope) ** 2)
+        shift = float(weight @ (change * slope.conj()).real) / slope_power
+        level = complex(weight @ change)
+
+        power_beyond_noise = max(power - noise, np.finfo(np.float64).tiny)
         return AmplitudeBand(
             low_rad_s,
             high_rad_s,
@@ -115,74 +200,131 @@ class Repeats:
             scatter=float(np.sqrt(np.mean(variances))),
             gain=level.real,
             shift=shift,
-            level_share=abs(level) ** 2 / beyond,
-            shift_share=shift**2 * steep / beyond,
-            probability=float(f.sf(power / noise, 2 * independent, 2 * independent * freedom)),
+            level_share=abs(level) ** 2 / power_beyond_noise,
+            shift_share=shift**2 * slope_power / power_beyond_noise,
+            probability=float(probability),
         )
 
 
-def _independent(deviations: ComplexArray, freedom: int) -> float:
-    """Independent errors among those of neighbouring frequencies, from deviations (K, F) of complex repeats
-    with `freedom` n: tr(S)^2 / tr(S^2), where of the sample covariance n tr(S_hat^2) has tr(S)^2 too much."""
+def _independent_errors(deviations: ComplexArray, freedom: int) -> float:
+    """Return how many independent errors neighbouring frequencies have among them, between 1 and F.
+
+    Parameters
+    ----------
+    deviations : ndarray, shape (K, F)
+        Complex deviations of K repeats from their means, at F frequencies.
+    freedom : int
+        n, complex degrees of freedom of the deviations: K less the means that were taken off; at least 2.
+
+    Notes
+    -----
+    tr(S)^2 / tr(S^2), S the covariance (F, F) between frequencies. Of the sample covariance, tr(S_hat^2) is
+    larger than tr(S^2) by tr(S)^2 / n in the mean, which few repeats make large; it is taken off. Traces of
+    the (K, K) matrix of inner products are those of S_hat, and it is smaller.
+    """
     inner = deviations @ deviations.conj().T / freedom
-    total, square = float(np.trace(inner).real), float(np.sum(np.abs(inner) ** 2))
-    if freedom < 2:
-        return 1.0
-    unbiased = freedom**2 / (freedom**2 - 1) * (square - total**2 / freedom)
-    return (
-        float(np.clip(total**2 / unbiased, 1.0, deviations.shape[1]))
-        if unbiased > 0
-        else float(deviations.shape[1])
-    )
+    trace = float(np.trace(inner).real)
+    trace_of_square = float(np.sum(np.abs(inner) ** 2))
+    unbiased = freedom**2 / (freedom**2 - 1) * (trace_of_square - trace**2 / freedom)
+    n_frequencies = deviations.shape[1]
+    if unbiased <= 0:
+        return float(n_frequencies)
+    return float(np.clip(trace**2 / unbiased, 1.0, n_frequencies))
 
 
 def repeats_of(records: Sequence[Record]) -> tuple[Repeats, ...]:
-    """Every experiment among SISO records that has an amplitude with two records or more; amplitudes with a
-    single one are left out. Raises ValueError for several inputs or outputs."""
+    """Return every experiment among records that has an amplitude with two records or more.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        One input and one output each. Their excitation is the reference where there is one, else the input;
+        records whose excitation stands still are left out, and so are amplitudes with a single record.
+
+    Returns
+    -------
+    tuple of Repeats
+
+    Raises
+    ------
+    ValueError
+        A record has several inputs or outputs.
+    """
     for record in records:
         record.refuse_several()
-    signals = [(one, (one.input if one.reference is None else one.reference)[:, 0]) for one in records]
-    moving = [(one, np.asarray(signal - signal.mean())) for one, signal in signals if np.ptp(signal) > 0]
-    found = (_experiment(form) for form in in_groups(moving, _alike))
-    return tuple(experiment for experiment in found if experiment is not None)
+
+    # Each record with its excitation (T,) about its mean.
+    excited = []
+    for record in records:
+        columns = record.input if record.reference is None else record.reference
+        excitation = columns[:, 0]
+        if np.ptp(excitation) > 0:
+            excited.append((record, np.asarray(excitation - excitation.mean())))
+
+    experiments = []
+    for group in in_groups(excited, _alike):
+        experiment = _experiment(group)
+        if experiment is not None:
+            experiments.append(experiment)
+    return tuple(experiments)
 
 
-def _alike(one: tuple[Record, RealArray], another: tuple[Record, RealArray]) -> bool:
-    """Excited in the same way, whatever the size."""
-    (record, course), (other, its) = one, another
-    if course.size != its.size or record.dt_s != other.dt_s:
+def _alike(first: tuple[Record, RealArray], second: tuple[Record, RealArray]) -> bool:
+    """Whether two records, each with its excitation (T,) about its mean, were excited alike but for the size.
+
+    They have one length, one sampling time, and courses that differ by less than 2 % (`SAME`) in root mean
+    square once their sizes are divided out.
+    """
+    first_record, first_course = first
+    second_record, second_course = second
+    if first_course.size != second_course.size or first_record.dt_s != second_record.dt_s:
         return False
-    return bool(np.linalg.norm(course / np.linalg.norm(course) - its / np.linalg.norm(its)) < SAME)
+    first_form = first_course / np.linalg.norm(first_course)
+    second_form = second_course / np.linalg.norm(second_course)
+    return bool(np.linalg.norm(first_form - second_form) < SAME)
 
 
-def _experiment(form: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
-    sized = sorted(((float(np.std(course)), record) for record, course in form), key=lambda pair: pair[0])
+def _experiment(group: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
+    """Return the responses of records that were excited alike, sorted by amplitude.
+
+    group: records, each with its excitation (T,) about its mean. None where no amplitude has two records,
+    where the excitation has fewer lines than three averaging widths, or where the input stands still at one.
+    """
+    # Records within 2 % of the smallest one of an amplitude belong to it.
+    sized = [(float(np.std(course)), record) for record, course in group]
+    sized.sort(key=lambda pair: pair[0])
     amplitudes: list[list[tuple[float, Record]]] = []
     for size, record in sized:
         if amplitudes and size < (1 + SAME) * amplitudes[-1][0][0]:
             amplitudes[-1].append((size, record))
         else:
             amplitudes.append([(size, record)])
-    repeated = [same for same in amplitudes if len(same) > 1]
+    repeated = [amplitude for amplitude in amplitudes if len(amplitude) > 1]
     if not repeated:
         return None
-    spectra = spectra_of([record for same in repeated for _, record in same], periodic=False)
+
+    # Lines that are excited, in averaging widths side by side: (F, 5) indices.
+    records = [record for amplitude in repeated for _, record in amplitude]
+    spectra = spectra_of(records, periodic=False)
     power = np.mean(np.abs(spectra.instrument) ** 2, axis=0)
-    excited = np.flatnonzero(power > EXCITED * power.max())
-    width = 2 * _HALF_WIDTH + 1
-    count = excited.size // width
-    if count < 3:
+    excited_lines = np.flatnonzero(power > EXCITED * power.max())
+    width = 2 * HALF_WIDTH_LINES + 1
+    n_widths = excited_lines.size // width
+    if n_widths < FEWEST_WIDTHS:
         return None
-    lines = excited[: count * width].reshape(count, width)
-    w = spectra.instrument[:, lines].conj()
-    through = np.sum(spectra.input[:, lines] * w, axis=2)
-    if np.any(through == 0):
+    lines = excited_lines[: n_widths * width].reshape(n_widths, width)
+
+    # Responses (R, F) of the records, as `empirical_frf` makes them: by the reference in a closed loop.
+    instrument = spectra.instrument[:, lines].conj()
+    input_power = np.sum(spectra.input[:, lines] * instrument, axis=2)
+    if np.any(input_power == 0):
         return None
-    response = np.sum(spectra.output[:, lines] * w, axis=2) / through
-    ends = np.cumsum([len(same) for same in repeated])[:-1]
+    response = np.sum(spectra.output[:, lines] * instrument, axis=2) / input_power
+    rows_per_amplitude = [len(amplitude) for amplitude in repeated]
+    ends = np.cumsum(rows_per_amplitude)[:-1]
     return Repeats(
-        tuple(float(np.mean([size for size, _ in same])) for same in repeated),
-        tuple(tuple(record.name for _, record in same) for same in repeated),
-        spectra.omega_rad_s[lines].mean(axis=1),
-        tuple(np.split(response, ends)),
+        rms=tuple(float(np.mean([size for size, _ in amplitude])) for amplitude in repeated),
+        names=tuple(tuple(record.name for _, record in amplitude) for amplitude in repeated),
+        omega_rad_s=spectra.omega_rad_s[lines].mean(axis=1),
+        responses=tuple(np.split(response, ends)),
     )

@@ -1,4 +1,12 @@
-"""Readings that wrap: an encoder's counts after a turn, an angle at 180 degrees, a counter of 16 bits."""
+"""Readings that are not what they seem: they wrap, stand for no reading, or spike.
+
+An encoder's count starts again after a turn, an angle at 180 degrees, a counter or a timer after 16 bits:
+`wraps_at` and `timer_period` find the period, `unwrapped` lets the readings go on. Instruments write numbers
+such as -9999 or 9.9e37 where they have no reading (`no_reading`), and single samples are damaged on their way
+(`spikes_in`). All of it is found by the numbers alone: jumps against usual steps, and numbers that programs
+are known to use. Assumed: a moving machine changes little from sample to sample against its whole range. A
+sawtooth that was meant looks like a reading that wraps; what is found is therefore reported, not corrected.
+"""
 
 from __future__ import annotations
 
@@ -6,183 +14,342 @@ import numpy as np
 
 from ident.data.arrays import IntArray, RealArray
 
-# Where readings start again: powers of two, turns in several units, round numbers of an encoder's lines.
-_PERIODS = tuple(
-    sorted(
-        {
-            *(2.0**k for k in range(8, 33)),
-            *(360.0, 3600.0, 21600.0, 36000.0, 400.0, 6400.0, np.pi, 2 * np.pi, 1.0),
-            *(
-                float(f"{digit}e{k}")
-                for digit in (1, 1.2, 1.44, 1.8, 2, 2.4, 2.5, 3, 4, 5, 6, 7.2, 8)
-                for k in (2, 3, 4, 5)
-            ),
-        }
-    )
-)
-# Steps from .4 to .6 of the range over longer ones: few where it wraps; a sine near Nyquist has .25.
-_VALLEY = 0.15
-# A signal that switches between two levels, or a spike, is seldom in between.
-_BETWEEN = 0.1
-# A spike, or a reading that drops out, stands at one level or a few.
-_LEVELS = 5
-# Noise spans 7 of its median steps in some thousand samples, a motion many more.
-_MOTION = 12.0
-# Unwrapped, its second differences are smaller by this factor.
-_SMOOTHER = 0.5
-# Steps this close to half a period may go either way.
-_NEARLY_HALF = 0.4
-# A speed that changes by less than this share of a period per sample leaves no doubt: half would.
-_SAME_SPEED = 0.25
-# Timers start again after 16 to 32 bits of seconds, milliseconds or microseconds, or at midnight.
-_TIMERS = tuple(
-    sorted(
-        {2.0**bits * unit for bits in (16, 24, 31, 32) for unit in (1.0, 1e-3, 1e-6)}
-        | {86_400.0 * unit for unit in (1.0, 1e3, 1e6)}
-    )
-)
-# Across a restart of a timer passes a usual step, or as many as may be missing at a place elsewhere.
-_LONGEST_SEAM = 6.0
-# Numbers that stand for no reading: the ends of 16, 32 and 64 bits, and what meters take for infinite.
-_ENDS_OF_INTEGERS = frozenset(
-    sign * value
-    for bits in (15, 16, 31, 32, 63)
-    for sign in (-1.0, 1.0)
-    for value in (2.0**bits, 2.0**bits - 1)
-)
-_INFINITE = 1e30  # 9.9e37 of meters, 1e30 and 3.4e38 of simulators; no quantity of a machine is larger
-# Such a number counts where it is so many times larger than all others.
-_FAR = 10.0
-# A command may be a single pulse; one so many times the range of the others is none.
-_FAR_OF_COMMAND = 100.0
-# Spikes: this share of the samples at most, and steps so many times longer than any other.
-_FEW, _JUMPS = 0.05, 10.0
+
+def _usual_periods() -> tuple[float, ...]:
+    """Return the periods at which readings of sensors wrap, ascending, in units of the reading."""
+    counters = [2.0**bits for bits in range(8, 33)]
+    degrees = [360.0, 3600.0, 36000.0, 21600.0]  # and their tenths and hundredths; minutes of arc
+    other_turns = [400.0, 6400.0, np.pi, 2 * np.pi, 1.0]  # gon, artillery mils, rad, turns
+    encoder_lines = []
+    for digits in (1, 1.2, 1.44, 1.8, 2, 2.4, 2.5, 3, 4, 5, 6, 7.2, 8):
+        for exponent in (2, 3, 4, 5):
+            encoder_lines.append(float(f"{digits}e{exponent}"))
+    return tuple(sorted({*counters, *degrees, *other_turns, *encoder_lines}))
+
+
+def _timer_periods() -> tuple[float, ...]:
+    """Return the periods at which timers start again, ascending, in s, ms or us: 16, 24, 31 or 32 bits of
+    ticks, or midnight."""
+    midnights = [86_400.0 * ticks_per_s for ticks_per_s in (1.0, 1e3, 1e6)]
+    overflows = []
+    for bits in (16, 24, 31, 32):
+        for unit in (1.0, 1e-3, 1e-6):
+            overflows.append(2.0**bits * unit)
+    return tuple(sorted({*overflows, *midnights}))
+
+
+def _ends_of_integers() -> frozenset[float]:
+    """Return the largest and smallest signed and unsigned integers of 16, 32 and 64 bits, and their
+    neighbours, which programs write for no reading."""
+    ends = []
+    for bits in (15, 16, 31, 32, 63):
+        ends += [2.0**bits, 2.0**bits - 1, -(2.0**bits), -(2.0**bits - 1)]
+    return frozenset(ends)
+
+
+# Where readings start again: powers of two, turns in several units, round numbers of an encoder's lines. A
+# period of this list is believed on weaker evidence than any other number.
+USUAL_PERIODS = _usual_periods()
+TIMER_PERIODS = _timer_periods()
+ENDS_OF_INTEGERS = _ends_of_integers()
+
+# Samples below which nothing is said of wrapping: a range and a usual step are hardly known from fewer.
+FEWEST_READINGS = 20
+# A step of more than this share of the range is a jump: at a wrap it is nearly 1.
+JUMP_SHARE = 0.6
+# A step between this share and `JUMP_SHARE` is neither usual nor a jump.
+LONG_SHARE = 0.4
+# Long steps per jump, at most: few where it wraps. A sine near the Nyquist frequency, which jumps at every
+# sample, has .25; doubled, this would let it pass.
+LONG_STEPS_PER_JUMP = 0.15
+# Share of the readings in the middle 60 % of the range below which they hardly are in between: a signal that
+# switches between two levels, or a spike. A motion over whole turns has .6.
+SELDOM_BETWEEN = 0.1
+# Levels that readings have on each side of the range, where they wrap: a spike, or a reading that drops out,
+# stands at one level or a few.
+FEWEST_LEVELS = 5
+# Range over median step of a motion, at least. Noise spans 7 of its median steps in some thousand samples, a
+# motion many more.
+MOTION_STEPS = 12.0
+# Unwrapped, the standard deviation of the second differences is smaller by this factor, at least. Of a true
+# wrap it is smaller by far more, of a jump that is no wrap it grows.
+SMOOTHER = 0.5
+# A step of more than this share of a period may go either way: half is the limit, where both are as long.
+NEARLY_HALF = 0.4
+# A speed that changes by less than this share of a period per sample leaves little doubt: a turn taken the
+# wrong way changes it by a whole period less that, three times as much. At .5 both ways change it alike.
+SAME_SPEED = 0.25
+# Usual steps that may pass while a timer starts again: as many as may be missing at one place elsewhere
+# (`time_grid`: five rows).
+LONGEST_SEAM = 6.0
+# A number beyond this is none: meters write 9.9e37, simulators 1e30 and 3.4e38; no quantity of a machine is
+# as large.
+INFINITE = 1e30
+# A number that programs write for no reading counts as one where it is so many times larger than the largest
+# of all others: a motion that happens to end at 9999 has readings near it.
+FAR = 10.0
+# A command may be a single pulse, which is meant. One that is so many times the range of the others away
+# from their median is none.
+FAR_OF_COMMAND = 100.0
+# Samples that may be spikes, as a share of all: more are a motion.
+SPIKES_SHARE = 0.05
+# The steps around a spike are so many times longer than any other step.
+SPIKE_STEPS = 10.0
+# Share of the steps of a row counter that are 1, at least; at the others it starts again.
+COUNTING_SHARE = 0.95
 
 
 def wraps_at(values: RealArray) -> float:
-    """The period at which readings (T,) seem to wrap, else 0: they jump by nearly their whole range, and go
-    on smoothly once unwrapped. So does a sawtooth; readings that never came near both ends are not seen."""
-    span = float(np.ptp(values)) if values.size >= 20 else 0.0
+    """Return the period at which readings seem to wrap, in their unit, or 0 where they do not.
+
+    Parameters
+    ----------
+    values : ndarray, shape (T,)
+        Readings of one sensor. Of fewer than 20 nothing is said.
+
+    Returns
+    -------
+    float
+        A usual period (`USUAL_PERIODS`) that the range fits, else the range itself (plus one for whole
+        numbers, since 0 to 4095 are 4096 counts).
+
+    Notes
+    -----
+    Readings that wrap jump by nearly their whole range, seldom by part of it, and go on smoothly once
+    unwrapped. Signals that are seldom between their ends (switching, dropping out, or a swing about the place
+    where the readings wrap) have to pass a stricter test. A sawtooth passes as well; readings that never
+    come near both ends are not seen.
+    """
+    span = float(np.ptp(values)) if values.size >= FEWEST_READINGS else 0.0
     if not span > 0 or counts_rows(values):
         return 0.0
-    share = np.abs(np.diff(values)) / span
-    jumps = share > 0.6
-    low = float(values.min())
-    between = float(np.mean((values > low + 0.2 * span) & (values < low + 0.8 * span)))
-    if not jumps.any() or np.sum((share > 0.4) & ~jumps) > _VALLEY * jumps.sum():
+
+    # Steps jump, or they are usual; those in between are few.
+    step_share = np.abs(np.diff(values)) / span
+    jumps = step_share > JUMP_SHARE
+    long_steps = (step_share > LONG_SHARE) & ~jumps
+    if not jumps.any() or np.sum(long_steps) > LONG_STEPS_PER_JUMP * jumps.sum():
         return 0.0
-    # The readings next to a jump are within a step of both ends.
-    step = float(np.quantile(share[~jumps], 0.9)) if not jumps.all() else 0.0
-    whole = bool(np.all(values == np.round(values)))
-    usual = [p for p in _PERIODS if span < p * (1 + 1e-9) <= (1 + 2 * max(step, 1e-3)) * span]
-    period = usual[0] if usual else float(f"{span + 1 if whole else span:.6g}")
+
+    # The readings next to a jump are within a step of both ends, so the period is at most two steps more
+    # than the range.
+    usual_share = float(np.quantile(step_share[~jumps], 0.9)) if not jumps.all() else 0.0
+    largest_period = (1 + 2 * max(usual_share, 1e-3)) * span
+    fitting_periods = [period for period in USUAL_PERIODS if span < period * (1 + 1e-9) <= largest_period]
+    holds_whole_numbers = bool(np.all(values == np.round(values)))
+    if fitting_periods:
+        period = fitting_periods[0]
+    elif holds_whole_numbers:
+        period = float(f"{span + 1:.6g}")
+    else:
+        period = float(f"{span:.6g}")
     going_on = np.unwrap(values, period=period)
-    if between < _BETWEEN:
-        # It switches, drops out, or swings about a usual place of wrapping, moves on both sides, and is no
-        # noise.
-        sides = (values[values < low + 0.5 * span], values[values > low + 0.5 * span])
-        moves = min(np.unique(side).size for side in sides) >= _LEVELS
-        usual_place = min(abs(low), abs(low + period / 2)) <= 2 * max(step * span, 1e-3 * period)
-        usual_step = float(np.median(np.abs(np.diff(going_on))))
-        if not (
-            usual and usual_place and moves and np.ptp(going_on) > _MOTION * usual_step and usual_step > 0
-        ):
+
+    low = float(values.min())
+    is_between = (values > low + 0.2 * span) & (values < low + 0.8 * span)
+    if float(np.mean(is_between)) < SELDOM_BETWEEN:
+        # Only a swing about a usual place of wrapping, 0 or half a period, passes: it moves on both sides of
+        # the range, and it is no noise.
+        if not fitting_periods:
             return 0.0
-    return period if np.std(np.diff(going_on, 2)) <= _SMOOTHER * np.std(np.diff(values, 2)) else 0.0
+        distance_to_usual_place = min(abs(low), abs(low + period / 2))
+        if distance_to_usual_place > 2 * max(usual_share * span, 1e-3 * period):
+            return 0.0
+        in_lower_half = values < low + 0.5 * span
+        in_upper_half = values > low + 0.5 * span
+        lower_levels = np.unique(values[in_lower_half])
+        upper_levels = np.unique(values[in_upper_half])
+        if min(lower_levels.size, upper_levels.size) < FEWEST_LEVELS:
+            return 0.0
+        usual_step = float(np.median(np.abs(np.diff(going_on))))
+        if not usual_step > 0 or np.ptp(going_on) <= MOTION_STEPS * usual_step:
+            return 0.0
+
+    roughness = np.std(np.diff(values, 2))
+    roughness_unwrapped = np.std(np.diff(going_on, 2))
+    return period if roughness_unwrapped <= SMOOTHER * roughness else 0.0
 
 
 def timer_period(stamps: RealArray) -> float:
-    """The period at which a timer with these stamps (T,) starts again, in their unit, else 0.
+    """Return the period at which a timer with these stamps starts again, in their unit, or 0.
 
-    Every step back has to be a usual step once the period is added.
+    Parameters
+    ----------
+    stamps : ndarray, shape (T,)
+        Time stamps as they stand in the log.
+
+    Returns
+    -------
+    float
+        One of `TIMER_PERIODS` that is longer than the range of the stamps, and with which every step back is
+        a usual step once the period is added. 0 where no step goes back, all do, or a stamp is not finite.
     """
     steps = np.diff(stamps)
-    back = steps < 0
-    if not back.any() or back.all() or not np.all(np.isfinite(stamps)):
+    goes_back = steps < 0
+    if not goes_back.any() or goes_back.all() or not np.all(np.isfinite(stamps)):
         return 0.0
-    usual = float(np.median(steps[~back]))
-    longest = max(1.5 * usual, float(np.max(steps[~back])))
+    forward = steps[~goes_back]
+    usual_step = float(np.median(forward))
+    longest_step = max(1.5 * usual_step, float(np.max(forward)))
+    longest_seam = min(longest_step, LONGEST_SEAM * usual_step)
     span = float(np.ptp(stamps))
-    for period in _TIMERS:
-        seams = steps[back] + period
-        if span < period and np.all(seams > 0) and np.all(seams <= min(longest, _LONGEST_SEAM * usual)):
+    for period in TIMER_PERIODS:
+        seams = steps[goes_back] + period
+        if span < period and np.all(seams > 0) and np.all(seams <= longest_seam):
             return period
     return 0.0
 
 
 def no_reading(values: RealArray, *, command: bool = False) -> IntArray:
-    """The samples (of T) that hold a number for no reading: -9999, 65535, 9.91e37, far from all others.
+    """Return the samples, as indices, that hold a number for no reading: -9999, 65535, 9.91e37.
 
-    command: of a command also single values that are a hundred times beyond the range of all others; a
-    smaller pulse may be meant.
+    Parameters
+    ----------
+    values : ndarray, shape (T,)
+    command : bool
+        The signal is a command. Then single values that are a hundred times beyond the range of all others
+        count as well; a smaller pulse may be meant.
+
+    Returns
+    -------
+    ndarray of int
+        Empty where there are none. Such a number is the smallest or the largest of all, at most half of the
+        samples have it, and it is ten times as large as the largest of all others.
     """
-    nothing = np.zeros(0, dtype=np.int64)
-    for code in (float(np.min(values, initial=0.0)), float(np.max(values, initial=0.0))):
-        rows = np.flatnonzero(values == code)
-        others = values[values != code]
-        if 2 * rows.size > values.size or not others.size:
+    smallest = float(np.min(values, initial=0.0))
+    largest = float(np.max(values, initial=0.0))
+    for code in (smallest, largest):
+        has_code = values == code
+        rows = np.flatnonzero(has_code)
+        readings = values[~has_code]
+        if 2 * rows.size > values.size or not readings.size:
             continue
-        if _stands_for_nothing(code) and abs(code) > _FAR * float(np.max(np.abs(others))):
+        largest_reading = float(np.max(np.abs(readings)))
+        if _stands_for_nothing(code) and abs(code) > FAR * largest_reading:
             return rows
-    spikes = spikes_in(values) if command else nothing
-    if spikes.size:
-        others = np.delete(values, spikes)
-        distance = float(np.min(np.abs(values[spikes] - np.median(others))))
-        if distance > _FAR_OF_COMMAND * float(np.ptp(others)):
-            return spikes
-    return nothing
+    if command:
+        spikes = spikes_in(values)
+        if spikes.size:
+            readings = np.delete(values, spikes)
+            distance = float(np.min(np.abs(values[spikes] - np.median(readings))))
+            if distance > FAR_OF_COMMAND * float(np.ptp(readings)):
+                return spikes
+    return np.zeros(0, dtype=np.int64)
 
 
 def _stands_for_nothing(value: float) -> bool:
-    """Whether programs write this number where there is no reading: three nines and more, another digit four
-    times and more, the largest of an integer, more than any meter shows."""
+    """Whether programs write this number where there is no reading.
+
+    Such numbers are three nines and more, another digit four times and more, an end of an integer's range
+    (`ENDS_OF_INTEGERS`), and more than any meter shows.
+    """
     digits = f"{abs(value):.10g}".replace(".", "").rstrip("0")
-    repeated = len(set(digits)) == 1 and len(digits) >= (3 if digits[:1] == "9" else 4)
-    return repeated or value in _ENDS_OF_INTEGERS or abs(value) >= _INFINITE
+    fewest_digits = 3 if digits.startswith("9") else 4
+    repeats_one_digit = len(set(digits)) == 1 and len(digits) >= fewest_digits
+    return repeats_one_digit or value in ENDS_OF_INTEGERS or abs(value) >= INFINITE
 
 
 def counts_rows(values: RealArray) -> bool:
-    """Whether readings (T,) only count: they go on by one, but for where they start again."""
+    """Whether readings (T,) only count: they go on by one, but for a few places where they start again.
+
+    False for a single reading.
+    """
     steps = np.diff(values)
-    return (
-        bool(np.all((steps == 1) | (steps < 0)) and np.mean(steps == 1) > 1 - _FEW) if steps.size else False
-    )
+    if not steps.size:
+        return False
+    counts_or_restarts = (steps == 1) | (steps < 0)
+    return bool(np.all(counts_or_restarts) and np.mean(steps == 1) > COUNTING_SHARE)
 
 
 def spikes_in(values: RealArray) -> IntArray:
-    """The samples (of T) to which a signal jumps, and from which it comes back or where it ends: around them
-    are steps many times longer than all others. What goes on moving there, as in a shock, is none."""
-    nothing, most, size = np.zeros(0, dtype=np.int64), int(_FEW * values.size), np.abs(np.diff(values))
-    longest = np.sort(size)[::-1][: most + 1]
-    larger = np.flatnonzero(longest[:-1] > _JUMPS * longest[1:]) if most and longest[-1] > 0 else nothing
-    if not larger.size:
+    """Return the samples, as indices, to which a signal jumps and from which it comes back.
+
+    Parameters
+    ----------
+    values : ndarray, shape (T,)
+
+    Returns
+    -------
+    ndarray of int
+        Ascending; empty where there are none. At most 5 % of the samples (`SPIKES_SHARE`), so that signals
+        of fewer than 20 have none. A single sample at either end counts, too, where nothing tells whether it
+        comes back.
+
+    Notes
+    -----
+    The steps around spikes are ten times longer than all others. They divide the signal into stretches that
+    are alternately usual and away; the longest one is usual. From a stretch away the signal comes back to
+    where it would have got by usual steps. What goes on moving there, as in a shock, is no spike, since then
+    longer and shorter steps leave no gap between them.
+    """
+    nothing = np.zeros(0, dtype=np.int64)
+    most_spikes = int(SPIKES_SHARE * values.size)
+    if most_spikes == 0:
         return nothing
-    other = longest[larger[-1] + 1]
-    parts = np.split(np.arange(values.size), np.flatnonzero(size > other) + 1)
-    # Every other part, beside the longest.
-    away = parts[(1 + int(np.argmax([part.size for part in parts]))) % 2 :: 2]
-    # At an end, where nothing tells whether it comes back, a single sample.
-    ends = {0, values.size - 1}
-    comes_back = (
-        part.size == 1
-        if {part[0], part[-1]} & ends
-        else abs(values[part[-1] + 1] - values[part[0] - 1]) <= (part.size + 1) * other
-        for part in away
-    )
-    return np.concatenate(away) if sum(map(len, away)) <= most and all(comes_back) else nothing
+
+    # The last gap among the longest steps, in descending order, divides jumps from other steps.
+    sizes = np.abs(np.diff(values))
+    longest_sizes = np.sort(sizes)[::-1][: most_spikes + 1]
+    if not longest_sizes[-1] > 0:
+        return nothing
+    before_gap = np.flatnonzero(longest_sizes[:-1] > SPIKE_STEPS * longest_sizes[1:])
+    if not before_gap.size:
+        return nothing
+    longest_usual = longest_sizes[before_gap[-1] + 1]
+
+    # Every other stretch, beside the longest.
+    stretches = np.split(np.arange(values.size), np.flatnonzero(sizes > longest_usual) + 1)
+    longest_stretch = int(np.argmax([stretch.size for stretch in stretches]))
+    away = stretches[(1 + longest_stretch) % 2 :: 2]
+    if sum(map(len, away)) > most_spikes:
+        return nothing
+
+    for stretch in away:
+        first = stretch[0]
+        last = stretch[-1]
+        if first == 0 or last == values.size - 1:
+            if stretch.size > 1:
+                return nothing
+            continue
+        gap = abs(values[last + 1] - values[first - 1])
+        if not gap <= (stretch.size + 1) * longest_usual:
+            return nothing
+    return np.concatenate(away)
 
 
 def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:
-    """Readings (T,) that wrap at this period, going on instead; and their longest step as a share of the
-    period where it is so near to half of it that some may go the wrong way, else 0. Near half a period the
-    turn is taken that changes the speed least, if by less than a quarter of a period per sample: a guess."""
-    found = np.unwrap(values, period=period)
-    longest = float(np.max(np.abs(np.diff(found)), initial=0.0)) / period
-    if longest <= _NEARLY_HALF:
-        return found, 0.0
-    going_on = values[0] + np.concatenate([[0.0], np.cumsum(np.unwrap(np.diff(found), period=period))])
+    """Return readings that wrap, going on instead, and how doubtful the direction of their longest step is.
+
+    Parameters
+    ----------
+    values : ndarray, shape (T,)
+        Readings, in their unit.
+    period : float
+        At which they wrap, in the same unit.
+
+    Returns
+    -------
+    going_on : ndarray, shape (T,)
+        The readings plus whole periods.
+    longest_share : float
+        Longest step as a share of the period, where it is so near to half of it (`NEARLY_HALF`) that some
+        steps may go the wrong way; else 0.
+
+    Notes
+    -----
+    Each step is taken the shorter way. Where one is near half a period, the turn is taken that changes the
+    speed least, provided that the speed then changes by less than a quarter of a period per sample: a guess.
+    """
+    shorter_way = np.unwrap(values, period=period)
+    longest_share = float(np.max(np.abs(np.diff(shorter_way)), initial=0.0)) / period
+    if longest_share <= NEARLY_HALF:
+        return shorter_way, 0.0
+
+    # The steps are unwrapped as the readings were, and added up.
+    steadiest_steps = np.unwrap(np.diff(shorter_way), period=period)
+    steadiest_way = values[0] + np.concatenate([[0.0], np.cumsum(steadiest_steps)])
     # Whole turns onto the readings, so that sums do not round these.
-    going_on = values + period * np.round((going_on - values) / period)
-    changes = float(np.max(np.abs(np.diff(going_on, 2)), initial=0.0))
-    found = going_on if changes <= _SAME_SPEED * period else found
-    return found, float(np.max(np.abs(np.diff(found)))) / period
+    steadiest_way = values + period * np.round((steadiest_way - values) / period)
+    largest_change = float(np.max(np.abs(np.diff(steadiest_way, 2)), initial=0.0))
+    going_on = steadiest_way if largest_change <= SAME_SPEED * period else shorter_way
+    return going_on, float(np.max(np.abs(np.diff(going_on)))) / period
