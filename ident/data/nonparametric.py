@@ -3,10 +3,8 @@
 `empirical_frf` divides averaged products of discrete Fourier transforms and takes the covariance from what
 the ratio leaves of the same lines; `coherence` says which share of the output's power is linear in the input.
 Both average over neighbouring spectral lines and over records (Ljung, System Identification, 2nd ed.,
-sections 6.3 and 6.4; Pintelon and Schoukens, System Identification, 2nd ed., chapters 2 and 7 on the reference
-as an instrument in a loop). Assumed: the response hardly changes over an averaging width, and the noise is
-independent from line to line. `spectra_of` makes the transforms, also for `repeats` and the validation of
-models.
+sections 6.3 and 6.4). Assumed: the response hardly changes over an averaging width, and the noise is
+independent from line to line. `spectra_of` makes the transforms, also for `repeats`.
 """
 
 from __future__ import annotations
