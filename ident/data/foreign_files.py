@@ -1,5 +1,11 @@
-"""Files that somebody else wrote: their size, how they are quoted; numpy archives of plain arrays; and files
-that only a compiled library reads, in a process of its own, whose end is a refusal."""
+"""Files that somebody else wrote: their size, how they are quoted, and reading them without being harmed.
+
+`content_of` takes the bytes of a file of limited size. `npz_arrays` reads numpy archives of plain arrays and
+unpickles nothing. `read_in_child` gives formats that only a compiled library reads to a process of its own
+(`child_reader`), whose end is a refusal. `shown`, `as_typed` and `path_as_typed` write what stands in a file
+into messages on one line. Functions here raise ValueError with the reason alone; whoever knows the file's
+name puts it before.
+"""
 
 from __future__ import annotations
 
@@ -18,137 +24,255 @@ from typing import Any
 
 import numpy as np
 
-from ident.data.child_reader import CPU_SECONDS, LARGEST_BYTES as LARGEST_BYTES
+from ident.data.child_reader import CPU_SECONDS, LARGEST_BYTES as LARGEST_BYTES, NO_LIBRARY, REFUSED
 
 MOST_COLUMNS = 4096
-"""Of a table: each is looked at, and a line of it printed. More is a table that lies on its side."""
+"""Columns of a table: each is looked at, and a line of it printed. More is a table that lies on its side."""
 
-_SCRIPT = Path(__file__).with_name("child_reader.py")
-_SECONDS = CPU_SECONDS + 30  # of waiting
-_REFUSED, _NO_LIBRARY = 2, 3  # exit codes of the reader
-_ENCRYPTED = 0x1  # bit 0 of the flags of a zip entry (APPNOTE 4.4.4)
+CHILD_SCRIPT = Path(__file__).with_name("child_reader.py")
+"""The script that reads compiled formats."""
+# Time that is waited for the child, s: its limit of processor time, and time for starting on a busy machine.
+LONGEST_WAIT_S = CPU_SECONDS + 30
+# Bit 0 of the flags of a zip entry: it is encrypted (PKWARE's APPNOTE, 4.4.4).
+ENCRYPTED_FLAG = 0x1
+# Kinds of numpy arrays that are taken: real numbers and booleans, instants and durations.
+NUMBER_KINDS = "fiub"
+INSTANT_KINDS = "Mm"
+# Python keeps a byte of a path that is no UTF-8 as a lone surrogate: this code plus the byte (PEP 383).
+FIRST_SURROGATE = 0xDC00
 
 
 @dataclass(frozen=True)
 class Unread:
-    """A named thing in a file that is no array of numbers: what it is, and what to do."""
+    """A named thing in a file that is no array of numbers.
+
+    Attributes
+    ----------
+    why : str
+        What it is, and what to do: 'Python objects; expected arrays of numbers'.
+    """
 
     why: str
 
 
 def shown(value: object, longest: int = 80) -> str:
-    """How a value from a file is quoted: on one line, cut where it is long."""
+    """Return how a value from a file is quoted in a message: on one line, cut where it is long.
+
+    Parameters
+    ----------
+    value : object
+        Text is taken as it is, anything else by its `repr`.
+    longest : int
+        Characters, at least 3; a longer text ends in '...'.
+
+    Returns
+    -------
+    str
+        Runs of blanks and line ends are one blank, characters that cannot be printed are escaped.
+    """
     text = value if isinstance(value, str) else repr(value)
-    text = " ".join(text[: 4 * longest].split())
-    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return text if len(text) <= longest else text[: longest - 3] + "..."
+    # Enough is kept that blanks may shrink; a text of a gigabyte is not gone through.
+    one_line = " ".join(text[: 4 * longest].split())
+    printable = ""
+    for character in one_line:
+        printable += character if character.isprintable() else character.encode("unicode_escape").decode()
+    return printable if len(printable) <= longest else printable[: longest - 3] + "..."
 
 
 def as_typed(value: object) -> str:
-    """A name or a path as a shell takes it, whole and on one line: quoted where it has to be.
+    """Return a name or a path as a shell takes it, whole and on one line: quoted where it has to be.
 
-    What a message cannot show as it is (control characters, runs of blanks, blanks that do not break) is
-    written in the quotes of bash and zsh that take escapes: $'a\\tb'.
+    Parameters
+    ----------
+    value : object
+        Taken by its `str`.
+
+    Returns
+    -------
+    str
+        What a message cannot show as it is (control characters, runs of blanks, blanks that do not break) is
+        written in the quotes of bash and zsh that take escapes: $'a\\tb'.
     """
     text = str(value)
     if text.isprintable() and text == " ".join(text.split()):
         return shlex.quote(text)
-    escaped = "".join(
-        character if character.isprintable() and character not in " \\'" else _escape(character)
-        for character in text
-    )
+    escaped = ""
+    for character in text:
+        is_plain = character.isprintable() and character not in " \\'"
+        escaped += character if is_plain else _escape(character)
     return f"$'{escaped}'"
 
 
 def _escape(character: str) -> str:
-    """A character by its number, as in $'\\x20' and $'\\u00a0'."""
+    """Return a character by its number, in as many hexadecimal digits as it needs: '\\x20', '\\u00a0'."""
     code = ord(character)
-    if 0xDC80 <= code <= 0xDCFF:  # a byte of a path that is no UTF-8, as Python keeps it
-        code -= 0xDC00
+    if FIRST_SURROGATE + 0x80 <= code <= FIRST_SURROGATE + 0xFF:
+        return f"\\x{code - FIRST_SURROGATE:02x}"
+    if code < 0x80:
         return f"\\x{code:02x}"
-    return f"\\x{code:02x}" if code < 0x80 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"
+    if code < 0x10000:
+        return f"\\u{code:04x}"
+    return f"\\U{code:08x}"
 
 
 def path_as_typed(path: object) -> str:
-    """A path as a shell takes it, and a program that takes what begins with a dash for an option."""
+    """Return a path as a shell takes it, with './' before one that begins with a dash, which programs would
+    take for an option."""
     text = str(path)
     return as_typed(f"./{text}" if text.startswith("-") else text)
 
 
-def content_of(file: Path) -> bytes:
-    """The bytes of a file. Raises ValueError where it is none (a pipe would be waited for), or holds more
-    than `LARGEST_BYTES`; OSError as `open`."""
+def content_of(file: Path, largest_bytes: int = LARGEST_BYTES) -> bytes:
+    """Return the bytes of a file.
+
+    Parameters
+    ----------
+    file : Path
+    largest_bytes : int
+        Size above which it is refused.
+
+    Raises
+    ------
+    ValueError
+        It is not there, it is no file (a pipe would be waited for), or it is too large.
+    OSError
+        It cannot be opened.
+    """
     if not file.is_file():
         raise ValueError("not a file" if file.exists() else "no such file")
     size = file.stat().st_size
-    if size > LARGEST_BYTES:
-        raise ValueError(f"{size / 2**20:.0f} MiB; expected at most {LARGEST_BYTES >> 20}: split the file")
+    if size > largest_bytes:
+        raise ValueError(f"{size / 2**20:.0f} MiB; expected at most {largest_bytes >> 20}: split the file")
     return file.read_bytes()
 
 
 def distinct(names: Sequence[str]) -> list[str]:
-    """Names of columns, those that are there several times numbered: '#1 angle', '#2 angle'."""
-    times, came, found = Counter(names), Counter[str](), list[str]()
+    """Return names of columns, in their order, those that are there several times numbered: '#1 angle'."""
+    times = Counter(names)
+    times_so_far = Counter[str]()
+    numbered = []
     for name in names:
-        came[name] += 1
-        found.append(f"#{came[name]} {name}" if times[name] > 1 else name)
-    return found
+        times_so_far[name] += 1
+        numbered.append(f"#{times_so_far[name]} {name}" if times[name] > 1 else name)
+    return numbered
 
 
 def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
-    """An array as it is, if it holds real numbers or instants. Raises ValueError saying what it holds."""
+    """Return an array as it is, if it holds real numbers or instants.
+
+    Parameters
+    ----------
+    values : array-like or Unread
+
+    Raises
+    ------
+    ValueError
+        It holds something else; the message says what, beginning with 'holds'.
+    """
     if isinstance(values, Unread):
         raise ValueError(f"holds {values.why}")
     array = np.asarray(values)
-    if array.dtype.kind not in "fiubMm":
-        what = "text" if array.dtype.kind in "USO" else f"{array.dtype}"
-        raise ValueError(f"holds {shown(what)}; expected real numbers")
-    if array.dtype.kind in "Mm" and np.datetime_data(array.dtype)[0] in ("Y", "M", "generic"):
+    if array.dtype.kind not in NUMBER_KINDS + INSTANT_KINDS:
+        is_text = array.dtype.kind in "USO"
+        content = "text" if is_text else f"{array.dtype}"
+        raise ValueError(f"holds {shown(content)}; expected real numbers")
+    if array.dtype.kind in INSTANT_KINDS and np.datetime_data(array.dtype)[0] in ("Y", "M", "generic"):
         raise ValueError(
             f"holds {array.dtype}, steps of no fixed length; expected instants, as datetime64[ns]"
         )
     return array
 
 
-def read_in_child(kind: str, library: str, content: bytes) -> bytes:
-    """What `child_reader` makes of the bytes of a file: HDF5, parquet, xlsx, MATLAB .mat, MCAP, bag, db3.
+def read_in_child(
+    kind: str,
+    library: str,
+    content: bytes,
+    *,
+    script: Path = CHILD_SCRIPT,
+    longest_wait_s: float = LONGEST_WAIT_S,
+) -> bytes:
+    """Return what a process of its own makes of the bytes of a file.
 
-    Raises ValueError, beginning with ':': damaged, too large, too slow, or the library is not installed.
+    Parameters
+    ----------
+    kind : str
+        'HDF5', 'parquet', 'xlsx', 'MATLAB .mat', 'mcap', 'bag' or 'db3': as messages call it; its last part
+        in lower case is the argument of the script.
+    library : str
+        What is to be installed for it, as pip takes it.
+    content : bytes
+        The file.
+    script : Path
+        The program that reads it from standard input; see `child_reader` for its answers and exit codes.
+    longest_wait_s : float
+        Time after which the process is ended, s.
+
+    Returns
+    -------
+    bytes
+        Its standard output.
+
+    Raises
+    ------
+    ValueError
+        Beginning with ':': damaged, too large, too slow, or the library is not installed.
+
+    Notes
+    -----
+    Python runs isolated (-I), without the surroundings that name plug-ins: a filter of HDF5 is a library that
+    gets loaded.
     """
-    # No plug-ins that the surroundings name: a filter of HDF5 is a library that gets loaded.
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("HDF5", "PYTHON"))}
-    command = [sys.executable, "-I", str(_SCRIPT), kind.lower().rpartition(".")[2]]
+    surroundings = {}
+    for name, value in os.environ.items():
+        if not name.startswith(("HDF5", "PYTHON")):
+            surroundings[name] = value
+    # '::' turns off every plug-in of HDF5.
+    surroundings["HDF5_PLUGIN_PRELOAD"] = "::"
+    argument = kind.lower().rpartition(".")[2]
     try:
-        done = subprocess.run(
-            command,
+        process = subprocess.run(
+            [sys.executable, "-I", str(script), argument],
             input=content,
             capture_output=True,
-            timeout=_SECONDS,
-            env=kept | {"HDF5_PLUGIN_PRELOAD": "::"},
+            timeout=longest_wait_s,
+            env=surroundings,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        raise ValueError(f": not read in {_SECONDS} s; a smaller file, or CSV, is") from None
-    if done.returncode == 0:
-        return done.stdout
-    if done.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        raise ValueError(f": not read in {longest_wait_s} s; a smaller file, or CSV, is") from None
+
+    if process.returncode == 0:
+        return process.stdout
+    if process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
         raise ValueError(
             f": not read within {CPU_SECONDS} s of processor time, or the time and memory that this session "
             "allows (ulimit -t, ulimit -v); a smaller file, or CSV, is"
         )
-    said = shown(done.stderr.decode("utf-8", "replace"))
-    if done.returncode == _NO_LIBRARY:
+    if process.returncode == NO_LIBRARY:
         raise ValueError(f": {kind} files need {library}: {sys.executable} -m pip install {library}")
-    raise ValueError(
-        f": {said if done.returncode == _REFUSED and said else f'not a {kind} file, or a damaged one'}"
-    )
+    complaint = shown(process.stderr.decode("utf-8", "replace"))
+    if process.returncode == REFUSED and complaint:
+        raise ValueError(f": {complaint}")
+    raise ValueError(f": not a {kind} file, or a damaged one")
 
 
 def npz_arrays(content: bytes) -> dict[str, Any]:
-    """The arrays of an npz file by name; `Unread` in place of Python objects.
+    """Return the arrays of a numpy archive by name; `Unread` in place of Python objects.
 
-    Raises ValueError with the reason, without the name of the file: no archive, encrypted, damaged, a name
-    twice, more than `LARGEST_BYTES`. Nothing is ever unpickled.
+    Parameters
+    ----------
+    content : bytes
+        An npz file: a zip archive of .npy files.
+
+    Raises
+    ------
+    ValueError
+        The reason, without the name of the file: no archive, encrypted, damaged, a name twice, or more than
+        `LARGEST_BYTES` once unpacked.
+
+    Notes
+    -----
+    Nothing is ever unpickled: pickles can hold programs.
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
@@ -163,7 +287,12 @@ def npz_arrays(content: bytes) -> dict[str, Any]:
 
 
 def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo) -> Any:
-    if entry.flag_bits & _ENCRYPTED:
+    """Return the array of an entry of a numpy archive, or `Unread` where it holds Python objects.
+
+    name: of the array, for complaints. Raises ValueError where the entry is encrypted, packed by a method
+    that Python does not know, or damaged.
+    """
+    if entry.flag_bits & ENCRYPTED_FLAG:
         raise ValueError(f"'{shown(name)}' is encrypted; expected a plain archive (numpy.savez)")
     try:
         content = archive.read(entry)
@@ -172,11 +301,15 @@ def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo) -> Any:
         raise ValueError(f"'{shown(name)}' is packed by {method}; expected numpy.savez_compressed") from None
     except Exception:  # zipfile raises many kinds on damaged content
         raise ValueError(f"'{shown(name)}' cannot be read, the archive is damaged") from None
+
+    # The header says whether there are objects; versions of the format differ in its length alone.
     try:
         stream = io.BytesIO(content)
-        first = np.lib.format.read_magic(stream) == (1, 0)
-        header = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        if header(stream)[2].hasobject:
+        if np.lib.format.read_magic(stream) == (1, 0):
+            _, _, dtype = np.lib.format.read_array_header_1_0(stream)
+        else:
+            _, _, dtype = np.lib.format.read_array_header_2_0(stream)
+        if dtype.hasobject:
             return Unread("Python objects; expected arrays of numbers")
         return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except (ValueError, OverflowError, MemoryError, TypeError, SyntaxError, RecursionError):

@@ -1,4 +1,10 @@
-"""MATLAB files (version 7.2 and before) from and as plain values; version 7.3 is HDF5 (`record_files`)."""
+"""MATLAB files of version 7.2 and before, from plain values and as plain values.
+
+`mat_bytes` makes the content of a file, the same for the same variables. `mat_variables` reads one in a
+process of its own (`foreign_files.read_in_child`), as scipy's reader is compiled and files are not to be
+trusted, and turns the tree that comes back into arrays, text, lists and dicts. Files of version 7.3 are HDF5
+and read by `record_files`.
+"""
 
 from __future__ import annotations
 
@@ -8,25 +14,55 @@ from typing import Any, Literal
 
 from ident.data.foreign_files import Unread, npz_arrays, read_in_child
 
+# Length of the text that opens a file of version 5 to 7.2, bytes (MAT-File Format, "Header"); 12 bytes that
+# say how to read the file follow.
+HEADER_TEXT_BYTES = 116
+
 
 def mat_bytes(variables: dict[str, Any], what: str, *, oned_as: Literal["row", "column"] = "row") -> bytes:
-    """Content of a file of the variables; equal variables give equal files. what: said in its first line."""
+    """Return the content of a MATLAB file (version 5 to 7.2, not compressed).
+
+    Parameters
+    ----------
+    variables : dict of str to value
+        What `scipy.io.savemat` takes: arrays, text, dicts as structs. Equal variables give equal files.
+    what : str
+        Said in the first line of the file, in ASCII, after 'MATLAB 5.0 MAT-file, '.
+    oned_as : {'row', 'column'}
+        What a vector (T,) becomes.
+    """
     import scipy.io  # here: few write such files, and every command would wait for it
 
     stream: Any = io.BytesIO()  # scipy takes streams, its stubs know paths only
     scipy.io.savemat(stream, variables, oned_as=oned_as)
-    # The text that opens the file has 116 bytes; scipy writes the date there.
-    return (b"MATLAB 5.0 MAT-file, " + what.encode("ascii")).ljust(116) + bytes(stream.getvalue()[116:])
+    # scipy writes the date into the text that opens the file.
+    header_text = b"MATLAB 5.0 MAT-file, " + what.encode("ascii")
+    after_text = bytes(stream.getvalue()[HEADER_TEXT_BYTES:])
+    return header_text.ljust(HEADER_TEXT_BYTES) + after_text
 
 
 def mat_variables(content: bytes, source: object) -> dict[str, Any]:
-    """Variables of a MATLAB file by name.
+    """Return the variables of a MATLAB file by name.
 
-    Numbers are arrays of two dimensions and more; text is str (several rows: a list of str), a struct a dict
-    of its fields, an array of structs or a cell array a list; what else there is is `Unread`. Raises
-    ValueError, one line beginning with `source`: another kind of file, or a damaged one.
+    Parameters
+    ----------
+    content : bytes
+        The file.
+    source : object
+        Its path; error messages begin with it.
+
+    Returns
+    -------
+    dict of str to value
+        Numbers are arrays of two dimensions and more; text is str (several rows: a list of str), a struct a
+        dict of its fields, an array of structs or a cell array a list; anything else is `Unread`.
+
+    Raises
+    ------
+    ValueError
+        One line: another kind of file (also one of version 7.3), or a damaged one.
     """
-    if b"\x89HDF\r\n" in content[:1024]:
+    if b"\x89HDF\r\n" in content[:1024]:  # the signature of HDF5
         raise ValueError(
             f"{source}: a version 7.3 .mat file where one of version 7 is expected: save it with '-v7'"
         )
@@ -35,13 +71,18 @@ def mat_variables(content: bytes, source: object) -> dict[str, Any]:
     except ValueError as error:
         raise ValueError(f"{source}{error}") from None
 
-    def value(tree: Any) -> Any:
-        (kind, inner), *_ = tree.items()
+    def value(tree: dict[str, Any]) -> Any:
+        """Return the value of a tree of one key, which says its kind (`child_reader.mat_variables`)."""
+        ((kind, inner),) = tree.items()
         if kind == "struct":
             return {name: value(item) for name, item in inner.items()}
         if kind == "list":
             return [value(item) for item in inner]
-        return arrays[str(inner)] if kind == "array" else Unread(inner) if kind == "unread" else inner
+        if kind == "array":
+            return arrays[str(inner)]
+        if kind == "unread":
+            return Unread(inner)
+        return inner
 
-    found: dict[str, Any] = value(json.loads(arrays["about"].tobytes()))
-    return found
+    variables: dict[str, Any] = value(json.loads(arrays["about"].tobytes()))
+    return variables

@@ -1,4 +1,11 @@
-"""Reading columns of numbers from log files: one registered reader per format (`reads`)."""
+"""Columns of log files of any known format, as a `Table`: one registered reader per format.
+
+`read_table` finds the reader by the ending of the file's name and puts the file's name before every
+complaint. Readers stand below it and are registered with `reads`; a program adds a format of its own in the
+same way. Text and npz are read here, formats that need a compiled library by a process of its own
+(`foreign_files.read_in_child`), so that a damaged file ends that process and not this one. Readers only find
+columns and their units; what the columns mean is for `table`, `units` and `record` to say.
+"""
 
 from __future__ import annotations
 
@@ -30,199 +37,345 @@ from ident.data.table import Table
 from ident.data.text_tables import Layout, read_text, text_of
 from ident.data.units import TIME_UNITS, says_time
 
+# A file's path, for complaints, and its bytes; the columns.
 Reader = Callable[[Path, bytes], Table]
 READERS: dict[str, Reader] = {}
-"""Readers by the ending of a file's name."""
+"""Readers by the ending of a file's name, in lower case: '.csv'."""
+
+# What a text file of GNU Octave begins with (its default format, which is no table).
+OCTAVE_TEXT = re.compile(rb"\s*# (Created by Octave|name: .*\r?\n# type: )")
+# A MATLAB file of version 7.3 is an HDF5 file, whose signature stands within its first bytes.
+HDF5_SIGNATURE = b"\x89HDF\r\n"
+SIGNATURE_WITHIN_BYTES = 1024
+
+# A column of text that is filled in at most this share of the rows may have rows of its own: signals logged
+# at half the rate of others have .5, a column in which readings are missing now and then has nearly 1.
+OWN_ROWS_SHARE = 0.8
+# Rows below which no column has rows of its own: a few empty cells are readings that are missing.
+FEWEST_ROWS = 10
+# A sheet that the longest one exceeds by more than this factor, in rows, is no log: some settings in a few
+# rows. Logs of one experiment on several sheets are of like length.
+LOG_OVER_SETTINGS = 10
 
 
 def reads(*endings: str) -> Callable[[Reader], Reader]:
-    """Registers a reader for these endings: from the path (for complaints) and the bytes of a file to a
-    `Table`. What it raises as ValueError is put behind the path, so it begins with ':' or ', line 3:'."""
+    """Return a decorator that registers a reader for files of these endings.
+
+    Parameters
+    ----------
+    *endings : str
+        Endings of file names in lower case, with their point: '.csv'.
+
+    Returns
+    -------
+    callable
+        Takes and returns a function from the path and the bytes of a file to a `Table`. What that function
+        raises as ValueError is put behind the path, so it begins with ':' or ', line 3:', or with words.
+    """
 
     def register(reader: Reader) -> Reader:
+        """Register the reader and return it as it is."""
         READERS.update(dict.fromkeys(endings, reader))
         return reader
 
     return register
 
 
-def read_table(path: str | PathLike[str]) -> Table:
-    """The columns of a log file; also of one packed by gzip (log.csv.gz). ValueError: one line."""
+def read_table(path: str | PathLike[str], *, largest_bytes: int = LARGEST_BYTES) -> Table:
+    """Return the columns of a log file, which may be packed by gzip (log.csv.gz).
+
+    Parameters
+    ----------
+    path : path-like
+        Its ending says the format (`READERS`).
+    largest_bytes : int
+        Size above which the file, and what it unpacks to, is refused.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    ValueError
+        One line that begins with the path: no such file, a pipe or a folder, an unknown format, text of
+        Octave, too large, damaged, or whatever the reader complains of.
+    """
     file = Path(path)
     if not file.is_file():  # a pipe would be waited for
         raise ValueError(f"{file}: {'not a file' if file.exists() else 'no such file'}")
-    ending, packed = _ending(file), file.suffix.lower() == ".gz"
+    ending = _ending(file)
     if ending not in READERS:
         known = ", ".join(READERS)
         raise ValueError(f"{file}: unknown kind of file '{shown(ending)}'; expected one of {known} (or .gz)")
+
     try:
-        content = _unpacked(content_of(file)) if packed else content_of(file)
-        if re.match(rb"\s*# (Created by Octave|name: .*\r?\n# type: )", content):
+        content = content_of(file, largest_bytes)
+        if file.suffix.lower() == ".gz":
+            content = _unpacked(content, largest_bytes)
+        if OCTAVE_TEXT.match(content):
             raise ValueError("Octave text; expected numbers as MATLAB has them: save -v7 FILE.mat NAMES")
         return READERS[ending](file, content)
     except ValueError as error:
-        text = str(error)
-        between = "" if text.startswith((":", ",")) else ": "
-        raise ValueError(text if text.startswith(str(file)) else f"{file}{between}{text}") from None
+        # Readers that were given the path have it in their complaint already.
+        complaint = str(error)
+        if not complaint.startswith(str(file)):
+            between = "" if complaint.startswith((":", ",")) else ": "
+            complaint = f"{file}{between}{complaint}"
+        raise ValueError(complaint) from None
 
 
 def _ending(file: Path) -> str:
+    """Return the ending of a file's name in lower case, with its point, '.gz' left out: '.csv'."""
     return Path(file.name.lower().removesuffix(".gz")).suffix
 
 
-def _unpacked(content: bytes) -> bytes:
+def _unpacked(content: bytes, largest_bytes: int) -> bytes:
+    """Return what gzip packed. Raises ValueError where it is damaged, or unpacks to more than the largest
+    size, of which no more is unpacked."""
     try:
         with gzip.open(io.BytesIO(content)) as stream:
-            unpacked = stream.read(LARGEST_BYTES + 1)
+            unpacked = stream.read(largest_bytes + 1)
     except (OSError, EOFError, zlib.error):
         raise ValueError(": not packed by gzip, or damaged") from None
-    if len(unpacked) > LARGEST_BYTES:
-        raise ValueError(f": unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
+    if len(unpacked) > largest_bytes:
+        raise ValueError(f": unpacks to more than {largest_bytes >> 20} MiB: split the file")
     return unpacked
-
-
-# A column with values in fewer of the rows has rows of its own.
-_OWN_ROWS = 0.8
 
 
 @reads(".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm")
 def _read_text(file: Path, content: bytes) -> Table:
-    """A text table; its layout is found from the lines (`text_tables`)."""
-    return _text_table(file, *read_text(text_of(content)))
+    """Return a text table, whose layout is found from its lines (`text_tables`). Raises ValueError without
+    the path where it has none."""
+    layout, columns = read_text(text_of(content))
+    return text_table(file, layout, columns)
 
 
-def _text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]]) -> Table:
-    """Stamps made from a stated start and step, where a scope writes these instead, and columns that have
-    rows of their own."""
-    raw, units = dict[str, Any](columns), dict(layout.units)
+def text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]]) -> Table:
+    """Return the table of a text file, with what a layout says beside the cells put into columns.
+
+    Parameters
+    ----------
+    file : Path
+        Named in complaints.
+    layout : Layout
+        Of it matter here: the units by name, the stated start and step of the rows, whether lines between the
+        rows were skipped, and the line of the first row.
+    columns : mapping of str to tuple of str
+        Cells by name, equally long; empty where a cell holds nothing.
+
+    Returns
+    -------
+    Table
+        Stamps are made where a scope writes a start and a step instead. Of several equal times, one for each
+        signal, each is called time. Columns without any cell are left out. Where columns have rows of their
+        own, each has its filled cells alone, and `clocks` says of which rows they are.
+
+    Raises
+    ------
+    ValueError
+        Without the path: two signals have different times.
+    """
+    raw = dict[str, Any](columns)
+    units = dict(layout.units)
     n_rows = len(next(iter(columns.values())))
-    if layout.increment is not None:
-        start, step = layout.increment
-        counted = next((name for name, unit in units.items() if unit.lower() == "sequence"), None)
-        given = [
-            name
-            for name, cells in raw.items()
-            if any(cells) and (says_time(name) or units.get(name, "").lower() in TIME_UNITS)
-        ]
-        name = counted or next((n for n in raw if units.get(n) == "s" and not any(raw[n])), "time")
-        # Rows that were skipped would be missing in it: then nobody knows the time.
-        if (counted is not None or not given) and not layout.skipped:
-            raw[name], units[name] = start + step * np.arange(n_rows), "s"
+
+    # Stamps from a stated start and step: in a column that counts samples, else in an empty one of seconds,
+    # else in one of their own. Rows that were skipped would be missing in it: then nobody knows the time.
+    if layout.increment is not None and not layout.skipped:
+        counting_names = [name for name, unit in units.items() if unit.lower() == "sequence"]
+        empty_names = [name for name in raw if units.get(name) == "s" and not any(raw[name])]
+        has_time = False
+        for name, cells in raw.items():
+            is_time = says_time(name) or units.get(name, "").lower() in TIME_UNITS
+            if any(cells) and is_time:
+                has_time = True
+        if counting_names or not has_time:
+            time_name = [*counting_names, *empty_names, "time"][0]
+            start_s, step_s = layout.increment
+            raw[time_name] = start_s + step_s * np.arange(n_rows)
+            units[time_name] = "s"
     raw = {name: cells for name, cells in raw.items() if not isinstance(cells, tuple) or any(cells)}
-    # Some write a time for each signal.
+
+    # Some programs write a time for each signal: '#1 time', '#2 time' once equal names are numbered.
     times = [name for name in raw if name.startswith("#") and says_time(name.partition(" ")[2])]
     if len(times) > 1 and len({raw[name] for name in times}) > 1:
         raise ValueError(f": '{times[0]}' and '{times[1]}' differ; expected one time for all signals")
-    raw = {name.partition(" ")[2] if name in times else name: cells for name, cells in raw.items()}
-    units |= {name.partition(" ")[2]: units.get(name, "") for name in times}
+    plain_names = {name: name.partition(" ")[2] for name in times}
+    raw = {plain_names.get(name, name): cells for name, cells in raw.items()}
+    units |= {plain: units.get(name, "") for name, plain in plain_names.items()}
     table = Table(file, raw, layout.first, layout, units)
-    filled = {name: [k for k, cell in enumerate(cells) if cell] for name, cells in columns.items()}
-    ends = {name: rows for name, rows in filled.items() if rows and len(rows) < n_rows}
+
     # An empty cell now and then is a reading that is missing; empty cells at the end are of a shorter vector.
-    own = any(len(rows) <= _OWN_ROWS * n_rows and rows[-1] - rows[0] >= len(rows) for rows in ends.values())
-    if not own or n_rows < 10:
+    rows_of = {name: [row for row, cell in enumerate(cells) if cell] for name, cells in columns.items()}
+    has_own_rows = False
+    for rows in rows_of.values():
+        if not rows:
+            continue
+        is_sparse = len(rows) <= OWN_ROWS_SHARE * n_rows
+        has_gaps = rows[-1] - rows[0] >= len(rows)
+        if is_sparse and has_gaps:
+            has_own_rows = True
+    if not has_own_rows or n_rows < FEWEST_ROWS:
         return table
-    kept = {name: rows for name, rows in filled.items() if rows}
-    raw = {name: tuple(columns[name][k] for k in rows) for name, rows in kept.items()}
-    clocks = {name: np.array(rows, dtype=np.float64) for name, rows in kept.items()}
-    return replace(table, raw=raw, clocks=clocks)
+    filled = {name: rows for name, rows in rows_of.items() if rows}
+    own_cells = {name: tuple(columns[name][row] for row in rows) for name, rows in filled.items()}
+    clocks = {name: np.array(rows, dtype=np.float64) for name, rows in filled.items()}
+    return replace(table, raw=own_cells, clocks=clocks)
 
 
 @reads(".npz")
 def _read_npz(file: Path, content: bytes) -> Table:
-    """A numpy archive of named vectors; object arrays (pickles) are not read."""
+    """Return the named arrays of a numpy archive; object arrays (pickles) are not read, and named as such.
+    Raises ValueError without the path for a damaged archive."""
     return Table(file, npz_arrays(content))
 
 
 @reads(".mat")
 def _read_mat(file: Path, content: bytes) -> Table:
-    """A MATLAB file; what stands in structs is called log.signals[0].values."""
-    if b"\x89HDF\r\n" in content[:1024]:  # version 7.3
+    """Return the variables of a MATLAB file; what stands in structs is called log.signals[0].values.
+
+    Raises ValueError for a damaged file.
+    """
+    if HDF5_SIGNATURE in content[:SIGNATURE_WITHIN_BYTES]:
         return _read_columns(file, content)
     return _table_of(file, _flat("", mat_variables(content, file)))
 
 
 @reads(".xlsx")
 def _read_xlsx(file: Path, content: bytes) -> Table:
-    """The visible sheet with a table, laid out as in a text file; rows are called lines. Where there are
-    several, their columns under the names of the sheets."""
+    """Return the visible sheet with a table, laid out as in a text file; rows are called lines.
+
+    Where several sheets have one, their columns are called sheet/column, and sheets with less than a tenth of
+    the rows of the longest are left out. Raises ValueError without the path where no sheet has a table.
+    """
     texts: dict[str, str] = json.loads(read_in_child("xlsx", "openpyxl", content))
-    found, refused = {}, ValueError()
+    sheets: dict[str, tuple[Layout, dict[str, tuple[str, ...]]]] = {}
+    refusals: list[ValueError] = []
     for title, text in texts.items():
         try:
-            found[title] = read_text(text)
+            sheets[title] = read_text(text)
         except ValueError as error:
-            refused = refused if refused.args else error
-    if not found and any("\t=" in text or text.startswith("=") for text in texts.values()):
-        raise ValueError(
-            ": formulas without their values; open the file in Excel or LibreOffice and save it again"
-        )
-    if not found:
-        raise refused
-    rows = {title: len(next(iter(columns.values()))) for title, (_, columns) in found.items()}
-    # Some settings in a few rows are no second log.
-    found = {title: one for title, one in found.items() if 10 * rows[title] >= max(rows.values())}
-    if len(found) == 1:
-        ((layout, columns),) = found.values()
-        return _text_table(file, layout, columns)
-    named = {
-        f"{title}/{name}": column for title, (_, table) in found.items() for name, column in table.items()
-    }
-    units = {f"{title}/{name}": u for title, (layout, _) in found.items() for name, u in layout.units.items()}
-    return Table(file, named, units=units)
+            refusals.append(error)
+    if not sheets:
+        if any("\t=" in text or text.startswith("=") for text in texts.values()):
+            raise ValueError(
+                ": formulas without their values; open the file in Excel or LibreOffice and save it again"
+            )
+        raise refusals[0]
+
+    n_rows = {}
+    for title, (_, columns) in sheets.items():
+        first_column = next(iter(columns.values()))
+        n_rows[title] = len(first_column)
+    longest = max(n_rows.values())
+    logs = {title: sheet for title, sheet in sheets.items() if LOG_OVER_SETTINGS * n_rows[title] >= longest}
+    if len(logs) == 1:
+        ((layout, columns),) = logs.values()
+        return text_table(file, layout, columns)
+
+    raw = {}
+    units = {}
+    for title, (layout, columns) in logs.items():
+        for name, cells in columns.items():
+            raw[f"{title}/{name}"] = cells
+        for name, unit in layout.units.items():
+            units[f"{title}/{name}"] = unit
+    return Table(file, raw, units=units)
 
 
 @reads(".json", ".jsonl", ".ndjson")
 def _read_json(file: Path, content: bytes) -> Table:
-    """Rows or columns as `json_columns` finds them; of `.jsonl` and `.ndjson` a row in each line."""
+    """Return the rows or columns that `json_columns` finds; of '.jsonl' and '.ndjson' a row in each line.
+
+    Raises ValueError without the path where it is no JSON or holds no columns.
+    """
     return Table(file, json_columns(text_of(content), in_lines=_ending(file) != ".json"))
 
 
 @reads(".mcap", ".bag", ".db3")
 def _read_bag(file: Path, content: bytes) -> Table:
-    """MCAP, ROS 1 and ROS 2 bags: topic.field; signals of several topics hold their last message."""
+    """Return the numbers of an MCAP, ROS 1 or ROS 2 bag, called topic.field, each topic with its own clock.
+
+    Signals of several topics hold their last message. Raises ValueError without the path.
+    """
+    # The child writes when a topic's messages were recorded under its name and a tab.
     table = _read_columns(file, content)
-    recorded = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
+    recorded_s = {name[:-1]: table.raw[name] for name in table.names if name.endswith("\t")}
     raw = {name: values for name, values in table.raw.items() if not name.endswith("\t")}
-    # A topic's name may be the beginning of another's: the longest that fits comes last.
-    topics = sorted(recorded, key=len)
-    clocks = {name: recorded[topic] for topic in topics for name in raw if name.startswith(f"{topic}.")}
+
+    # A topic's name may be the beginning of another's: the longest that fits comes last, and counts.
+    clocks = {}
+    for topic in sorted(recorded_s, key=len):
+        for name in raw:
+            if name.startswith(f"{topic}."):
+                clocks[name] = recorded_s[topic]
     return replace(table, raw=raw, clocks=clocks)
 
 
 @reads(".h5", ".hdf5", ".parquet")
 def _read_columns(file: Path, content: bytes) -> Table:
-    """What the child makes of a file: of HDF5 datasets by their path, group/signal, and group/table.field."""
-    kinds = dict.fromkeys((".h5", ".hdf5", ".mat"), ("HDF5", "h5py")) | {".parquet": ("parquet", "pyarrow")}
-    kind, libraries = kinds.get(_ending(file), (_ending(file)[1:], "mcap rosbags"))
+    """Return what the child process makes of a file: of HDF5 the datasets by their path, group/signal, and
+    the fields of tables, group/table.field; also of parquet, MATLAB 7.3 and bags.
+
+    Raises ValueError without the path: damaged, too large, too slow, or the library is not installed.
+    """
+    ending = _ending(file)
+    if ending in (".h5", ".hdf5", ".mat"):
+        kind = "HDF5"
+        libraries = "h5py"
+    elif ending == ".parquet":
+        kind = "parquet"
+        libraries = "pyarrow"
+    else:
+        kind = ending[1:]
+        libraries = "mcap rosbags"
     arrays = npz_arrays(read_in_child(kind, libraries, content))
     about = json.loads(arrays.pop("about").tobytes())
-    found = [
-        (name, Unread(why) if why else arrays[str(k)], unit) for k, (name, unit, why) in enumerate(about)
-    ]
-    return _table_of(file, found)
+    columns = []
+    for number, (name, unit, why_unread) in enumerate(about):
+        values = Unread(why_unread) if why_unread else arrays[str(number)]
+        columns.append((name, values, unit))
+    return _table_of(file, columns)
 
 
 def _table_of(file: Path, columns: Sequence[tuple[str, Any, str]]) -> Table:
-    """Of names, columns and units; a name may be there several times."""
+    """Return the table of columns, each a name, values and a unit ('' for none); equal names are numbered."""
     names = distinct([name for name, _, _ in columns])
-    units = {name: unit for name, (_, _, unit) in zip(names, columns, strict=True) if unit}
-    return Table(file, {name: column[1] for name, column in zip(names, columns, strict=True)}, units=units)
+    raw = {}
+    units = {}
+    for name, (_, values, unit) in zip(names, columns, strict=True):
+        raw[name] = values
+        if unit:
+            units[name] = unit
+    return Table(file, raw, units=units)
 
 
 def _flat(name: str, value: Any, unit: str = "") -> list[tuple[str, Any, str]]:
-    """Nested fields and lists under the names by which a program would call them, with their units; text is
-    no column. What says its name beside its data, as recorders do, has that."""
+    """Return the columns in nested fields and lists: name, values and unit ('' for none) of each.
+
+    Names are those by which a program would call them, log.signals[0].values. An object that says its name
+    beside its data, as recorders write it, gives that name to them; one that says its unit, gives that. Text
+    is no column.
+    """
+    if isinstance(value, str):
+        return []
     if isinstance(value, Mapping):
-        said = {key.lower(): text.strip() for key, text in value.items() if isinstance(text, str)}
-        data = ("data", "values") if said.get("name") else ()
-        unit = said.get("unit", "")
-        parts = [
-            (said["name"] if key.lower() in data else f"{name}.{key}" if name else key, item)
-            for key, item in value.items()
-        ]
+        texts = {key.lower(): text.strip() for key, text in value.items() if isinstance(text, str)}
+        recorded_name = texts.get("name", "")
+        unit = texts.get("unit", "")
+        parts = []
+        for key, item in value.items():
+            if recorded_name and key.lower() in ("data", "values"):
+                parts.append((recorded_name, item))
+            else:
+                parts.append((f"{name}.{key}" if name else key, item))
     elif isinstance(value, list):
-        parts = [(f"{name}[{k}]", item) for k, item in enumerate(value)]
+        parts = [(f"{name}[{number}]", item) for number, item in enumerate(value)]
     else:
-        return [] if isinstance(value, str) else [(name, value, unit)]
-    return [item for part in parts for item in _flat(*part, unit)]
+        return [(name, value, unit)]
+
+    columns = []
+    for part_name, part in parts:
+        columns += _flat(part_name, part, unit)
+    return columns

@@ -360,7 +360,7 @@ def test_a_reader_keeps_to_limits_that_are_there():
         resource.setrlimit(resource.RLIMIT_AS, (2**32, 2**32))
 
     done = subprocess.run(
-        [sys.executable, "-I", str(foreign_files._SCRIPT), "mat"],
+        [sys.executable, "-I", str(foreign_files.CHILD_SCRIPT), "mat"],
         input=saved({"t": 1.0}), capture_output=True, preexec_fn=less, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, b"")

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ident.data.json_columns import json_columns
-from ident.data.record_files import _text_table
+from ident.data.record_files import text_table
 from ident.data.roles import roles_of
 from ident.data.text_tables import read_text, text_of
 
@@ -85,7 +85,7 @@ def cpu_s(text):
     begin = time.process_time()
     try:
         layout, columns = read_text(text_of(text.encode()))
-        table = _text_table(Path("a.csv"), layout, columns)
+        table = text_table(Path("a.csv"), layout, columns)
         for name in table.names:
             table.unit(name)
         roles_of(table, "a.csv")
