@@ -1,10 +1,18 @@
-"""The uniform grid under a log's time stamps: its step, or why there is none (`sampling_time`); stamps that
-stray a little and single lost rows made good (`TimeGrid`), or a coarser grid (`CoarseGrid`) on request."""
+"""The uniform grid under a log's time stamps: its step, or why there is none and what helps.
+
+Models of records take samples at a uniform step. `sampling_time` takes the step from stamps that are uniform
+to 1 %, and otherwise says what is wrong and which option makes it good. `TimeGrid` puts rows whose stamps
+jitter, or of which single ones were lost, on the grid that fits all stamps best, by a cubic spline.
+`CoarseGrid` makes a coarser grid of stamps that keep to none, with straight lines between readings and means
+of the input. `Repair` says what either did, and up to which frequency the result is faithful to 1 % (of a
+cubic spline: Hall and Meyer, Journal of Approximation Theory 16, 1976). Assumed: stamps say when rows were
+taken.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 
@@ -12,32 +20,60 @@ from ident.data.arrays import IntArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.table import Table
 
-# Of an interval from the mean one: at the Nyquist frequency a phase wrong by 0.03 rad; above a clock's
-# jitter.
+# How far a step may be from the usual one, as a share of it, where stamps count as uniform: at the Nyquist
+# frequency it is a phase wrong by 0.03 rad, and it is above the jitter of a controller's clock.
 TIME_TOLERANCE = 0.01
-# Stamps this far off a multiple (in samples) are no jitter that an interpolation makes good.
+# How far a stamp may be off its instant, in samples, for an interpolation to make it good. Steps are then up
+# to 1.4 samples, and the error of a cubic spline, which grows with their fourth power, 3.8 times that of
+# even ones. From half a sample on nobody knows which sample a stamp is.
 LARGEST_JITTER = 0.2
-# Below this they count as on it: an output changes by a thousandth of its step from row to row.
-_ON_GRID = 1e-3
-_MOST_LOST_ROWS = 5  # a spline over such a gap is right to 1 % up to a twentieth of the Nyquist frequency
-_MOST_LOST_SHARE = 0.05  # ellipses come out too narrow by 2.6 % at most: 1 / sqrt(0.95)
-
-# Angular frequency times spacing at which a cubic spline is wrong by 1 % of a sine: 5/384 (omega h)^4.
-_FAITHFUL = (0.01 * 384 / 5) ** 0.25
-# The same of a straight line between readings, (omega h)^2 / 8, and of an input that is averaged over a step
-# and held for the next: 1 - sinc(omega h / 2)^2 = (omega h)^2 / 12.
-_FAITHFUL_LINE = (0.01 * 8) ** 0.5
-_FAITHFUL_MEAN = (0.01 * 12) ** 0.5  # of 1 - sinc^2, see above
-# In so many parts of a log the mean step is compared with that of the whole.
-_PARTS = 10
-# A coarser grid that is proposed has about as many readings in each of its steps.
-_READINGS = 3
+# Stamps closer than this to their instants, in samples, count as on them: an output changes by a thousandth
+# of its step from row to row.
+ON_GRID = 1e-3
+# Rows that may be missing at one place: a spline over such a gap is right to 1 % up to a twentieth of the
+# Nyquist frequency.
+MOST_LOST_ROWS = 5
+# Share of all rows that may be missing: ellipses come out too narrow by 2.6 % at most, 1 / sqrt(0.95).
+MOST_LOST_SHARE = 0.05
+# Error of an interpolation, as a share of a sine's amplitude, up to which it counts as faithful.
+FAITHFUL_SHARE = 0.01
+# Frequency times spacing h, rad, at which a cubic spline has that error: 5/384 (omega h)^4.
+FAITHFUL_SPLINE_RAD = (FAITHFUL_SHARE * 384 / 5) ** 0.25
+# Frequency times spacing, rad, at which a straight line between readings has it: (omega h)^2 / 8.
+FAITHFUL_LINE_RAD = (FAITHFUL_SHARE * 8) ** 0.5
+# Frequency times step, rad, at which an input that is averaged over a step and held for the next has it:
+# 1 - sinc(omega h / 2)^2 = (omega h)^2 / 12.
+FAITHFUL_MEAN_RAD = (FAITHFUL_SHARE * 12) ** 0.5
+# Parts of a log whose mean step is compared with that of the whole, to show how a clock drifts: enough for a
+# clock that warms up, and of two steps each at least.
+CLOCK_PARTS = 10
+# Readings in each step of a coarser grid that is proposed, about.
+READINGS_PER_STEP = 3
+# Multiples of a power of ten that a proposed step is.
+ROUND_MULTIPLES = (1, 2, 3, 5, 10)
 
 
 def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s: float | None) -> float:
-    """dt in seconds from time stamps [s] (mean interval), or the given one; both must agree. Raises
-    ValueError if neither is given, dt_s is not positive, or the stamps are not increasing and uniform to
-    `TIME_TOLERANCE`, rounding aside."""
+    """Return the sampling time of a log, s: the mean step of its stamps, or the stated one.
+
+    Parameters
+    ----------
+    table : Table
+        For complaints: the path, the place of a row, the names of columns.
+    stamps : ndarray, shape (T,), or None
+        Time stamps, s; None where the log has no time column.
+    name : str or None
+        Of the time column, for complaints.
+    dt_s : float or None
+        Stated sampling time, s. Where there are stamps as well, they have to agree to 1 %.
+
+    Raises
+    ------
+    ValueError
+        Neither stamps nor a sampling time, one that is not positive, or stamps that are not increasing or not
+        uniform to `TIME_TOLERANCE`, unless they are a uniform clock's that were rounded. The message names
+        the first place, the cause and the option that helps.
+    """
     if dt_s is not None and not (np.isfinite(dt_s) and dt_s > 0):
         raise ValueError(f"{table.path}: dt_s must be a positive number of seconds; got {dt_s}")
     if stamps is None:
@@ -47,27 +83,32 @@ def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s
                 f"{table.listed()}"
             )
         return float(dt_s)
+
+    # Lost samples move the mean step, but not the median.
     table.increasing(stamps, name)
-    interval = np.diff(stamps)
-    # The median holds where samples are lost; the mean is the better estimate after.
-    median = float(np.median(interval))
-    uneven = np.flatnonzero(~(np.abs(interval - median) <= TIME_TOLERANCE * median))
+    steps = np.diff(stamps)
+    median = float(np.median(steps))
+    uneven = np.flatnonzero(~(np.abs(steps - median) <= TIME_TOLERANCE * median))
     if uneven.size and not only_rounded(stamps):
-        row, lost = int(uneven[0]), _counts(interval) - 1
-        if (stray := jitter_of(stamps)) > LARGEST_JITTER:
-            what = f"the stamps keep to no grid, steps are {np.min(interval):.4g} to {np.max(interval):.4g} s"
-        elif np.any(lost > 0):
-            row = int(np.argmax(lost > 0))
-            missing = int(np.sum(np.maximum(lost, 0)))
-            what = f"rows missing: {missing} of {stamps.size + missing}"
+        row = int(uneven[0])
+        n_lost = _usual_steps_in(steps) - 1
+        jitter = jitter_of(stamps)
+        if jitter > LARGEST_JITTER:
+            cause = f"the stamps keep to no grid, steps are {np.min(steps):.4g} to {np.max(steps):.4g} s"
+        elif np.any(n_lost > 0):
+            row = int(np.argmax(n_lost > 0))
+            missing = int(np.sum(np.maximum(n_lost, 0)))
+            cause = f"rows missing: {missing} of {stamps.size + missing}"
         else:
-            what = f"no row is missing, the clock jitters by up to {stray:.1%} of a step"
+            cause = f"no row is missing, the clock jitters by up to {jitter:.1%} of a step"
         raise ValueError(
-            f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {interval[row]:.6g} s where most "
+            f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {steps[row]:.6g} s where most "
             f"steps are {median:.6g} s; expected uniform sampling (each step within {TIME_TOLERANCE:.0%}); "
-            f"{what}: {_advice(stamps)}"
+            f"{cause}: {_advice(stamps)}"
         )
-    mean = float((stamps[-1] - stamps[0]) / interval.size)
+
+    # Of uniform stamps the mean is the better estimate.
+    mean = float((stamps[-1] - stamps[0]) / steps.size)
     if dt_s is None:
         # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002.
         return float(f"{mean:.12g}")
@@ -79,88 +120,164 @@ def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s
 
 
 def only_rounded(stamps: RealArray) -> bool:
-    """Whether stamps (T,) [s] are a uniform clock's, rounded: 0.008, 0.016, 0.023 for steps of 1/128 s."""
-    since = stamps - stamps[0]
-    digit = next((10.0**-k for k in range(10) if np.allclose(since, np.round(since, k), 0, 1e-10)), 0.0)
-    uniform = np.polyval(np.polyfit(np.arange(since.size), since, 1), np.arange(since.size))
-    # A line through rounded stamps is itself off by part of the digit.
-    return bool(
-        0 < digit <= 0.5 * np.median(np.diff(stamps)) and np.max(np.abs(since - uniform)) <= 0.75 * digit
-    )
+    """Whether stamps (T,) [s], increasing, are a uniform clock's, rounded: 0.008, 0.016, 0.023 of 1/128 s.
+
+    They have a last decimal of at most half a usual step, and lie on a straight line but for rounding: half
+    of that decimal, and a quarter more, as a line through rounded stamps is itself off by part of it.
+    """
+    since_first = stamps - stamps[0]
+    digit = 0.0
+    for decimals in range(10):
+        if np.allclose(since_first, np.round(since_first, decimals), 0, 1e-10):
+            digit = 10.0**-decimals
+            break
+    if not 0 < digit <= 0.5 * np.median(np.diff(stamps)):
+        return False
+    rows = np.arange(since_first.size)
+    uniform = np.polyval(np.polyfit(rows, since_first, 1), rows)
+    return bool(np.max(np.abs(since_first - uniform)) <= 0.75 * digit)
 
 
 def clock_doubts(stamps: RealArray, record: str) -> tuple[Finding, ...]:
-    """The finding on uniform stamps (T,) [s] whose small deviations add up: no frequency is better known."""
-    interval = np.diff(stamps)
-    if interval.size < 2 * _PARTS or only_rounded(stamps):
+    """Return the finding on stamps that are uniform from row to row, but whose small deviations add up.
+
+    Parameters
+    ----------
+    stamps : ndarray, shape (T,)
+        Increasing, s; uniform to `TIME_TOLERANCE`.
+    record : str
+        How the finding calls the log.
+
+    Returns
+    -------
+    tuple of Finding
+        Empty where the stamps stay within `LARGEST_JITTER` of one grid, are only rounded, or are fewer than
+        21. `share`: largest difference between the mean step of a tenth of the log and that of all, relative;
+        no frequency is known better. `dt_s`: a step to which the log could be resampled.
+    """
+    steps = np.diff(stamps)
+    if steps.size < 2 * CLOCK_PARTS or only_rounded(stamps):
         return ()
-    stray = float(np.max(np.abs(_fitted(stamps)[1])))
-    if stray <= LARGEST_JITTER:
+    largest_lateness = float(np.max(np.abs(_best_grid(stamps).late)))
+    if largest_lateness <= LARGEST_JITTER:
         return ()
-    mean = float(np.mean(interval))
-    share = max(abs(float(np.mean(part)) / mean - 1) for part in np.array_split(interval, _PARTS))
-    coarse = _coarser(interval)
-    return (finding(FindingKind.CLOCK_DRIFTS, record=record, samples=stray, share=share, dt_s=coarse),)
+    mean = float(np.mean(steps))
+    share = 0.0
+    for part in np.array_split(steps, CLOCK_PARTS):
+        share = max(share, abs(float(np.mean(part)) / mean - 1))
+    drift = finding(
+        FindingKind.CLOCK_DRIFTS,
+        record=record,
+        samples=largest_lateness,
+        share=share,
+        dt_s=_coarser_step(steps),
+    )
+    return (drift,)
 
 
 def jitter_of(stamps: RealArray) -> float:
-    """Largest distance of a step from a whole number of usual ones, as a share of one."""
-    interval = np.diff(stamps)
-    step = float(np.median(interval))
-    return float(np.max(np.abs(interval / step - np.maximum(np.rint(interval / step), 1))))
+    """Return the largest distance of a step from a whole number of usual ones, at least one, in usual steps.
+
+    stamps: (T,) [s], increasing; the usual step is the median.
+    """
+    steps = np.diff(stamps)
+    in_usual_steps = steps / float(np.median(steps))
+    whole = np.maximum(np.rint(in_usual_steps), 1)
+    return float(np.max(np.abs(in_usual_steps - whole)))
 
 
 def option_for(stamps: RealArray) -> str:
-    """The option that takes increasing stamps (T,) [s]: '', '--repair', '--resample-s SECONDS', or
-    'split'."""
-    interval = np.diff(stamps)
-    median = float(np.median(interval))
-    if np.max(np.abs(interval - median)) <= TIME_TOLERANCE * median or only_rounded(stamps):
+    """Return the option that takes increasing stamps (T,) [s].
+
+    '' where they are uniform; 'split' where more rows are missing at a place than can be filled in;
+    '--repair' where all are close to one grid and few rows are missing; else '--resample-s SECONDS'.
+    """
+    steps = np.diff(stamps)
+    median = float(np.median(steps))
+    if np.max(np.abs(steps - median)) <= TIME_TOLERANCE * median or only_rounded(stamps):
         return ""
-    if np.max(interval) > (_MOST_LOST_ROWS + 1.5) * median:
+    if np.max(steps) > (MOST_LOST_ROWS + 1.5) * median:
         return "split"
-    rows, late, _ = _fitted(stamps)
-    close = np.all(np.diff(rows) > 0) and np.max(np.abs(late)) <= LARGEST_JITTER
-    if close and stamps.size >= (1 - _MOST_LOST_SHARE) * (rows[-1] + 1):
+    grid = _best_grid(stamps)
+    each_row_has_a_sample = np.all(np.diff(grid.rows) > 0)
+    is_close = np.max(np.abs(grid.late)) <= LARGEST_JITTER
+    n_samples = grid.rows[-1] + 1
+    if each_row_has_a_sample and is_close and stamps.size >= (1 - MOST_LOST_SHARE) * n_samples:
         return "--repair"
-    return f"--resample-s {_coarser(interval):g}"
+    return f"--resample-s {_coarser_step(steps):g}"
 
 
 def _advice(stamps: RealArray, options: bool = True) -> str:
-    found = option_for(stamps)
-    if found == "split":
+    """Return what to do about stamps (T,) [s] that are not uniform, in words.
+
+    options: whether who reads it can give options; they are named as on the command line and in Python.
+    """
+    option = option_for(stamps)
+    if option == "split":
         return "split the file there"
     if not options:
         return "resample it to a uniform step"
-    name, _, number = found.removeprefix("--").partition(" ")
-    return f"{found} ({name.replace('-', '_')} = {number or 'true'})"
+    name, _, number = option.removeprefix("--").partition(" ")
+    return f"{option} ({name.replace('-', '_')} = {number or 'true'})"
 
 
-def _coarser(interval: RealArray) -> float:
-    """A step of 1, 2, 3 or 5 times a power of ten that takes a few readings and bridges the largest gap."""
-    least = max(_READINGS * float(np.median(interval)), float(np.max(interval)) / (_MOST_LOST_ROWS + 1))
-    decade = 10.0 ** np.floor(np.log10(least))
-    return float(f"{next(m for m in (1, 2, 3, 5, 10) if m * decade >= least) * decade:.6g}")
+def _coarser_step(steps: RealArray) -> float:
+    """Return a step, s, of a coarser grid for a log with these steps (T - 1,) [s].
+
+    It is 1, 2, 3 or 5 times a power of ten, holds three usual steps, and bridges the largest gap with no more
+    steps than may be without a reading.
+    """
+    for_readings = READINGS_PER_STEP * float(np.median(steps))
+    for_gap = float(np.max(steps)) / (MOST_LOST_ROWS + 1)
+    shortest = max(for_readings, for_gap)
+    decade = 10.0 ** np.floor(np.log10(shortest))
+    multiple = next(multiple for multiple in ROUND_MULTIPLES if multiple * decade >= shortest)
+    return float(f"{multiple * decade:.6g}")
 
 
-def _counts(interval: RealArray) -> IntArray:
-    return np.rint(interval / np.median(interval)).astype(np.int64)
+def _usual_steps_in(steps: RealArray) -> IntArray:
+    """Return how many usual (median) steps each step (T - 1,) [s] is, rounded to whole numbers."""
+    return np.rint(steps / np.median(steps)).astype(np.int64)
 
 
-def _fitted(stamps: RealArray) -> tuple[IntArray, RealArray, float]:
-    """The sample each stamp is, how far it is from it (in samples), and the step, by least squares."""
-    rows = np.concatenate([[0], np.cumsum(_counts(np.diff(stamps)))])
-    slope, start = np.polyfit(rows, stamps - stamps[0], 1)
-    return rows, (stamps - stamps[0] - start) / slope - rows, float(slope)
+class _BestGrid(NamedTuple):
+    """A uniform grid that fits stamps by least squares.
+
+    rows: (T,) the sample each stamp is, from 0; late: (T,) stamp minus instant of that sample, in samples;
+    step_s: the grid's step.
+    """
+
+    rows: IntArray
+    late: RealArray
+    step_s: float
+
+
+def _best_grid(stamps: RealArray) -> _BestGrid:
+    """Return the grid that fits increasing stamps (T,) [s] best; each step counts as so many usual ones."""
+    steps = _usual_steps_in(np.diff(stamps))
+    rows = np.concatenate([[0], np.cumsum(steps)])
+    step_s, start_s = np.polyfit(rows, stamps - stamps[0], 1)
+    late = (stamps - stamps[0] - start_s) / step_s - rows
+    return _BestGrid(rows, late, float(step_s))
 
 
 @dataclass(frozen=True)
 class Repair:
-    """What was done to the rows of a log to have them on a uniform grid: missing of samples rows were filled
-    in; jitter: largest distance of a stamp from its instant, in samples.
+    """What was done to the rows of a log to have them on a uniform grid.
 
-    Of a coarser grid: own_s, the usual step of the log itself [s], of which jitter is then (0 on the log's
-    own grid); largest_s: the largest step not longer than one of the grid.
+    Attributes
+    ----------
+    samples : int
+        Samples of the grid.
+    missing : int
+        Samples without a row of the log (of a coarser grid: without a reading near), which were filled in.
+    jitter : float
+        Largest distance of a stamp from its instant, in samples; of a coarser grid, of a step of the log from
+        whole usual ones, in these.
+    own_s : float
+        Of a coarser grid: the usual step of the log itself, s; 0 on the log's own grid.
+    largest_s : float
+        Of a coarser grid: the largest step of the log that is not longer than one of the grid, s.
     """
 
     samples: int
@@ -170,28 +287,62 @@ class Repair:
     largest_s: float = 0.0
 
     def finding(self, record: str, dt_s: float) -> Finding:
-        """too_narrow: share by which ellipses shrink if every filled row counts as one more measurement;
-        above faithful_rad_s what stands between the readings is wrong by more than 1 % of the motion."""
-        told = {
-            "record": record,
-            "samples": self.samples,
-            "missing": self.missing,
-            "jitter": self.jitter,
-            "too_narrow": (self.samples / max(self.samples - self.missing, 1)) ** 0.5 - 1,
-        }
+        """Return what a user should know of the repair.
+
+        Parameters
+        ----------
+        record : str
+            How the finding calls the log.
+        dt_s : float
+            Step of the grid, s.
+
+        Returns
+        -------
+        Finding
+            `too_narrow`: share by which ellipses shrink if every filled row counts as one more measurement.
+            `faithful_rad_s`: above this frequency what stands between the readings is wrong by more than 1 %
+            of the motion.
+        """
+        n_measured = max(self.samples - self.missing, 1)
+        too_narrow = (self.samples / n_measured) ** 0.5 - 1
         if self.own_s:
-            faithful = min(_FAITHFUL_LINE / self.largest_s, _FAITHFUL_MEAN / dt_s)
-            coarse = {"dt_s": dt_s, "own_s": self.own_s, "faithful_rad_s": faithful}
-            return finding(FindingKind.RESAMPLED, **told, **coarse)
+            return finding(
+                FindingKind.RESAMPLED,
+                record=record,
+                samples=self.samples,
+                missing=self.missing,
+                jitter=self.jitter,
+                too_narrow=too_narrow,
+                dt_s=dt_s,
+                own_s=self.own_s,
+                faithful_rad_s=min(FAITHFUL_LINE_RAD / self.largest_s, FAITHFUL_MEAN_RAD / dt_s),
+            )
+        # Two neighbours that stray apart leave a longer step.
+        longest_s = (1 + 2 * self.jitter) * dt_s
         return finding(
-            FindingKind.REPAIRED, **told, faithful_rad_s=_FAITHFUL / ((1 + 2 * self.jitter) * dt_s)
+            FindingKind.REPAIRED,
+            record=record,
+            samples=self.samples,
+            missing=self.missing,
+            jitter=self.jitter,
+            too_narrow=too_narrow,
+            faithful_rad_s=FAITHFUL_SPLINE_RAD / longest_s,
         )
 
 
 @dataclass(frozen=True, eq=False)
 class TimeGrid:
-    """Rows of a log on multiples of the sampling period dt_s (least squares over all stamps). rows (R,): the
-    sample each row is, increasing from 0. late (R,): stamp minus instant of that sample, in samples."""
+    """A log of R rows on multiples of its sampling period, T samples, some of which may have no row.
+
+    Attributes
+    ----------
+    dt_s : float
+        Sampling period, s, by least squares over all stamps.
+    rows : ndarray of int, shape (R,)
+        The sample each row is, increasing from 0.
+    late : ndarray, shape (R,)
+        Stamp minus instant of that sample, in samples; all 0 where the log is on the grid as it is.
+    """
 
     dt_s: float
     rows: IntArray
@@ -199,124 +350,216 @@ class TimeGrid:
 
     @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, *, options: bool = True) -> TimeGrid:
-        """The grid under the stamps (R,) [s] of the column `name`; its phase is their mean. options: whether
-        who reads the complaint can give --repair and --resample-s. Raises ValueError, one line with file and
-        row: time that does not increase, too many rows lost, a stamp too far off the grid."""
+        """Return the grid under the stamps of a log; its phase is their mean.
+
+        Parameters
+        ----------
+        table : Table
+            For complaints: the path and the place of a row.
+        name : str
+            Of the time column, for complaints.
+        stamps : ndarray, shape (R,)
+            Time stamps, s.
+        options : bool
+            Whether who reads a complaint can give --repair and --resample-s.
+
+        Raises
+        ------
+        ValueError
+            One line with file and row: time that does not increase, more than five rows lost at a place or
+            5 % of all, or a stamp more than `LARGEST_JITTER` off the grid.
+        """
         table.increasing(stamps, name)
-        interval = np.diff(stamps)
-        step, counts = float(np.median(interval)), _counts(interval)
-        if np.any(counts > _MOST_LOST_ROWS + 1):
-            row = int(np.argmax(counts > _MOST_LOST_ROWS + 1))
+        steps = np.diff(stamps)
+        usual_step = float(np.median(steps))
+        counts = _usual_steps_in(steps)
+        is_long_gap = counts > MOST_LOST_ROWS + 1
+        if np.any(is_long_gap):
+            row = int(np.argmax(is_long_gap))
             raise ValueError(
-                f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {interval[row]:.6g} s where "
-                f"most steps are {step:.6g} s; at most {_MOST_LOST_ROWS} rows may be missing at a place: "
-                "split the file"
+                f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {steps[row]:.6g} s where "
+                f"most steps are {usual_step:.6g} s; at most {MOST_LOST_ROWS} rows may be missing at a "
+                "place: split the file"
             )
-        rows, late, slope = _fitted(stamps)
-        if np.any(counts == 0) or np.max(np.abs(late)) > LARGEST_JITTER:
-            row = int(np.argmax(np.abs(late)))
+
+        grid = _best_grid(stamps)
+        lateness = np.abs(grid.late)
+        if np.any(counts == 0) or np.max(lateness) > LARGEST_JITTER:
+            row = int(np.argmax(lateness))
             raise ValueError(
-                f"{table.path}, {table.place(row)}: time '{name}' is {abs(late[row]):.2f} of a step of "
-                f"{step:.6g} s off a uniform grid (steps: {np.min(interval):.4g} to {np.max(interval):.4g} "
+                f"{table.path}, {table.place(row)}: time '{name}' is {lateness[row]:.2f} of a step of "
+                f"{usual_step:.6g} s off a uniform grid (steps: {np.min(steps):.4g} to {np.max(steps):.4g} "
                 f"s; their deviations add up); --repair takes {LARGEST_JITTER:g}: {_advice(stamps, options)}"
             )
-        if len(stamps) < (1 - _MOST_LOST_SHARE) * (rows[-1] + 1):
+        n_samples = grid.rows[-1] + 1
+        if len(stamps) < (1 - MOST_LOST_SHARE) * n_samples:
             raise ValueError(
-                f"{table.path}: {rows[-1] + 1 - len(rows)} of {rows[-1] + 1} rows are missing by the time "
-                f"column '{name}'; expected at most {_MOST_LOST_SHARE:.0%}: {_advice(stamps, options)}"
+                f"{table.path}: {n_samples - len(grid.rows)} of {n_samples} rows are missing by the time "
+                f"column '{name}'; expected at most {MOST_LOST_SHARE:.0%}: {_advice(stamps, options)}"
             )
-        on_grid = np.max(np.abs(late)) <= _ON_GRID
+        late = np.zeros(len(grid.rows)) if np.max(lateness) <= ON_GRID else grid.late
         # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002.
-        return cls(float(f"{slope:.12g}"), rows, np.zeros(len(rows)) if on_grid else late)
+        return cls(float(f"{grid.step_s:.12g}"), grid.rows, late)
 
     @property
     def n_samples(self) -> int:
+        """T, samples of the grid from the first to the last row."""
         return int(self.rows[-1]) + 1
 
     @property
     def repair(self) -> Repair | None:
         """What `sampled` changes; None where the log is on the grid as it is."""
         jitter = float(np.max(np.abs(self.late)))
-        return Repair(int(self.rows[-1]) + 1, len(self.missing), jitter) if self.missing or jitter else None
+        if not self.missing and not jitter:
+            return None
+        return Repair(self.n_samples, len(self.missing), jitter)
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Samples that the log lacks."""
-        return tuple(int(k) for k in np.setdiff1d(np.arange(self.rows[-1] + 1), self.rows))
+        """Samples that the log has no row for, ascending."""
+        samples = np.arange(self.rows[-1] + 1)
+        return tuple(int(sample) for sample in np.setdiff1d(samples, self.rows))
 
     def sampled(self, values: RealArray) -> RealArray:
-        """Outputs (R, Y) read at the stamps -> (T, Y) at the grid's instants, by a cubic spline. Neglected:
-        the fourth derivative over a sample; noise of the readings next to a missing row."""
+        """Return outputs at the instants of the grid.
+
+        Parameters
+        ----------
+        values : ndarray, shape (R,) or (R, Y)
+            As they were read at the stamps.
+
+        Returns
+        -------
+        ndarray, shape (T,) or (T, Y)
+            By a cubic spline through the readings; readings on the grid stay as they are.
+
+        Notes
+        -----
+        Neglected: the fourth derivative over a sample; noise of the readings next to a missing row.
+        """
         from scipy.interpolate import CubicSpline  # here: a log that is refused never waits for it
 
-        grid = np.arange(self.rows[-1] + 1)
-        if len(grid) == len(values) and not self.late.any():
+        samples = np.arange(self.rows[-1] + 1)
+        is_on_grid = not self.late.any()
+        if len(samples) == len(values) and is_on_grid:
             return values
-        filled = np.asarray(CubicSpline(self.rows + self.late, values)(grid))
-        if not self.late.any():
+        filled = np.asarray(CubicSpline(self.rows + self.late, values)(samples))
+        if is_on_grid:
             filled[self.rows] = values
         return filled
 
     def held(self, values: RealArray) -> RealArray:
-        """Inputs (R,), each held from its grid instant on -> (T,); half-way between neighbours of a missing
-        row."""
+        """Return inputs (T,) at the instants of the grid, from those of the rows (R,).
+
+        Each is held from the instant of its sample on, whatever its stamp; on a line between its neighbours
+        where the row is missing.
+        """
         return np.interp(np.arange(self.rows[-1] + 1), self.rows, values)
 
 
 @dataclass(frozen=True, eq=False)
 class CoarseGrid:
-    """Rows of a log with stamps (R,) [s], increasing, on a coarser grid of step dt_s from the first row
-    on."""
+    """A log of R rows on a coarser grid that begins at the first row.
+
+    Attributes
+    ----------
+    stamps : ndarray, shape (R,)
+        Time stamps since the first, s, increasing.
+    dt_s : float
+        Step of the grid, s.
+    """
 
     stamps: RealArray
     dt_s: float
 
     @classmethod
     def of(cls, table: Table, name: str, stamps: RealArray, dt_s: float) -> Self:
-        """Raises ValueError: time that does not increase, a step that does not fit, five steps without a
-        reading."""
+        """Return the grid of a step for the stamps of a log.
+
+        Parameters
+        ----------
+        table : Table
+            For complaints: the path and the place of a row.
+        name : str
+            Of the time column, for complaints.
+        stamps : ndarray, shape (R,)
+            Time stamps, s.
+        dt_s : float
+            Step of the grid, s: at least the usual step of the log, at most its length.
+
+        Raises
+        ------
+        ValueError
+            Time that does not increase, a step that does not fit, or more than five steps of the grid without
+            a reading.
+        """
         table.increasing(stamps, name)
-        interval = np.diff(stamps)
-        own, span, row = float(np.median(interval)), float(stamps[-1] - stamps[0]), int(np.argmax(interval))
-        if not (1 - TIME_TOLERANCE) * own <= dt_s <= span:
+        steps = np.diff(stamps)
+        usual_step = float(np.median(steps))
+        length_s = float(stamps[-1] - stamps[0])
+        if not (1 - TIME_TOLERANCE) * usual_step <= dt_s <= length_s:
+            proposed_step = min(_coarser_step(steps), length_s)
             raise ValueError(
-                f"{table.path}: resample_s = {dt_s:.6g} s; expected {own:.6g} s, the usual step of '{name}', "
-                f"to {span:.6g} s; try --resample-s {min(_coarser(interval), span):g}"
+                f"{table.path}: resample_s = {dt_s:.6g} s; expected {usual_step:.6g} s, the usual step of "
+                f"'{name}', to {length_s:.6g} s; try --resample-s {proposed_step:g}"
             )
-        if interval[row] > (_MOST_LOST_ROWS + 1) * max(dt_s, own * (1 + TIME_TOLERANCE)):
+        row = int(np.argmax(steps))
+        if steps[row] > (MOST_LOST_ROWS + 1) * max(dt_s, usual_step * (1 + TIME_TOLERANCE)):
             raise ValueError(
-                f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {interval[row]:.6g} s; at "
-                f"most {_MOST_LOST_ROWS} steps of the grid (resample_s = {dt_s:.6g} s) may be without a "
+                f"{table.path}, {table.place(row + 1)}: time '{name}' steps by {steps[row]:.6g} s; at "
+                f"most {MOST_LOST_ROWS} steps of the grid (resample_s = {dt_s:.6g} s) may be without a "
                 "reading: split the file there"
             )
         return cls(stamps - stamps[0], dt_s)
 
     @property
     def _instants(self) -> RealArray:
+        """Instants (T,) of the grid, s, from 0 to the last stamp."""
         # Rounding of the stamps must not cost the last one.
-        count = int(np.floor(self.stamps[-1] / self.dt_s + 1e-6)) + 1
-        return np.asarray(self.dt_s * np.arange(count), dtype=np.float64)
+        n_samples = int(np.floor(self.stamps[-1] / self.dt_s + 1e-6)) + 1
+        return np.asarray(self.dt_s * np.arange(n_samples), dtype=np.float64)
 
     @property
     def n_samples(self) -> int:
+        """T, instants of the grid."""
         return int(self._instants.size)
 
     @property
     def repair(self) -> Repair:
-        interval, instants = np.diff(self.stamps), self._instants
+        """What became of the log: instants without a reading within half a step, and its own steps."""
+        instants = self._instants
         edges = np.append(instants - self.dt_s / 2, instants[-1] + self.dt_s / 2)
-        empty = int(np.sum(np.histogram(self.stamps, edges)[0] == 0))
-        own = float(np.median(interval))
-        near = interval[interval <= max(self.dt_s, own)]
-        return Repair(instants.size, empty, jitter_of(self.stamps), own, float(np.max(near)))
+        readings_per_instant = np.histogram(self.stamps, edges)[0]
+        steps = np.diff(self.stamps)
+        usual_step = float(np.median(steps))
+        is_inside_a_step = steps <= max(self.dt_s, usual_step)
+        return Repair(
+            samples=instants.size,
+            missing=int(np.sum(readings_per_instant == 0)),
+            jitter=jitter_of(self.stamps),
+            own_s=usual_step,
+            largest_s=float(np.max(steps[is_inside_a_step])),
+        )
 
     def sampled(self, values: RealArray) -> RealArray:
-        """Outputs (R,) -> (T,) on straight lines between the readings, which never make noise larger."""
+        """Return outputs (T,) at the instants of the grid, from those of the rows (R,).
+
+        They lie on straight lines between the readings, which never make noise larger.
+        """
         return np.interp(self._instants, self.stamps, values)
 
     def held(self, values: RealArray) -> RealArray:
-        """Inputs (R,), each held from its stamp to the next -> (T,) means over the steps: the same push."""
-        edges = np.append(self._instants, self._instants[-1] + self.dt_s)
-        stamps = np.append(self.stamps, max(self.stamps[-1], edges[-1]) + self.dt_s)
-        pushed = np.concatenate([[0.0], np.cumsum(values * np.diff(stamps))])
-        return np.asarray(np.diff(np.interp(edges, stamps, pushed)) / self.dt_s, dtype=np.float64)
+        """Return inputs (T,), means over the steps of the grid, from those of the rows (R,).
+
+        Each row's input is held from its stamp to the next, the last one to the end of the grid: a mean over
+        a step pushes a machine as far as what was held in it.
+        """
+        instants = self._instants
+        edges = np.append(instants, instants[-1] + self.dt_s)
+        # A stamp beyond the grid, up to which the last input is held.
+        end_s = max(self.stamps[-1], edges[-1]) + self.dt_s
+        stamps = np.append(self.stamps, end_s)
+        # Integral of the input up to each stamp; its differences over the steps are the means.
+        integral = np.concatenate([[0.0], np.cumsum(values * np.diff(stamps))])
+        integral_at_edges = np.interp(edges, stamps, integral)
+        return np.asarray(np.diff(integral_at_edges) / self.dt_s, dtype=np.float64)
