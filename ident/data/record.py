@@ -1,4 +1,12 @@
-"""Measured signals: sampled uniformly, checked once, and read from CSV, npz and MATLAB files."""
+"""Measured signals of one experiment: sampled uniformly, checked once, and read from files of any format.
+
+`Record` is what every estimator takes: inputs, outputs and references as arrays with names and units, and
+what is known of how they were read. Whoever makes one is told at once, in one line, what does not fit, so
+that later code need not check. `Record.from_file` makes one from columns of a log: it chooses a run, unwraps
+and scales signals, finds the sampling time or a uniform grid, and notes what looks doubtful
+(`reading_notes`). `in_one_unit` converts the records of a set to common units. Nothing is corrected without
+being asked for or noted.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +18,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly
-from ident.data.finding import Finding, FindingKind, Value, finding
+from ident.data.finding import Finding, FindingKind, finding
 from ident.data.foreign_files import as_typed, shown
 from ident.data.record_files import read_table
 from ident.data.shown import Shown
@@ -22,22 +30,52 @@ from ident.data.wrapping import no_reading, spikes_in, unwrapped, wraps_at
 
 T = TypeVar("T")
 
-# Clocks of one machine differ by less: a thousandth of every frequency, below what most records tell.
+# Relative difference of sampling times up to which they are those of one clock: clocks of hosts differ by
+# less. It is a thousandth of every frequency, below what most records tell.
 SAME_CLOCK = 1e-3
+# Relative difference up to which the sampling times of a record and of a model are equal: rounding.
+SAME_DT = 1e-9
+# Readings may span this share more than the period at which they wrap: rounding of decimals.
+BEYOND_PERIOD = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Record(Shown):
-    """One uniformly sampled experiment.
+    """One uniformly sampled experiment: T samples of U inputs, Y outputs and R references.
 
-    input (T, U), output (T, Y), reference (T, R) or None, with distinct names each; units are free text,
-    empty or one per column. name: shown to the user; source: the file, named in error messages. time_column:
-    what time stamps were taken for, None where dt_s was given without. repair: what was done to rows that
-    jittered or were missing. cut: samples of the commanded input beyond what the amplifier gives (`limited`).
-    notes: how the file was read. own_units: by column, what the file says, before anything is stated.
+    Attributes
+    ----------
+    name : str
+        Shown to the user.
+    input : ndarray, shape (T, U)
+    output : ndarray, shape (T, Y)
+    dt_s : float
+        Sampling time, s.
+    input_names, output_names : tuple of str
+        Of the columns, distinct.
+    reference : ndarray, shape (T, R), or None
+    reference_names : tuple of str
+        Empty without a reference.
+    input_units, output_units : tuple of str
+        Free text; empty, or one per column.
+    source : str
+        The file, named in error messages; '' where there is none.
+    time_column : TimeColumn or None
+        What time stamps were taken for; None where dt_s was given without.
+    repair : Repair or None
+        What was done to rows that jittered or were missing.
+    cut : int
+        Samples of the commanded input beyond what the amplifier gives (`limited`).
+    notes : tuple of Finding
+        What is to be known of the way the file was read.
+    own_units : mapping of str to str
+        By column, what the file says, before anything is stated.
 
-    Raises ValueError if a shape or a name does not fit, dt_s is not positive, or a sample is not finite or
-    above 1e100 (names the first one).
+    Raises
+    ------
+    ValueError
+        A shape or a name does not fit, dt_s is not positive, or a sample is not finite or above 1e100 (names
+        the first one).
     """
 
     name: str
@@ -58,6 +96,8 @@ class Record(Shown):
     own_units: Mapping[str, str] = field(default_factory=dict, metadata={"since": 2})
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check that everything fits together."""
+        # Fields of a frozen class are set through `object`. Names may come as lists.
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
             object.__setattr__(self, key, tuple(getattr(self, key)))
         if not (np.isfinite(self.dt_s) and self.dt_s > 0):
@@ -69,12 +109,15 @@ class Record(Shown):
         elif self.reference_names:
             raise ValueError(f"{self.label}: reference_names given without a reference")
         for key, names in (("input_units", self.input_names), ("output_units", self.output_names)):
-            if len(getattr(self, key)) not in (0, len(names)):
-                raise ValueError(
-                    f"{self.label}: {key} must be empty or one per column; got {getattr(self, key)}"
-                )
+            units = getattr(self, key)
+            if len(units) not in (0, len(names)):
+                raise ValueError(f"{self.label}: {key} must be empty or one per column; got {units}")
 
     def _check(self, key: str, names: tuple[str, ...]) -> None:
+        """Replace a signal ('input', 'output' or 'reference') by a locked copy (T, C) with these C names.
+
+        Raises ValueError where shape, length, names or a sample does not fit.
+        """
         signal = readonly(getattr(self, key))
         object.__setattr__(self, key, signal)
         if signal.ndim != 2 or signal.shape[1] != len(names) or not names:
@@ -84,14 +127,17 @@ class Record(Shown):
             )
         if len(set(names)) != len(names):
             raise ValueError(f"{self.label}: {key} names must be distinct; got {list(names)}")
-        if signal.shape[0] != np.shape(self.input)[0] or signal.shape[0] < 1:
+        n_samples = signal.shape[0]
+        n_input_samples = np.shape(self.input)[0]
+        if n_samples != n_input_samples or n_samples < 1:
             raise ValueError(
-                f"{self.label}: {key} has {signal.shape[0]} samples and input {np.shape(self.input)[0]}; "
+                f"{self.label}: {key} has {n_samples} samples and input {n_input_samples}; "
                 "they must be equally long, at least one"
             )
-        bad = np.argwhere(~(np.abs(signal) <= LARGEST))
-        if bad.size:
-            k, column = bad[0]
+        # NaN compares as false, so it is among those that are not small enough.
+        refused = np.argwhere(~(np.abs(signal) <= LARGEST))
+        if refused.size:
+            k, column = refused[0]
             raise ValueError(
                 f"{self.label}: {key} column '{names[column]}' is {signal[k, column]:.6g} at index {k}; "
                 f"expected finite numbers, magnitudes up to {LARGEST:g} (else choose another unit)"
@@ -104,47 +150,75 @@ class Record(Shown):
 
     @property
     def doubts(self) -> tuple[Finding, ...]:
-        """What to know of the time base before trusting a frequency."""
-        column, repair = self.time_column, self.repair
-        found = [column.doubt(self.dt_s)] if column is not None and column.doubtful else []
-        repaired = [repair.finding(self.label, self.dt_s)] if repair is not None else []
-        return (*found, *repaired, *self.notes)
+        """What to know of the record before trusting a frequency: its time base, repairs, and notes."""
+        doubts: list[Finding] = []
+        if self.time_column is not None and self.time_column.doubtful:
+            doubts.append(self.time_column.doubt(self.dt_s))
+        if self.repair is not None:
+            doubts.append(self.repair.finding(self.label, self.dt_s))
+        return (*doubts, *self.notes)
 
     @property
     def n_samples(self) -> int:
+        """T, samples of each signal."""
         return int(self.input.shape[0])
 
     @property
     def time_s(self) -> RealArray:
-        """Sampling instants (T,), starting at 0."""
+        """Sampling instants (T,), s, starting at 0."""
         return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
 
     def sampled_like(self, other: Record) -> bool:
-        """Whether the sampling times are one but for the clocks of hosts, to 0.1 %."""
+        """Whether the sampling times of two records are one but for the clocks of hosts, to 0.1 %."""
         return abs(self.dt_s - other.dt_s) <= SAME_CLOCK * other.dt_s
 
     def refuse_several(self, dt_s: float | None = None, inputs: int = 1) -> None:
-        """Raise ValueError unless there are so many inputs and one output, sampled at dt_s where given."""
+        """Refuse another number of inputs, several outputs, or another sampling time.
+
+        Parameters
+        ----------
+        dt_s : float, optional
+            The sampling time of a model, s, which the record has to have.
+        inputs : int
+            Inputs that are expected.
+
+        Raises
+        ------
+        ValueError
+            The record does not fit.
+        """
         if self.input.shape[1] != inputs or self.output.shape[1] != 1:
+            expected = f"{inputs} inputs" if inputs > 1 else "one input"
             raise ValueError(
-                f"{self.label}: need {inputs if inputs > 1 else 'one'} input{'s' * (inputs > 1)} and one "
+                f"{self.label}: need {expected} and one "
                 f"output, got {list(self.input_names)} and {list(self.output_names)}; choose with Record.siso"
             )
-        if dt_s is not None and not abs(self.dt_s - dt_s) <= 1e-9 * dt_s:
+        if dt_s is not None and not abs(self.dt_s - dt_s) <= SAME_DT * dt_s:
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")
 
     def only(self, output: int) -> Record:
-        """The record with this output alone."""
-        units = self.output_units[output : output + 1]
+        """Return the record with one output alone, given by its index; the inputs stay."""
+        # A list as the index keeps the column two-dimensional.
         return replace(
             self,
             output=self.output[:, [output]],
             output_names=(self.output_names[output],),
-            output_units=units,
+            output_units=self.output_units[output : output + 1],
         )
 
     def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
-        """The record with one input and one output; a name may be left out where there is only one column."""
+        """Return the record with one input and one output.
+
+        Parameters
+        ----------
+        input_name, output_name : str, optional
+            May be left out where there is only one column.
+
+        Raises
+        ------
+        ValueError
+            No column of that name, or none named among several.
+        """
         i = self._column("input", self.input_names, input_name)
         o = self._column("output", self.output_names, output_name)
         return replace(
@@ -155,6 +229,10 @@ class Record(Shown):
         )
 
     def _column(self, key: str, names: tuple[str, ...], name: str | None) -> int:
+        """Return the index of a name among those of the columns of a signal (key: 'input' or 'output').
+
+        Raises ValueError where it is not there, or None among several.
+        """
         if name is None and len(names) == 1:
             return 0
         if name not in names:
@@ -162,7 +240,13 @@ class Record(Shown):
         return names.index(name)
 
     def slice(self, start: int, stop: int) -> Record:
-        """Samples start <= k < stop, 0 <= start < stop <= T; the new record's time starts at 0 again."""
+        """Return samples start <= k < stop; the new record's time starts at 0 again.
+
+        Raises
+        ------
+        ValueError
+            Unless 0 <= start < stop <= T.
+        """
         if not 0 <= start < stop <= self.n_samples:
             raise ValueError(
                 f"{self.label}: samples {start} to {stop}: expected 0 <= start < stop <= "
@@ -171,15 +255,25 @@ class Record(Shown):
         return self.each(lambda signal: signal[start:stop])
 
     def limited(self, limit: float) -> Record:
-        """The record with an input cut off at a limit, both signs, as of an amplifier. Raises ValueError
-        unless > 0."""
+        """Return the record with inputs cut off at a limit, both signs, as an amplifier does.
+
+        Parameters
+        ----------
+        limit : float
+            In units of the inputs.
+
+        Raises
+        ------
+        ValueError
+            The limit is not positive.
+        """
         if not limit > 0:
             raise ValueError(f"the limit of the input must be positive; got {limit:g}")
-        cut = int(np.sum(np.abs(self.input) > limit))
-        return replace(self, input=np.clip(self.input, -limit, limit), cut=cut)
+        n_beyond = int(np.sum(np.abs(self.input) > limit))
+        return replace(self, input=np.clip(self.input, -limit, limit), cut=n_beyond)
 
     def each(self, change: Callable[[RealArray], RealArray]) -> Record:
-        """The record with its input, output and reference, (T, .) each, changed alike."""
+        """Return the record with its input, output and reference, (T, .) each, changed alike."""
         reference = None if self.reference is None else change(self.reference)
         return replace(self, input=change(self.input), output=change(self.output), reference=reference)
 
@@ -204,129 +298,221 @@ class Record(Shown):
         decimal: str | None = None,
         run: int | None = None,
     ) -> Self:
-        """Read columns of a log file, or of a table that is there; readers: `ident.data.record_files`.
+        """Read columns of a log file.
 
-        The sampling time comes from the column `time`, from dt_s, or from both if they agree. Time has the
-        unit time_unit, else that in the column's name ('t_ms', 'Zeit [ms]'), else seconds. scale, offset,
-        units: by column, quantity = scale * column + offset in that unit. repair: stamps that jitter, and
-        single missing rows, are put on a uniform grid (`TimeGrid`). resample_s: all rows are put on a grid of
-        this step (`CoarseGrid`). unwrap: by column, the period at which its readings wrap (4096, 360), before
-        scale and offset. decimal: 'point' or 'comma', where the numbers leave a doubt. run: of a table in
-        which time starts again (`Table.runs`), from 0. Raises ValueError in one line naming file and place.
+        Parameters
+        ----------
+        path : path-like or Table
+            The file, or a table that was read before; formats: `ident.data.record_files`.
+        inputs, outputs, references : sequence of str
+            Names of columns.
+        time : str, optional
+            The column of time stamps. The sampling time comes from it, from `dt_s`, or from both if they
+            agree.
+        dt_s : float, optional
+            Sampling time, s.
+        time_unit : str, optional
+            Of the time column; default: the unit in the column's name ('t_ms', 'Zeit [ms]'), else seconds.
+        name : str, optional
+            Of the record; default: the file's name without its ending, and the run.
+        scale, offset : mapping of str to float, optional
+            By column: the quantity is scale * column + offset.
+        units : mapping of str to str, optional
+            By column: the unit of that quantity.
+        repair : bool
+            Stamps that jitter, and single missing rows, are put on a uniform grid (`TimeGrid`).
+        resample_s : float, optional
+            All rows are put on a grid of this step, s (`CoarseGrid`).
+        unwrap : mapping of str to float, optional
+            By column, the period at which its readings wrap (4096, 360), before scale and offset.
+        decimal : str, optional
+            'point' or 'comma', where the numbers leave a doubt.
+        run : int, optional
+            Of a table in which time starts again (`Table.runs`), from 0.
+
+        Raises
+        ------
+        ValueError
+            In one line naming file and place.
         """
-        table = (path if isinstance(path, Table) else read_table(path)).with_decimal(decimal)
-        runs = table.runs(time)
-        if run is not None or len(runs) > 1:
-            if run is None or not 0 <= run < len(runs):
-                what = f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}" if runs[0].run else "one run"
-                raise ValueError(
-                    f"{table.path}: holds {what}; expected one of them: run = 0 to {len(runs) - 1}"
-                )
-            table = runs[run]
-        for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
-            if isinstance(names, str):
-                raise ValueError(
-                    f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
-                )
-        wanted = [*inputs, *outputs, *references]
-        if time in wanted:
-            raise ValueError(f"{table.path}: column {time!r} is named as time and as a signal; expected two")
-        if time is None and time_unit is not None:
-            raise ValueError(f"{table.path}: time_unit = '{time_unit}' without a time column; name it (time)")
-        both = [item for item in inputs if item in outputs]
-        if both:
-            raise ValueError(f"{table.path}: column {both[0]!r} is named as input and output; expected two")
-        if table.sparse and time is None:
-            raise ValueError(
-                f"{table.path}: columns have rows of their own (other cells are empty); name the time column "
-                "(--time)"
-            )
-        # Of a text table the rows of the output: what drives it is held, as in a bag.
+        table = path if isinstance(path, Table) else read_table(path)
+        table = _one_run(table.with_decimal(decimal), time, run)
+        label = str(table.path)
+        _refuse_roles(table, inputs, outputs, references, time, time_unit)
+        scale = scale or {}
+        offset = offset or {}
+        units = units or {}
+        unwrap = unwrap or {}
+
+        # Columns that have rows of their own are taken on those of the output: what drives it is held between
+        # its rows, as in a bag.
+        signal_names = [*inputs, *outputs, *references]
         base = outputs[0] if table.sparse else None
-        columns = table.columns(wanted if time is None else [time, *wanted], base)
-        stamps, time_column = (None, None) if time is None else table.seconds(time, columns[time], time_unit)
-        scale, offset, units, unwrap = scale or {}, offset or {}, units or {}, unwrap or {}
-        for item in (*scale, *offset, *units, *unwrap):
-            if item not in wanted:
+        columns = table.columns(signal_names if time is None else [time, *signal_names], base)
+        stamps: RealArray | None = None
+        time_column: TimeColumn | None = None
+        if time is not None:
+            stamps, time_column = table.seconds(time, columns[time], time_unit)
+        # A statement about a column that is not used is a misspelt name, and would be ignored in silence.
+        for column in (*scale, *offset, *units, *unwrap):
+            if column not in signal_names:
                 raise ValueError(
-                    f"{table.path}: scale, offset, unit or unwrap of column {item!r}, which is not used as a "
+                    f"{label}: scale, offset, unit or unwrap of column {column!r}, which is not used as a "
                     "signal"
                 )
-        doubtful = list[Finding]()
-        for item, period in unwrap.items():
-            if not (np.isfinite(period) and period > 0):
-                raise ValueError(f"{table.path}: column {item!r} wraps at a positive number; got {period}")
-            if (span := float(np.ptp(columns[item]))) > period * (1 + 1e-6):
-                raise ValueError(
-                    f"{table.path}: column {item!r} spans {span:.9g}, more than the {period:g} at which it "
-                    "is said to wrap"
-                )
-            columns[item], longest = unwrapped(columns[item], period)
-            if longest:
-                doubtful.append(
-                    finding(FindingKind.LONG_STEPS, record=str(table.path), name=item, share=longest)
-                )
+
+        # Readings go on where they are said to wrap; then the file is looked at for what else is doubtful.
+        notes: list[Finding] = []
+        for column, period in unwrap.items():
+            columns[column], longest_share = _unwrapped(columns[column], column, period, label)
+            if longest_share:
+                notes.append(finding(FindingKind.LONG_STEPS, record=label, name=column, share=longest_share))
         if time_column is not None and time_column.wraps:
-            doubtful.append(time_column.timer(str(table.path)))
-        notes = (*doubtful, *reading_notes(table, columns, inputs, outputs, references))
-        step = dt_s if stamps is None else float(np.median(np.diff(stamps))) if stamps.size > 1 else None
-        if step is not None and 0 < step < np.inf:
-            moved = np.column_stack([columns[item] for item in outputs])
-            refuse_step(str(table.path), step, moved, time_column)
+            notes.append(time_column.timer(label))
+        notes += reading_notes(table, columns, inputs, outputs, references)
+        usual_step_s = dt_s
+        if stamps is not None:
+            usual_step_s = float(np.median(np.diff(stamps))) if stamps.size > 1 else None
+        if usual_step_s is not None and 0 < usual_step_s < np.inf:
+            moved = np.column_stack([columns[column] for column in outputs])
+            refuse_step(label, usual_step_s, moved, time_column)
+
+        # The sampling time, of the stamps or of the grid that they are put on.
         grid: TimeGrid | CoarseGrid | None = None
         if resample_s is not None:
             if time is None or stamps is None or dt_s is not None:
-                raise ValueError(f"{table.path}: resample_s needs a time column, and no dt_s beside it")
+                raise ValueError(f"{label}: resample_s needs a time column, and no dt_s beside it")
             grid = CoarseGrid.of(table, time, stamps, resample_s)
         elif repair and time is not None and stamps is not None:
             grid = TimeGrid.of(table, time, stamps)
         if grid is not None:
             stamps = np.asarray(grid.dt_s * np.arange(grid.n_samples), dtype=np.float64)
-        step = sampling_time(table, stamps, time, dt_s)
+        step_s = sampling_time(table, stamps, time, dt_s)
         if grid is None and stamps is not None:
-            notes += clock_doubts(stamps, str(table.path))
+            notes += clock_doubts(stamps, label)
 
-        def stack(names: Sequence[str], held: bool = False) -> RealArray:
+        def quantities(names: Sequence[str], *, held: bool) -> RealArray:
+            """Return columns (T, C) in their units, on the grid; held: from row to row, as a command is."""
             if not names:
                 return np.zeros((0, 0))
-            found = [columns[item] * scale.get(item, 1.0) + offset.get(item, 0.0) for item in names]
-            if grid is None:
-                return np.column_stack(found)
-            return np.column_stack([grid.held(item) if held else grid.sampled(item) for item in found])
+            signals = []
+            for column in names:
+                signal = columns[column] * scale.get(column, 1.0) + offset.get(column, 0.0)
+                if grid is not None:
+                    signal = grid.held(signal) if held else grid.sampled(signal)
+                signals.append(signal)
+            return np.column_stack(signals)
 
-        def stated(names: Sequence[str]) -> tuple[str, ...]:
-            found = tuple(units.get(item, "" if item in scale else table.unit(item)) for item in names)
-            return found if any(found) else ()
+        # A stated unit counts, else the file's; of a scaled column nobody knows it.
+        unit_of = {}
+        own_units = {}
+        for column in signal_names:
+            file_unit = table.unit(column)
+            unit_of[column] = units.get(column, "" if column in scale else file_unit)
+            if file_unit and column in scale:
+                own_units[column] = f"{scale[column]:g} * {file_unit}"
+            elif file_unit:
+                own_units[column] = unit_of[column]
 
-        command, output = stack(inputs, held=True), stack(outputs)
-        reference = stack(references, held=True) if references else None
+        def units_of(names: Sequence[str]) -> tuple[str, ...]:
+            """Return the units of columns; none where no column has one."""
+            stated = tuple(unit_of[column] for column in names)
+            return stated if any(stated) else ()
+
+        # Outputs are read at instants; commands and references are held from one row to the next. A loop
+        # shows whether units are right: its output follows its reference.
+        command = quantities(inputs, held=True)
+        output = quantities(outputs, held=False)
+        reference = quantities(references, held=True) if references else None
         if reference is not None and len(references) == len(outputs) == 1 and inputs:
-            names = (*references, *outputs, inputs[0])
-            of = [units.get(item, "" if item in scale else table.unit(item)) for item in names]
-            notes += contradicted_by_loop(reference[:, 0], output[:, 0], command[:, 0], names, of, scale)
+            loop_names = (references[0], outputs[0], inputs[0])
+            loop_units = [unit_of[column] for column in loop_names]
+            notes += contradicted_by_loop(
+                reference[:, 0], output[:, 0], command[:, 0], loop_names, loop_units, scale
+            )
+        if name is None:
+            name = f"{table.path.stem}, {table.run}" if table.run else table.path.stem
         return cls(
-            name=", ".join(filter(None, (table.path.stem, table.run))) if name is None else name,
+            name=name,
             input=command,
             output=output,
-            dt_s=step,
+            dt_s=step_s,
             input_names=tuple(inputs),
             output_names=tuple(outputs),
             reference=reference,
             reference_names=tuple(references),
-            input_units=stated(inputs),
-            output_units=stated(outputs),
-            source=str(table.path),
+            input_units=units_of(inputs),
+            output_units=units_of(outputs),
+            source=label,
             time_column=time_column,
             repair=None if grid is None else grid.repair,
-            notes=notes,
-            own_units={
-                item: f"{scale[item]:g} * {table.unit(item)}"
-                if item in scale
-                else units.get(item, table.unit(item))
-                for item in wanted
-                if table.unit(item)
-            },
+            notes=tuple(notes),
+            own_units=own_units,
         )
+
+
+def _one_run(table: Table, time: str | None, run: int | None) -> Table:
+    """Return a table, or the chosen run of it where time starts again.
+
+    time: name of the time column; run: from 0. Raises ValueError where there are several runs and none is
+    chosen, or no such run.
+    """
+    runs = table.runs(time)
+    if run is None and len(runs) == 1:
+        return table
+    if run is None or not 0 <= run < len(runs):
+        what = f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}" if runs[0].run else "one run"
+        raise ValueError(f"{table.path}: holds {what}; expected one of them: run = 0 to {len(runs) - 1}")
+    return runs[run]
+
+
+def _refuse_roles(
+    table: Table,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    references: Sequence[str],
+    time: str | None,
+    time_unit: str | None,
+) -> None:
+    """Raise ValueError where the names of columns, or of the time column, do not go together.
+
+    A string is no list of names, no column is two things, a unit of time needs a time column, and a table
+    whose columns have rows of their own needs one, too.
+    """
+    for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
+        if isinstance(names, str):
+            raise ValueError(
+                f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
+            )
+    if time in (*inputs, *outputs, *references):
+        raise ValueError(f"{table.path}: column {time!r} is named as time and as a signal; expected two")
+    if time is None and time_unit is not None:
+        raise ValueError(f"{table.path}: time_unit = '{time_unit}' without a time column; name it (time)")
+    for name in inputs:
+        if name in outputs:
+            raise ValueError(f"{table.path}: column {name!r} is named as input and output; expected two")
+    if table.sparse and time is None:
+        raise ValueError(
+            f"{table.path}: columns have rows of their own (other cells are empty); name the time column "
+            "(--time)"
+        )
+
+
+def _unwrapped(values: RealArray, name: str, period: float, label: str) -> tuple[RealArray, float]:
+    """Return readings (T,) of a column going on, and the share of the period that their longest step is where
+    it may go the wrong way, else 0 (`wrapping.unwrapped`).
+
+    period: in units of the readings; label: the file, for complaints. Raises ValueError where the period is
+    not positive, or the readings span more than it.
+    """
+    if not (np.isfinite(period) and period > 0):
+        raise ValueError(f"{label}: column {name!r} wraps at a positive number; got {period}")
+    span = float(np.ptp(values))
+    if span > period * (1 + BEYOND_PERIOD):
+        raise ValueError(
+            f"{label}: column {name!r} spans {span:.9g}, more than the {period:g} at which it is said to wrap"
+        )
+    return unwrapped(values, period)
 
 
 def reading_notes(
@@ -336,79 +522,141 @@ def reading_notes(
     outputs: Sequence[str],
     references: Sequence[str] = (),
 ) -> tuple[Finding, ...]:
-    """What is said of the way a file was read; columns: inputs, outputs and references as they are used."""
-    found, record = list[Finding](), str(table.path)
-    if table.layout is not None and table.layout.commented:
-        first = table.layout.skipped[0]
-        found.append(
-            finding(FindingKind.SKIPPED_ROWS, record=record, rows=table.layout.commented, line=first)
-        )
-    if table.layout is not None and table.layout.cut:
-        found.append(finding(FindingKind.CUT_ROW, record=record, line=table.layout.cut))
-    if table.layout is not None and table.layout.footer:
-        found.append(finding(FindingKind.FOOTER, record=record, line=table.layout.footer))
+    """Return what a user should know of the way a file was read.
+
+    Parameters
+    ----------
+    table : Table
+        Of it matter here: the layout of a text file (rows that were skipped or cut), clocks, cells and units.
+    columns : mapping of str to ndarray, shape (T,) each
+        Inputs, outputs and references as they are used, before scale and offset.
+    inputs, outputs, references : sequence of str
+        Names of columns.
+
+    Returns
+    -------
+    tuple of Finding
+        Rows left out, inputs held between their rows, units that contradict the name, numbers in brackets,
+        outputs that seem to wrap, spikes, and numbers that stand for no reading.
+    """
+    record = str(table.path)
+    notes = list[Finding]()
+    layout = table.layout
+    if layout is not None and layout.commented:
+        first = layout.skipped[0]
+        notes.append(finding(FindingKind.SKIPPED_ROWS, record=record, rows=layout.commented, line=first))
+    if layout is not None and layout.cut:
+        notes.append(finding(FindingKind.CUT_ROW, record=record, line=layout.cut))
+    if layout is not None and layout.footer:
+        notes.append(finding(FindingKind.FOOTER, record=record, line=layout.footer))
+
+    # Inputs that have rows of their own are held between them.
     if table.sparse:
-        others = [name for name in inputs if not np.array_equal(table.clocks[name], table.clocks[outputs[0]])]
-        found += [finding(FindingKind.HELD, record=record, name=name, output=outputs[0]) for name in others]
+        for name in inputs:
+            if not np.array_equal(table.clocks[name], table.clocks[outputs[0]]):
+                notes.append(finding(FindingKind.HELD, record=record, name=name, output=outputs[0]))
     for name in (*inputs, *outputs):
-        if units := table.contradiction(name):
-            found.append(finding(FindingKind.UNIT_CONTRADICTED, record=record, name=name, units=units))
+        contradicting_units = table.contradiction(name)
+        if contradicting_units:
+            notes.append(
+                finding(FindingKind.UNIT_CONTRADICTED, record=record, name=name, units=contradicting_units)
+            )
     for name in (*inputs, *outputs):
-        if told := _bookkept(table, name):
-            found.append(told)
+        bookkept = _bookkept(table, name)
+        if bookkept is not None:
+            notes.append(bookkept)
+
+    # Readings that wrap also jump: they are not looked at for spikes below.
+    wrapping = set()
     for name in outputs:
-        if period := wraps_at(columns[name]):
-            found.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
-    wrapping = {item.values["name"] for item in found if item.kind is FindingKind.WRAPS}
+        period = wraps_at(columns[name])
+        if period:
+            wrapping.add(name)
+            notes.append(finding(FindingKind.WRAPS, record=record, name=name, period=period))
+
+    # An output that jumps away and comes back has spikes; a command may be a pulse, which is meant, and so
+    # only numbers that stand for no reading count there.
     for name in (*inputs, *references, *outputs):
         if name in wrapping:
             continue
         values = columns[name]
+        is_output = name in outputs
         kind = FindingKind.SPIKES
-        rows = spikes_in(values) if name in outputs else np.zeros(0, dtype=np.int64)
+        rows = spikes_in(values) if is_output else np.zeros(0, dtype=np.int64)
         if not rows.size:
             kind = FindingKind.NO_READING
-            rows = no_reading(values, command=name not in outputs)
+            rows = no_reading(values, command=not is_output)
         if rows.size:
-            first = int(rows[0])
-            place = table.place(first, name)
-            found.append(
-                finding(kind, record=record, name=name, value=values[first], place=place, rows=rows.size)
+            first_row = int(rows[0])
+            notes.append(
+                finding(
+                    kind,
+                    record=record,
+                    name=name,
+                    value=values[first_row],
+                    place=table.place(first_row, name),
+                    rows=rows.size,
+                )
             )
-    return tuple(found)
+    return tuple(notes)
 
 
 def _bookkept(table: Table, name: str) -> Finding | None:
-    """The finding on a column of text with numbers like '(3.25)' and '3.25-'."""
+    """Return the finding on a column of text with negative numbers like '(3.25)' and '3.25-', or None.
+
+    Book-keepers write minus signs so. The finding names the first such cell and what it was read as.
+    """
     cells = table.raw[name]
     if table.layout is None or not isinstance(cells, tuple):
         return None
     decimal = table.layout.decimal
-    rows = [k for k, cell in enumerate(cells) if is_bookkept(cell, decimal)]
+    rows = [row for row, cell in enumerate(cells) if is_bookkept(cell, decimal)]
     if not rows:
         return None
+    first_cell = cells[rows[0]]
     return finding(
         FindingKind.BOOKKEPT,
         record=str(table.path),
         name=name,
         place=table.place(rows[0], name),
-        cell=cells[rows[0]],
-        value=number(cells[rows[0]], decimal),
+        cell=first_cell,
+        value=number(first_cell, decimal),
         rows=len(rows),
     )
 
 
 def in_one_unit(records: Sequence[Record]) -> list[Record]:
-    """Records of one set, each column in the unit that it has in the first that says one; a note says what
-    was converted. Raises ValueError, one line, for units that are not of one quantity."""
-    first, found = dict[str, tuple[str, str]](), list[Record]()
+    """Return records of one set with each column in the unit that it has in the first one that says a unit.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Columns of one name are of one quantity. Where a record says no unit, its numbers stay.
+
+    Returns
+    -------
+    list of Record
+        Those that were converted have a note of it for each column.
+
+    Raises
+    ------
+    ValueError
+        One line: units of a column that are not of one quantity.
+    """
+    # By column: the unit that counts, and the record that says it.
+    first_said = dict[str, tuple[str, str]]()
+    converted = list[Record]()
     for record in records:
-        named = (*record.input_names, *record.output_names)
-        units = dict(zip(named, (*record.input_units, *record.output_units), strict=False))
+        names = (*record.input_names, *record.output_names)
+        units = dict(zip(names, (*record.input_units, *record.output_units), strict=False))
         units |= record.own_units
-        factors, notes = dict[str, float](), list[Finding]()
-        for name, unit in ((name, unit) for name, unit in units.items() if unit):
-            wanted, whose = first.setdefault(name, (unit, record.label))
+
+        factors = dict[str, float]()
+        notes = list[Finding]()
+        for name, unit in list(units.items()):
+            if not unit:
+                continue
+            wanted, whose = first_said.setdefault(name, (unit, record.label))
             factor = 1.0 if unit == wanted else per(unit, wanted)
             if factor is None:
                 raise ValueError(
@@ -417,27 +665,40 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
                     f"one, or state --unit {as_typed(f'{name}=UNIT')} if a header is wrong"
                 )
             if factor != 1.0:
-                factors[name], units[name] = factor, wanted
-                told: dict[str, Value] = {"name": name, "unit": unit, "of": wanted, "times": factor}
-                notes.append(finding(FindingKind.UNIT_CONVERTED, record=record.label, **told))
+                factors[name] = factor
+                units[name] = wanted
+                note = finding(
+                    FindingKind.UNIT_CONVERTED,
+                    record=record.label,
+                    name=name,
+                    unit=unit,
+                    of=wanted,
+                    times=factor,
+                )
+                notes.append(note)
+
         if factors:
             changed: dict[str, Any] = {"own_units": units, "notes": (*record.notes, *notes)}
             for key in ("input", "output", "reference"):
-                names, signal = getattr(record, f"{key}_names"), getattr(record, key)
-                changed[key] = None if signal is None else signal * [factors.get(name, 1.0) for name in names]
-                if key != "reference" and any(map(units.get, names)):
+                signal = getattr(record, key)
+                names = getattr(record, f"{key}_names")
+                if signal is not None:
+                    changed[key] = signal * [factors.get(name, 1.0) for name in names]
+                if key != "reference" and any(units.get(name) for name in names):
                     changed[f"{key}_units"] = tuple(units.get(name, "") for name in names)
             record = replace(record, **changed)
-        found.append(record)
-    return found
+        converted.append(record)
+    return converted
 
 
 def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
-    """Items in groups, in the order they come: each in the first group whose first item it is like."""
+    """Return items in groups, in the order they come: each in the first group whose first item it is like."""
     groups: list[list[T]] = []
     for item in items:
-        group = next((group for group in groups if alike(item, group[0])), None)
-        if group is None:
-            groups.append(group := [])
-        group.append(item)
+        for group in groups:
+            if alike(item, group[0]):
+                group.append(item)
+                break
+        else:
+            groups.append([item])
     return groups
