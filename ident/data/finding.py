@@ -1,4 +1,10 @@
-"""What a test or a check found, as numbers; its sentence stands in the template of those who show it."""
+"""What a test or a check found, as numbers and names; its sentence is written by whoever shows it.
+
+Numerical code says what it noticed as a `Finding`: a kind and the values that belong to it. The sentences
+stand in one template of the reports (`findings.j2`), a macro for each kind called by its name in lower case,
+so that numbers can be tested without words and words be changed without code. `PriorTest` is the verdict of
+the data on something that was stated as known, with the statistic that decided it.
+"""
 
 from __future__ import annotations
 
@@ -10,18 +16,22 @@ import numpy as np
 
 from ident.data.shown import Shown
 
-Value = float | bool | int | str  # what a sentence is made with
+# A value that a sentence is made with.
+Value = float | bool | int | str
 
-# Level of the tests of what is stated as known.
+# Confidence level of the tests of what is stated as known: one true statement in a hundred is refused. At
+# .95 a user with a few statements would often be told that a right one is wrong.
 TEST_LEVEL = 0.99
-
 # Lags at which residuals are tested for whiteness: 25 samples, a few periods of what a sampled model can
 # follow. A test over so many lags takes more than twice as many samples.
 WHITE_LAGS = 25
 
 
 class FindingKind(Enum):
-    """Which question a finding answers, or what it warns of."""
+    """Which question a finding answers, or what it warns of.
+
+    Each has its sentence, and with it the names of its values, in the macro of its name in `findings.j2`.
+    """
 
     # Poles at a bound of the search.
     NO_POLE = auto()
@@ -115,22 +125,49 @@ class FindingKind(Enum):
 
 @dataclass(frozen=True, repr=False)
 class Finding(Shown):
-    """A kind, and the numbers and names that belong to it (units in their names)."""
+    """Something that a test or a check found.
+
+    Attributes
+    ----------
+    kind : FindingKind
+    values : mapping of str to Value
+        The numbers and names that belong to it, with units in their keys (`dt_s`); which there are depends on
+        the kind.
+    """
 
     kind: FindingKind
     values: Mapping[str, Value]
 
 
 def finding(kind: FindingKind, **values: Value | np.generic) -> Finding:
-    """Numbers of numpy become plain ones."""
-    return Finding(kind, {k: v.item() if isinstance(v, np.generic) else v for k, v in values.items()})
+    """Return a finding of a kind with these values; numbers of numpy become plain ones, as JSON has them."""
+    plain_values: dict[str, Value] = {}
+    for name, value in values.items():
+        plain_values[name] = value.item() if isinstance(value, np.generic) else value
+    return Finding(kind, plain_values)
 
 
 @dataclass(frozen=True)
 class PriorTest:
-    """Verdict of the data on one prior: refused where statistic exceeds limit, the chi-square quantile at 99
-    % with degrees_of_freedom (a cancelled integrator the other way round). imposed: the model keeps to the
-    prior; details: what the advice needs beside these."""
+    """Verdict of the data on one prior: something that the user stated as known.
+
+    Attributes
+    ----------
+    kind : FindingKind
+        Which prior it is: `INTEGRATORS`, `DELAY`, `FIXED_POLES`, ...
+    prior : str
+        The prior in words.
+    refused : bool
+        The statistic exceeds the limit (of a cancelled integrator, it falls below).
+    imposed : bool
+        The model keeps to the prior all the same.
+    statistic, limit : float
+        The statistic is chi-square distributed where the prior holds; the limit is its quantile at 99 %
+        (`TEST_LEVEL`).
+    degrees_of_freedom : int
+    details : mapping of str to Value
+        What the advice needs beside these.
+    """
 
     kind: FindingKind
     prior: str
@@ -143,6 +180,7 @@ class PriorTest:
 
     @property
     def finding(self) -> Finding:
+        """The verdict as a finding of its kind, with the level of the test and the details."""
         return finding(
             self.kind,
             prior=self.prior,
@@ -155,6 +193,12 @@ class PriorTest:
         )
 
 
-def distinct(found: Sequence[Finding]) -> tuple[Finding, ...]:
-    """Each one once, in their order."""
-    return tuple({(item.kind, repr(dict(item.values))): item for item in found}.values())
+def distinct(findings: Sequence[Finding]) -> tuple[Finding, ...]:
+    """Return each of some findings once: those of one kind with equal values are the same.
+
+    They stay in the order in which each comes first.
+    """
+    by_content = {}
+    for item in findings:
+        by_content[item.kind, repr(dict(item.values))] = item
+    return tuple(by_content.values())

@@ -1,4 +1,11 @@
-"""A frequency response with a 2x2 covariance at every frequency: what identification hands to control."""
+"""A frequency response with a 2x2 covariance at every frequency: what identification hands to control.
+
+`FrequencyUncertainty` is the response as a Gaussian over real and imaginary part, frequency by frequency, as
+estimators, measured tables and empirical responses give it and as controllers are designed for it. It checks
+its numbers once, so that whoever takes one need not. `ellipse` draws the regions of a confidence level,
+`normalised_distance` and `contains` compare another response with them; `from_csv` and `to_csv` exchange
+tables with other programs. Nothing is said of how errors at different frequencies belong together.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +22,41 @@ from ident.data.record_files import read_table
 from ident.data.response_columns import read_response
 from ident.data.table import LARGEST
 
-# A product of factors can miss symmetry or semidefiniteness by rounding, not by more.
-_PSD_TOLERANCE = 1e-9
-# Of a grid of our own: a hundred a decade over four decades.
+# By how much a covariance may miss symmetry or semidefiniteness, relative to its largest entry: a product of
+# factors misses them by rounding, not by more.
+PSD_TOLERANCE = 1e-9
+# Relative excess of a frequency over the Nyquist frequency that counts as rounding.
+ABOVE_NYQUIST = 1e-9
+# Frequencies of a grid of our own: a hundred a decade over four decades.
 FREQUENCIES = 400
 
-_COLUMNS = ("real", "imag", "variance_real", "variance_imag")
-_CROSS = "covariance_real_imag"
+# The column of a table that may be left out where it is zero.
+CROSS_COLUMN = "covariance_real_imag"
 
 
 @dataclass(frozen=True, eq=False)
 class FrequencyUncertainty:
-    """G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.
+    """A frequency response G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.
 
-    omega_rad_s (F,) strictly increasing, 0 <= omega <= pi / dt_s; centre (F,) complex; covariance (F,2,2),
-    symmetric and positive semidefinite (zero = exactly known); level: of each frequency's ellipse taken
-    alone; method: where the numbers come from. Raises ValueError, naming the first frequency at fault.
+    Attributes
+    ----------
+    omega_rad_s : ndarray, shape (F,)
+        Frequencies, rad/s, strictly increasing, 0 <= omega <= pi / dt_s.
+    centre : ndarray, shape (F,)
+        Complex response, in units of the output per unit of the input.
+    covariance : ndarray, shape (F, 2, 2)
+        Symmetric and positive semidefinite; zero where the response is known exactly.
+    dt_s : float
+        Sampling time, s.
+    level : float
+        Confidence level of each frequency's ellipse taken by itself.
+    method : str
+        Where the numbers come from, in words.
+
+    Raises
+    ------
+    ValueError
+        A shape or a number does not fit; the message names the first frequency at fault.
     """
 
     omega_rad_s: RealArray
@@ -41,65 +67,94 @@ class FrequencyUncertainty:
     method: str = "given"
 
     def __post_init__(self) -> None:
+        """Lock the arrays, check them, and make the covariance exactly symmetric."""
         lock(self, "omega_rad_s")
         lock(self, "centre", dtype=np.complex128)
-        omega, centre, covariance = self.omega_rad_s, self.centre, np.array(self.covariance, dtype=np.float64)
-        if (
-            omega.ndim != 1
-            or omega.size == 0
-            or centre.shape != omega.shape
-            or covariance.shape != (omega.size, 2, 2)
-        ):
+        omega = self.omega_rad_s
+        centre = self.centre
+        covariance = np.array(self.covariance, dtype=np.float64)
+        is_a_list = omega.ndim == 1 and omega.size > 0
+        if not is_a_list or centre.shape != omega.shape or covariance.shape != (omega.size, 2, 2):
             raise ValueError(
                 "need omega (F,), centre (F,) and covariance (F,2,2) with F >= 1; "
                 f"got {omega.shape}, {centre.shape}, {covariance.shape}"
             )
         if not (0 < self.dt_s < np.inf):
             raise ValueError(f"dt_s must be positive and finite; got {self.dt_s}")
-        chi2_radius(self.level)
+        chi2_radius(self.level)  # refuses a level outside of (0, 1)
+
+        # Comparisons with NaN are false, so what must hold is asked for and negated.
+        nyquist = np.pi / self.dt_s
         _refuse_first(~np.isfinite(omega), omega, "omega is not finite")
         _refuse_first(~(np.diff(omega) > 0), omega[1:], "omega must be strictly increasing; it is not")
         _refuse_first(omega < 0, omega, "omega must not be negative")
-        nyquist = np.pi / self.dt_s
-        _refuse_first(omega > nyquist * (1 + 1e-9), omega, f"omega is above pi / dt_s = {nyquist:.6g} rad/s")
+        is_above = omega > nyquist * (1 + ABOVE_NYQUIST)
+        _refuse_first(is_above, omega, f"omega is above pi / dt_s = {nyquist:.6g} rad/s")
         _refuse_first(~(np.abs(centre) < LARGEST), omega, f"the centre is not finite, or beyond {LARGEST:g}")
-        _refuse_first(~np.all(np.isfinite(covariance), axis=(1, 2)), omega, "the covariance is not finite")
-        skew = np.abs(covariance[:, 0, 1] - covariance[:, 1, 0])
+        is_finite = np.all(np.isfinite(covariance), axis=(1, 2))
+        _refuse_first(~is_finite, omega, "the covariance is not finite")
+        upper = covariance[:, 0, 1]
+        lower = covariance[:, 1, 0]
         largest = np.abs(covariance).max(axis=(1, 2))
-        _refuse_first(skew > _PSD_TOLERANCE * largest, omega, "the covariance is not symmetric")
-        _refuse_first(
-            relative_deficit(covariance) > _PSD_TOLERANCE,
-            omega,
-            "the covariance is not positive semidefinite",
-        )
-        covariance[:, 0, 1] = covariance[:, 1, 0] = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
+        is_skew = np.abs(upper - lower) > PSD_TOLERANCE * largest
+        _refuse_first(is_skew, omega, "the covariance is not symmetric")
+        is_indefinite = relative_deficit(covariance) > PSD_TOLERANCE
+        _refuse_first(is_indefinite, omega, "the covariance is not positive semidefinite")
+
+        cross = 0.5 * (upper + lower)
+        covariance[:, 0, 1] = cross
+        covariance[:, 1, 0] = cross
         object.__setattr__(self, "dt_s", float(self.dt_s))
         object.__setattr__(self, "level", float(self.level))
         object.__setattr__(self, "covariance", readonly(covariance))
 
     def ellipse(self, level: float | None = None) -> EllipseAxes:
-        """Axes of the ellipses that hold the response with probability `level` (default: the record's)."""
-        s1, s2, u1 = standard_axes(self.covariance)
-        radius = chi2_radius(self.level if level is None else level)
-        return EllipseAxes(semi_major=radius * s1, semi_minor=radius * s2, direction=u1)
+        """Return the axes of F ellipses that hold the response with this probability, each by itself.
 
-    def normalised_distance(self, response: npt.ArrayLike) -> RealArray:
-        """Distance (F,) of a response (F,) from the centre in units of the ellipse: 1 on its boundary."""
-        response = self._matching(response)
-        return ellipse_distance(
-            response - self.centre, self.ellipse(), np.abs(self.centre) + np.abs(response)
+        Parameters
+        ----------
+        level : float, optional
+            Default: `self.level`.
+
+        Raises
+        ------
+        ValueError
+            The level does not lie between 0 and 1.
+        """
+        axes = standard_axes(self.covariance)
+        radius = chi2_radius(self.level if level is None else level)
+        return EllipseAxes(
+            semi_major=radius * axes.major, semi_minor=radius * axes.minor, direction=axes.direction
         )
 
+    def normalised_distance(self, response: npt.ArrayLike) -> RealArray:
+        """Return how far a response is from the centre in units of the ellipse, (F,): 1 on its boundary.
+
+        Parameters
+        ----------
+        response : array-like, shape (F,)
+            Complex, at the frequencies of this response.
+
+        Raises
+        ------
+        ValueError
+            Another shape, or a number that is not finite.
+        """
+        response = self._matching(response)
+        magnitude = np.abs(self.centre) + np.abs(response)
+        return ellipse_distance(response - self.centre, self.ellipse(), magnitude)
+
     def contains(self, response: npt.ArrayLike) -> BoolArray:
-        """(F,) whether a response (F,) lies in the ellipse of its frequency."""
+        """Return whether a response (F,) lies in the ellipse of each frequency, (F,). Raises ValueError for
+        another shape."""
         return np.asarray(self.normalised_distance(response) <= 1.0)
 
     def enclosing_radius(self) -> RealArray:
-        """(F,) radius of the smallest disc around the centre that holds the ellipse."""
+        """Return the radii (F,) of the smallest discs around the centre that hold the ellipses."""
         return self.ellipse().semi_major
 
     def to_control(self) -> Any:
-        """The centre as `control.FrequencyResponseData`, without the covariances."""
+        """Return the centre as `control.FrequencyResponseData`, without the covariances."""
         # Here and not above: python-control brings its plotting along.
         import control
 
@@ -109,33 +164,62 @@ class FrequencyUncertainty:
     def from_csv(cls, path: str | Path, dt_s: float, *, level: float = 0.95) -> Self:
         """Read a frequency response with covariances.
 
-        Frequency and response as `FrfRepeats.from_csv` reads them, and columns `variance_real`,
-        `variance_imag` and, if it is not zero, `covariance_real_imag`. Raises ValueError in one line naming
-        file, line and column.
+        Parameters
+        ----------
+        path : path-like
+            A table with frequency and response as `FrfRepeats.from_csv` reads them, and columns
+            `variance_real`, `variance_imag` and, if it is not zero, `covariance_real_imag`.
+        dt_s : float
+            Sampling time, s.
+        level : float
+            Confidence level of the ellipses.
+
+        Raises
+        ------
+        ValueError
+            In one line naming file, line and column.
         """
         table = read_table(path)
         omega, centre = read_response(table)
-        variance_re, variance_im = table.columns(_COLUMNS[2:]).values()
+        variances = table.columns(("variance_real", "variance_imag"))
+        variance_re = variances["variance_real"]
+        variance_im = variances["variance_imag"]
         negative = np.flatnonzero((variance_re < 0) | (variance_im < 0))
         if negative.size:
             raise ValueError(f"{path}, {table.place(int(negative[0]))}: a variance is negative")
-        cross = table.columns([_CROSS])[_CROSS] if _CROSS in table.names else np.zeros_like(omega)
-        covariance = np.stack([np.stack([variance_re, cross], -1), np.stack([cross, variance_im], -1)], -2)
+        if CROSS_COLUMN in table.names:
+            cross = table.columns([CROSS_COLUMN])[CROSS_COLUMN]
+        else:
+            cross = np.zeros_like(omega)
+        first_row = np.stack([variance_re, cross], -1)
+        second_row = np.stack([cross, variance_im], -1)
+        covariance = np.stack([first_row, second_row], -2)
         try:
             return cls(omega, centre, covariance, dt_s, level, f"given in {table.path.name}")
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
 
     def to_csv(self, path: str | Path) -> None:
-        """Write the columns `from_csv` reads; numbers keep all their digits."""
-        parts = (self.centre.real, self.centre.imag, self.covariance[:, 0, 0], self.covariance[:, 1, 1])
-        columns = {"omega_rad_s": self.omega_rad_s, **dict(zip(_COLUMNS, parts, strict=True))}
-        columns[_CROSS] = self.covariance[:, 0, 1]
-        rows = zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True)
-        text = "\n".join(",".join(row) for row in (tuple(columns), *rows)) + "\n"
-        Path(path).write_text(text, encoding="utf-8", newline="\n")
+        """Write a table of the columns that `from_csv` reads; numbers keep all their digits."""
+        columns = {
+            "omega_rad_s": self.omega_rad_s,
+            "real": self.centre.real,
+            "imag": self.centre.imag,
+            "variance_real": self.covariance[:, 0, 0],
+            "variance_imag": self.covariance[:, 1, 1],
+            CROSS_COLUMN: self.covariance[:, 0, 1],
+        }
+
+        # The shortest text that gives the same double again.
+        texts = [[repr(number) for number in column.tolist()] for column in columns.values()]
+        lines = [",".join(columns)]
+        for row in zip(*texts, strict=True):
+            lines.append(",".join(row))
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
 
     def _matching(self, response: npt.ArrayLike) -> ComplexArray:
+        """Return a response as a complex array (F,). Raises ValueError for another shape, or a number that is
+        not finite."""
         response = np.asarray(response, dtype=np.complex128)
         if response.shape != self.omega_rad_s.shape:
             raise ValueError(
@@ -146,7 +230,8 @@ class FrequencyUncertainty:
         return response
 
 
-def _refuse_first(bad: BoolArray, omega: RealArray, complaint: str) -> None:
-    if np.any(bad):
-        index = int(np.argmax(bad))
-        raise ValueError(f"{complaint} (first at omega = {omega[index]:.6g} rad/s)")
+def _refuse_first(is_refused: BoolArray, omega_rad_s: RealArray, complaint: str) -> None:
+    """Raise ValueError with a complaint and the first refused of the frequencies (F,), if there is one."""
+    if np.any(is_refused):
+        first = int(np.argmax(is_refused))
+        raise ValueError(f"{complaint} (first at omega = {omega_rad_s[first]:.6g} rad/s)")

@@ -1,4 +1,12 @@
-"""Repeated measurements of one frequency response, point by point: reading, choosing, opening the loop."""
+"""Repeated measurements of one frequency response, point by point: reading, choosing, averaging.
+
+A response that an analyser or a sweep measured several times comes as points: frequency, complex response,
+and a label for the condition (date, amplitude). `FrfRepeats` reads and chooses points, opens a loop point by
+point, and averages the repeats of each frequency with a covariance from their scatter (`FrfRepeats.mean`),
+widened by Hotelling's T-squared for the few repeats there are (T. W. Anderson, An Introduction to
+Multivariate Statistical Analysis, chapter 5). Assumed: repeats are independent and Gaussian.
+`measured_response` takes whatever a user has: a table with variances, repeated sweeps, or a single one.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +23,34 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
 
-# Neighbours on either side that a hint may propose to pool.
-_MOST_NEIGHBOURS = 50
+# Neighbours on either side that a hint may propose to pool: beyond, what is pooled is no neighbourhood.
+MOST_NEIGHBOURS = 50
+# Degrees of freedom that a 2x2 covariance needs to be more than a line: three repeats.
+FEWEST_DEGREES = 2
+# Median distance of the points of a circular Gaussian cloud from its centre, in standard deviations of one
+# coordinate: that of the Rayleigh distribution, sqrt(2 ln 2).
+RAYLEIGH_MEDIAN = 1.1774
+# Columns in which a table states the spread of its response.
+SPREAD_COLUMNS = ("covariance_real_imag", "variance_imag", "variance_real")
 
 
 @dataclass(frozen=True, eq=False)
 class FrfRepeats:
-    """Measured points of a frequency response: omega_rad_s (K,), response (K,), label (K,) or none.
+    """Measured points of a frequency response; points of equal frequency are repeats.
 
-    Points of equal frequency are repeats; the label is their condition (date, amplitude). Raises ValueError
-    for other shapes or numbers that are not finite.
+    Attributes
+    ----------
+    omega_rad_s : ndarray, shape (K,)
+        Frequencies, rad/s, in any order.
+    response : ndarray, shape (K,)
+        Complex, in units of the output per unit of the input.
+    label : tuple of str
+        The condition of each point (date, amplitude); '' for each where none is given.
+
+    Raises
+    ------
+    ValueError
+        Other shapes, no point, or numbers that are not finite.
     """
 
     omega_rad_s: RealArray
@@ -32,6 +58,7 @@ class FrfRepeats:
     label: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check them."""
         lock(self, "omega_rad_s")
         lock(self, "response", dtype=np.complex128)
         size = self.omega_rad_s.size
@@ -46,17 +73,28 @@ class FrfRepeats:
 
     @classmethod
     def from_csv(cls, path: str | Path, *, label: str | None = None) -> Self:
-        """One row per measured point: a frequency (Hz, rad/s), real and imaginary part or gain (factor, dB)
-        and phase (rad, degrees), under any usual names that say their units, and the column named by `label`.
+        """Read one measured point from each row of a table.
 
-        Raises ValueError in one line naming file, line and column; where a unit is not said, it asks for it.
+        Parameters
+        ----------
+        path : path-like
+            A table with a frequency (Hz, rad/s), and real and imaginary part or gain (factor, dB) and phase
+            (rad, degrees), under any usual names that say their units.
+        label : str, optional
+            The column that holds the condition of each point.
+
+        Raises
+        ------
+        ValueError
+            In one line naming file, line and column; where a unit is not said, it asks for it.
         """
         table = read_table(path)
         if label is not None and label not in table.names:
             raise ValueError(f"{table.path}, line 1: missing column {label}; found {list(table.names)}")
         omega, response = read_response(table)
-        labels = [""] * response.size if label is None else [str(cell).strip() for cell in table.raw[label]]
-        return cls(omega, response, tuple(labels))
+        if label is None:
+            return cls(omega, response)
+        return cls(omega, response, tuple(str(cell).strip() for cell in table.raw[label]))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -64,24 +102,41 @@ class FrfRepeats:
         return tuple(dict.fromkeys(self.label))
 
     def only(self, *labels: str) -> FrfRepeats:
-        """Points of the given conditions. Raises ValueError if one does not occur."""
+        """Return the points of some conditions. Raises ValueError if one does not occur."""
         for wanted in labels:
             if wanted not in self.label:
                 raise ValueError(f"no point is labelled {wanted!r}; there are {list(self.labels)}")
-        return self._chosen(np.array([name in labels for name in self.label]))
+        return self._chosen(np.array([label in labels for label in self.label]))
 
     def band(self, omega_min_rad_s: float, omega_max_rad_s: float) -> FrfRepeats:
-        """Points with omega_min <= omega <= omega_max."""
-        return self._chosen((self.omega_rad_s >= omega_min_rad_s) & (self.omega_rad_s <= omega_max_rad_s))
+        """Return the points with omega_min <= omega <= omega_max. Raises ValueError if there is none."""
+        is_inside = (self.omega_rad_s >= omega_min_rad_s) & (self.omega_rad_s <= omega_max_rad_s)
+        return self._chosen(is_inside)
 
     def open_loop(self, reference_gain: float, feedback_gain: float) -> FrfRepeats:
-        """Plant responses from those of the closed loop r -> y under u = reference_gain r - feedback_gain y:
-        G = T / (a - g T) point by point. Raises ValueError where a - g T is zero."""
-        rest = reference_gain - feedback_gain * self.response
-        if np.any(rest == 0):
-            at = self.omega_rad_s[int(np.argmax(rest == 0))]
-            raise ValueError(f"at omega = {at:.6g} rad/s a point of the closed loop is exactly a / g")
-        return FrfRepeats(self.omega_rad_s, self.response / rest, self.label)
+        """Return plant responses from those of a closed loop r -> y, point by point.
+
+        Parameters
+        ----------
+        reference_gain, feedback_gain : float
+            a and g of the loop's law u = a r - g y.
+
+        Returns
+        -------
+        FrfRepeats
+            G = T / (a - g T), with T the response of the loop.
+
+        Raises
+        ------
+        ValueError
+            a - g T is zero at a point.
+        """
+        command_per_reference = reference_gain - feedback_gain * self.response
+        is_zero = command_per_reference == 0
+        if np.any(is_zero):
+            omega = self.omega_rad_s[int(np.argmax(is_zero))]
+            raise ValueError(f"at omega = {omega:.6g} rad/s a point of the closed loop is exactly a / g")
+        return FrfRepeats(self.omega_rad_s, self.response / command_per_reference, self.label)
 
     def mean(
         self,
@@ -92,52 +147,89 @@ class FrfRepeats:
         outlier_threshold: float | None = None,
         of: Literal["mean", "next run"] = "mean",
     ) -> FrequencyUncertainty:
-        """Centre and covariance of the mean over all points of each frequency.
+        """Average the points of each frequency, with the covariance of their mean.
 
-        The covariance is widened until the ellipse of the chi-square quantile at `level` equals Hotelling's
-        (variance x 1.7 with 10 repeats, x 9.5 with 4, x 133 with 3). pool_neighbours = m averages relative
-        covariances over m frequencies on either side first. outlier_threshold = t drops points farther than t
-        robust standard deviations from the median of their frequency. of = "next run": the region of one more
-        run (Hotelling's prediction region). Raises ValueError where a frequency is left with too few repeats.
+        Parameters
+        ----------
+        dt_s : float
+            Sampling time of the controller, s.
+        level : float
+            Confidence level of the ellipses.
+        pool_neighbours : int
+            m: relative covariances are averaged over m frequencies on either side first, which few repeats
+            need. 0: each frequency by itself.
+        outlier_threshold : float, optional
+            Points farther than so many robust standard deviations from the median of their frequency are left
+            out (`inliers`).
+        of : {'mean', 'next run'}
+            Whose region it is: that of the mean, or of one more run (Hotelling's prediction region).
+
+        Returns
+        -------
+        FrequencyUncertainty
+            One frequency for each different one, ascending.
+
+        Raises
+        ------
+        ValueError
+            A frequency is left with too few repeats (the message says what helps), or an option is negative.
+
+        Notes
+        -----
+        The covariance is widened until the ellipse of the chi-square quantile at `level` equals Hotelling's:
+        variance times 1.7 with 10 repeats, 9.5 with 4, 133 with 3.
         """
         if pool_neighbours < 0:
             raise ValueError(f"pool_neighbours must not be negative; got {pool_neighbours}")
         if outlier_threshold is not None and not outlier_threshold > 0:
             raise ValueError(f"outlier_threshold must be positive; got {outlier_threshold}")
+
+        # Mean and scatter matrix (sum of squares and products about it) of the repeats of each frequency.
         grid, group = np.unique(self.omega_rad_s, return_inverse=True)
         centre = np.empty(grid.size, dtype=np.complex128)
         scatter = np.empty((grid.size, 2, 2))
         count = np.empty(grid.size, dtype=np.int64)
         for index in range(grid.size):
-            points = self.response[group == index]
+            is_of_frequency = group == index
+            points = self.response[is_of_frequency]
             if outlier_threshold is not None:
                 points = inliers(points, outlier_threshold)
             centre[index] = points.mean()
             deviation = points - centre[index]
-            pair = np.stack([deviation.real, deviation.imag])
-            scatter[index], count[index] = pair @ pair.T, points.size
+            parts = np.stack([deviation.real, deviation.imag])
+            scatter[index] = parts @ parts.T
+            count[index] = points.size
+
         freedom = count - 1
         if pool_neighbours:
             scatter, freedom = _pooled(scatter, freedom, centre, pool_neighbours)
-        if np.any(freedom < 2):
+        if np.any(freedom < FEWEST_DEGREES):
             raise ValueError(_too_few(grid, count, freedom))
-        share = 1 / count if of == "mean" else 1 + 1 / count
-        covariance = scatter * (hotelling_widening(freedom, level) * share / freedom)[:, None, None]
-        method = "repeated measurements" if of == "mean" else "one more run"
+
+        # The mean of n points has 1 / n of the variance of one; a further run differs from it by both.
+        if of == "mean":
+            share = 1 / count
+            method = "repeated measurements"
+        else:
+            share = 1 + 1 / count
+            method = "one more run"
+        factor = hotelling_widening(freedom, level) * share / freedom
+        covariance = scatter * factor[:, None, None]
         return FrequencyUncertainty(grid, centre, covariance, dt_s, level, method)
 
-    def _chosen(self, keep: BoolArray) -> FrfRepeats:
-        if not np.any(keep):
+    def _chosen(self, is_chosen: BoolArray) -> FrfRepeats:
+        """Return the points for which an array (K,) is true. Raises ValueError where none is."""
+        if not np.any(is_chosen):
             raise ValueError("no measured point is left")
         return FrfRepeats(
-            self.omega_rad_s[keep],
-            self.response[keep],
-            tuple(name for name, kept in zip(self.label, keep, strict=True) if kept),
+            self.omega_rad_s[is_chosen],
+            self.response[is_chosen],
+            tuple(self.label[k] for k in np.flatnonzero(is_chosen)),
         )
 
 
 def is_response(*paths: Path) -> bool:
-    """Whether the files are frequency responses; one that cannot be read is left to others."""
+    """Whether the files are frequency responses; False where one cannot be read, which others will say."""
     try:
         return all(has_response(read_table(path)) for path in paths)
     except ValueError:
@@ -152,64 +244,116 @@ def measured_response(
     pool_neighbours: int = 0,
     outlier_threshold: float | None = None,
 ) -> FrequencyUncertainty | FrfRepeats:
-    """Of a table with variances, or the mean of repeated sweeps in one file or several (`FrfRepeats.mean`);
-    the points themselves where each frequency is measured once. Raises ValueError naming the file."""
-    if len(paths) == 1 and "variance_real" in (names := read_table(paths[0]).names):
-        known = {"variance_real", "variance_imag", "covariance_real_imag"}
-        for column in names:
+    """Return the measured frequency response in one file or several.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        One table that states variances, or tables of points: sweeps of one response.
+    dt_s : float
+        Sampling time of the controller, s.
+    level : float
+        Confidence level of the ellipses.
+    pool_neighbours, outlier_threshold
+        Of repeats, see `FrfRepeats.mean`.
+
+    Returns
+    -------
+    FrequencyUncertainty or FrfRepeats
+        The points themselves where each frequency is measured once, so that the spread is not known.
+
+    Raises
+    ------
+    ValueError
+        Naming the file: what cannot be read, or a column that seems to state the spread under another name.
+    """
+    if len(paths) == 1:
+        names = read_table(paths[0]).names
+        if "variance_real" in names:
             # A covariance under another name would be left out in silence, and the ellipses be wrong.
-            if column not in known and ("covar" in column.lower() or "varian" in column.lower()):
-                raise ValueError(
-                    f"{paths[0]}, line 1: unknown column {column!r}; the spread stands in "
-                    f"{', '.join(sorted(known))}"
-                )
-        return FrequencyUncertainty.from_csv(paths[0], dt_s, level=level)
+            for name in names:
+                states_spread = "covar" in name.lower() or "varian" in name.lower()
+                if states_spread and name not in SPREAD_COLUMNS:
+                    raise ValueError(
+                        f"{paths[0]}, line 1: unknown column {name!r}; the spread stands in "
+                        f"{', '.join(SPREAD_COLUMNS)}"
+                    )
+            return FrequencyUncertainty.from_csv(paths[0], dt_s, level=level)
+
     sweeps = [FrfRepeats.from_csv(path) for path in paths]
-    omega, response = (
-        np.concatenate([getattr(one, name) for one in sweeps]) for name in ("omega_rad_s", "response")
-    )
-    found = FrfRepeats(omega, response)
+    omega = np.concatenate([sweep.omega_rad_s for sweep in sweeps])
+    response = np.concatenate([sweep.response for sweep in sweeps])
+    points = FrfRepeats(omega, response)
     if np.unique(omega).size == omega.size:
-        return found
-    return found.mean(dt_s, level=level, pool_neighbours=pool_neighbours, outlier_threshold=outlier_threshold)
+        return points
+    return points.mean(
+        dt_s, level=level, pool_neighbours=pool_neighbours, outlier_threshold=outlier_threshold
+    )
 
 
 def _too_few(grid: RealArray, count: IntArray, freedom: IntArray) -> str:
-    """What is missing for a covariance, and only what mends it."""
-    spread = "give variance_real, variance_imag or a stated uncertainty"
+    """Return what is missing for a covariance at every frequency, and only what mends it.
+
+    grid: frequencies (F,), rad/s; count: repeats (F,); freedom: degrees of freedom (F,), somewhere below 2.
+    """
+    state_spread = "give variance_real, variance_imag or a stated uncertainty"
     if np.all(count == 1):
-        return f"one sweep: every frequency is measured once, so its spread is not known; {spread}"
-    at = int(np.argmax(freedom < 2))
-    times = "is 1 measurement" if count[at] == 1 else f"are {count[at]} repeats"
-    text = f"at omega = {grid[at]:.6g} rad/s there {times}: a 2x2 covariance needs at least 3"
+        return f"one sweep: every frequency is measured once, so its spread is not known; {state_spread}"
+    first = int(np.argmax(freedom < FEWEST_DEGREES))
+    times = "is 1 measurement" if count[first] == 1 else f"are {count[first]} repeats"
+    complaint = f"at omega = {grid[first]:.6g} rad/s there {times}: a 2x2 covariance needs at least 3"
+
     # The fewest neighbours whose repeats suffice everywhere, each frequency giving one less than it has.
-    for m in range(1, _MOST_NEIGHBOURS + 1):
-        sums = np.convolve(count - 1, np.ones(2 * m + 1, dtype=np.int64))[m:-m]
-        if np.all(sums >= 2):
-            return f"{text}, or pool_neighbours = {m}"
-    return f"{text}; {spread}"
+    for neighbours in range(1, MOST_NEIGHBOURS + 1):
+        window = np.ones(2 * neighbours + 1, dtype=np.int64)
+        pooled_freedom = np.convolve(count - 1, window)[neighbours:-neighbours]
+        if np.all(pooled_freedom >= FEWEST_DEGREES):
+            return f"{complaint}, or pool_neighbours = {neighbours}"
+    return f"{complaint}; {state_spread}"
 
 
 def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
-    """Points within `threshold` robust standard deviations of the median, in one pass: repeated, it shrinks
-    by chance."""
-    distance = np.abs(points - (np.median(points.real) + 1j * np.median(points.imag)))
-    # The median distance of a circular Gaussian cloud (Rayleigh) is 1.1774 standard deviations.
-    spread = float(np.median(distance)) / 1.1774
-    return points[distance <= threshold * spread] if spread > 0 else points
+    """Return the points within so many robust standard deviations of their median.
+
+    Parameters
+    ----------
+    points : ndarray, shape (K,)
+        Complex repeats of one frequency.
+    threshold : float
+        In standard deviations of one coordinate, estimated by the median distance from the median.
+
+    Returns
+    -------
+    ndarray, shape (L,)
+        All points where half of them are equal. In one pass: repeated, the cloud shrinks by chance.
+    """
+    median = np.median(points.real) + 1j * np.median(points.imag)
+    distance = np.abs(points - median)
+    spread = float(np.median(distance)) / RAYLEIGH_MEDIAN
+    if not spread > 0:
+        return points
+    is_near = distance <= threshold * spread
+    return points[is_near]
 
 
 def _pooled(
-    scatter: RealArray, freedom: IntArray, centre: ComplexArray, m: int
+    scatter: RealArray, freedom: IntArray, centre: ComplexArray, neighbours: int
 ) -> tuple[RealArray, IntArray]:
-    """Sums over m neighbours on either side of scatter relative to the centre, turned back to each centre."""
+    """Return the scatter (F, 2, 2) and the degrees of freedom (F,) of each frequency and its neighbours.
+
+    scatter: sums of squares and products about each centre (F,), complex. They are added up relative to the
+    response, as a gain error scatters it everywhere alike, and turned back to each centre. neighbours: on
+    either side; fewer at the ends. Raises ValueError where a centre is zero.
+    """
     if np.any(centre == 0):
         raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")
     rotation = factor_matrices(centre)
     inverse = np.linalg.inv(rotation)
     relative = inverse @ scatter @ inverse.transpose(0, 2, 1)
-    totals, degrees = np.empty_like(relative), np.empty_like(freedom)
+    total = np.empty_like(relative)
+    total_freedom = np.empty_like(freedom)
     for index in range(centre.size):
-        window = slice(max(0, index - m), index + m + 1)
-        totals[index], degrees[index] = relative[window].sum(axis=0), freedom[window].sum()
-    return rotation @ totals @ rotation.transpose(0, 2, 1), degrees
+        window = slice(max(0, index - neighbours), index + neighbours + 1)
+        total[index] = relative[window].sum(axis=0)
+        total_freedom[index] = freedom[window].sum()
+    return rotation @ total @ rotation.transpose(0, 2, 1), total_freedom

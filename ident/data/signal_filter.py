@@ -1,5 +1,11 @@
-"""Fitting inside a frequency band: the same filter on input and output leaves the model, and removes the
-rest."""
+"""Fitting inside a frequency band: one filter on input and output leaves the model and removes the rest.
+
+A linear plant and a linear filter commute, so that a record whose signals all went through one filter has the
+same response; noise, drift and dynamics outside of the band count less in a fit of it (Ljung, System
+Identification, 2nd ed., section 14.4). `band_limited` applies a Butterworth filter, `increments` takes
+differences, which whitens slow noise. `band_edges` checks a band, `settling_time_s` says how long the
+filter's own start is seen. Assumed: that start is skipped, or the fit has an unknown initial state.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +17,9 @@ import numpy as np
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 
+# Time constants of the filter's slowest pole after which its start is gone: to e^-5, .7 %.
+SETTLED_TIME_CONSTANTS = 5
+
 
 def band_limited(
     record: Record,
@@ -20,43 +29,86 @@ def band_limited(
     filter_order: int = 2,
     skip_s: float = 0.0,
 ) -> Record:
-    """Filter input, output and reference with one Butterworth filter; drop the first `skip_s` seconds.
+    """Return the record with input, output and reference through one Butterworth filter.
 
-    A fit of the result is weighted to the band; None leaves a side open. The filter starts with its steady
-    state for the first sample, so that a lightly damped plant not at rest needs an unknown initial state in
-    the fit. Raises ValueError if the band is empty or leaves (0, pi/dt), both sides are None, or nothing is
-    left after `skip_s`.
+    Parameters
+    ----------
+    record : Record
+    low_rad_s, high_rad_s : float, optional
+        Edges of the band, rad/s (3 dB); None leaves a side open.
+    filter_order : int
+        Of a low-pass or high-pass filter; a band-pass filter has twice as many poles.
+    skip_s : float
+        Time that is left out at the start, s.
+
+    Returns
+    -------
+    Record
+        A fit of it is weighted to the band.
+
+    Raises
+    ------
+    ValueError
+        The band is empty or leaves (0, pi/dt), both sides are None, or nothing is left after `skip_s`.
+
+    Notes
+    -----
+    The filter starts with its steady state for the first sample, so that a lightly damped plant not at rest
+    needs an unknown initial state in the fit.
     """
     import scipy.signal  # half a second that logs which are refused do not need
 
-    low, high = low_rad_s, high_rad_s
-    edges = band_edges(record.dt_s, low, high)
-    skip = round(skip_s / record.dt_s)
-    if not 0 <= skip < record.n_samples:
+    edges = band_edges(record.dt_s, low_rad_s, high_rad_s)
+    n_skipped = round(skip_s / record.dt_s)
+    if not 0 <= n_skipped < record.n_samples:
         raise ValueError(f"{record.label}: skip_s = {skip_s} leaves nothing of {record.n_samples} samples")
-    kind: Literal["bandpass", "lowpass", "highpass"] = (
-        "lowpass" if low is None else "highpass" if high is None else "bandpass"
-    )
-    sections = scipy.signal.butter(
-        filter_order, edges if len(edges) == 2 else edges[0], kind, output="sos", fs=2 * np.pi / record.dt_s
-    )
-    settled = scipy.signal.sosfilt_zi(sections)
 
-    def filtered(signal: RealArray) -> RealArray:
-        columns = [scipy.signal.sosfilt(sections, x, zi=settled * x[0])[0] for x in signal.T]
-        return np.column_stack(columns)[skip:]
+    kind: Literal["bandpass", "lowpass", "highpass"]
+    if low_rad_s is None:
+        kind = "lowpass"
+    elif high_rad_s is None:
+        kind = "highpass"
+    else:
+        kind = "bandpass"
+    corner = edges if len(edges) == 2 else edges[0]
+    sampling_rad_s = 2 * np.pi / record.dt_s
+    sections = scipy.signal.butter(filter_order, corner, kind, output="sos", fs=sampling_rad_s)
+    # The filter's state once a constant input of 1 has settled; it scales with the input.
+    steady_state_of_one = scipy.signal.sosfilt_zi(sections)
+
+    def filtered(signals: RealArray) -> RealArray:
+        """Return filtered signals, columns of (T, C), without the samples that are skipped."""
+        columns = []
+        for signal in signals.T:
+            column, _ = scipy.signal.sosfilt(sections, signal, zi=steady_state_of_one * signal[0])
+            columns.append(column)
+        return np.column_stack(columns)[n_skipped:]
 
     return record.each(filtered)
 
 
 def band_edges(dt_s: float, low_rad_s: float | None, high_rad_s: float | None) -> list[float]:
-    """The one or two edges [rad/s] that a band has. Raises ValueError if both are None, or the band is empty
-    or leaves (0, pi/dt_s)."""
+    """Return the one or two edges, rad/s, that a band has, lower first.
+
+    Parameters
+    ----------
+    dt_s : float
+        Sampling time, s.
+    low_rad_s, high_rad_s : float or None
+        None where the side is open.
+
+    Raises
+    ------
+    ValueError
+        Both sides are None, or the band is empty or leaves (0, pi/dt_s).
+    """
     if low_rad_s is None and high_rad_s is None:
         raise ValueError("a band needs a lower or an upper frequency")
     nyquist = np.pi / dt_s
     edges = [edge for edge in (low_rad_s, high_rad_s) if edge is not None]
-    if not all(a < b for a, b in pairwise([0.0, *edges, nyquist])):
+    ascending = [0.0, *edges, nyquist]
+    # NaN compares as false, and is refused.
+    if not all(lower < upper for lower, upper in pairwise(ascending)):
         raise ValueError(
             f"the band must lie in (0, {nyquist:.6g}) rad/s, lower below upper; got {low_rad_s} to "
             f"{high_rad_s}"
@@ -65,19 +117,33 @@ def band_edges(dt_s: float, low_rad_s: float | None, high_rad_s: float | None) -
 
 
 def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float) -> float:
-    """Time after which the start of `band_limited` (order 2) has died down to e^-5: before, it looks like
-    a mode at the edge."""
-    import scipy.signal
+    """Return the time, s, after which the start of `band_limited` (order 2) has died down to e^-5.
+
+    Parameters
+    ----------
+    dt_s : float
+        Sampling time, s.
+    low_rad_s, high_rad_s : float
+        Edges of the band, rad/s.
+
+    Notes
+    -----
+    By the slowest pole of the filter. Before, its start looks like a mode at the edge of the band.
+    """
+    import scipy.signal  # as above
 
     _, poles, _ = scipy.signal.butter(
         2, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
     )
-    return float(-5 * dt_s / np.log(np.abs(poles).max()))
+    log_radius = np.log(np.abs(poles).max())
+    return float(-SETTLED_TIME_CONSTANTS * dt_s / log_radius)
 
 
 def increments(record: Record) -> Record:
-    """The record through 1 - q^-1, one sample shorter: the same response, slow noise whitened. ValueError for
-    one sample."""
+    """Return the record through 1 - q^-1, one sample shorter: the same response, slow noise whitened.
+
+    Raises ValueError for a record of one sample.
+    """
     if record.n_samples < 2:
         raise ValueError(f"{record.label}: differences need at least two samples")
     return record.each(lambda signal: np.diff(signal, axis=0))
