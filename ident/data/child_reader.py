@@ -45,8 +45,9 @@ LONGEST_FIELD = 256
 LONGEST_TEXT = 32
 # Kinds of numpy arrays that hold real numbers: floats, signed and unsigned integers, booleans.
 NUMBER_KINDS = "fiub"
-# Exit codes: the file is refused; the library that reads it is not installed.
+# Exit code where the file is refused, or damaged.
 REFUSED = 2
+# Exit code where the library that reads it is not installed.
 NO_LIBRARY = 3
 
 

@@ -44,8 +44,9 @@ READERS: dict[str, Reader] = {}
 
 # What a text file of GNU Octave begins with (its default format, which is no table).
 OCTAVE_TEXT = re.compile(rb"\s*# (Created by Octave|name: .*\r?\n# type: )")
-# A MATLAB file of version 7.3 is an HDF5 file, whose signature stands within its first bytes.
+# A MATLAB file of version 7.3 is an HDF5 file, which begins with this.
 HDF5_SIGNATURE = b"\x89HDF\r\n"
+# First bytes of a MATLAB file in which the signature is looked for: text of 512 bytes may stand before it.
 SIGNATURE_WITHIN_BYTES = 1024
 
 # A column of text that is filled in at most this share of the rows may have rows of its own: signals logged
