@@ -89,20 +89,17 @@ def test_to_control_and_round_trip(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"omega_rad_s": [1.0, 3.0, 2.0]}, "strictly increasing.*omega = 2"),
-        ({"omega_rad_s": [1.0, 2.0, 400.0]}, r"above pi / dt_s.*omega = 400"),
-        ({"omega_rad_s": [-1.0, 2.0, 4.0]}, "negative"),
-        ({"omega_rad_s": [1.0, np.nan, 4.0]}, "not finite"),
-        ({"centre": [1.0, np.inf, 1.0]}, r"centre is not finite.*omega = 2"),
-        (
-            {"covariance": [np.eye(2), np.diag([1.0, -1.0]), np.eye(2)]},
-            r"not positive semidefinite.*omega = 2",
-        ),
-        ({"covariance": [np.eye(2), [[1, 2], [2, 1]], np.eye(2)]}, "not positive semidefinite"),
-        ({"covariance": [np.eye(2), [[1, 0.2], [0, 1]], np.eye(2)]}, "not symmetric"),
-        ({"covariance": [np.eye(2)]}, "need omega"),
-        ({"dt_s": 0.0}, "dt_s"),
-        ({"level": 1.0}, "confidence level"),
+        ({"omega_rad_s": [1.0, 3.0, 2.0]}, "increasing.*omega = 2"),
+        ({"omega_rad_s": [1.0, 2.0, 400.0]}, r"314\.159 rad/s.*omega = 400"),
+        ({"omega_rad_s": [-1.0, 2.0, 4.0]}, "negative.*omega = -1"),
+        ({"omega_rad_s": [1.0, np.nan, 4.0]}, "omega .*finite.*omega = nan"),
+        ({"centre": [1.0, np.inf, 1.0]}, r"centre .*finite.*omega = 2"),
+        ({"covariance": [np.eye(2), np.diag([1.0, -1.0]), np.eye(2)]}, "semidefinite.*omega = 2"),
+        ({"covariance": [np.eye(2), [[1, 2], [2, 1]], np.eye(2)]}, "semidefinite.*omega = 2"),
+        ({"covariance": [np.eye(2), [[1, 0.2], [0, 1]], np.eye(2)]}, "symmetric.*omega = 2"),
+        ({"covariance": [np.eye(2)]}, r"\(1, 2, 2\)"),
+        ({"dt_s": 0.0}, "dt_s .*0.0"),
+        ({"level": 1.0}, "level .*1.0"),
     ],
 )
 def test_bad_input_is_refused_in_one_line(change, message):
@@ -118,15 +115,15 @@ HEADER = "omega_rad_s,real,imag,variance_real,variance_imag,covariance_real_imag
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        (HEADER + "1,1,0,1,1,0\n2,1,x,1,1,0\n", "line 3: column 'imag' is 'x'; expected a finite number"),
-        (HEADER + "1,1,nan,1,1,0\n", "line 2: column 'imag' is 'nan'; expected a finite number"),
-        (HEADER + "1,1,0,-1,1,0\n", "line 2: a variance is negative"),
-        (HEADER + "1,1,0,1,1,2\n", "not positive semidefinite"),
-        (HEADER + "2,1,0,1,1,0\n1,1,0,1,1,0\n", "strictly increasing"),
-        (HEADER + "1,1,0\n", "line 2: 3 cells where line 1 has 6"),
+        (HEADER + "1,1,0,1,1,0\n2,1,x,1,1,0\n", "line 3: .*'imag' .*'x'"),
+        (HEADER + "1,1,nan,1,1,0\n", "line 2: .*'imag' .*'nan'"),
+        (HEADER + "1,1,0,-1,1,0\n", "line 2: .*variance .*negative"),
+        (HEADER + "1,1,0,1,1,2\n", "semidefinite.*omega = 1"),
+        (HEADER + "2,1,0,1,1,0\n1,1,0,1,1,0\n", "increasing.*omega = 1"),
+        (HEADER + "1,1,0\n", "line 2: 3 cells .*line 1 has 6"),
         (HEADER, "no rows"),
-        ("omega_rad_s,real\n1,2\n", "no column 'imag'; the file has omega_rad_s, real"),
-        ("real,imag\n1,2\n", "exactly one of the columns"),
+        ("omega_rad_s,real\n1,2\n", "'imag'.*omega_rad_s, real"),
+        ("real,imag\n1,2\n", "exactly one of the columns .*omega_rad_s"),
     ],
 )
 def test_csv_errors_name_file_and_place(tmp_path, text, message):

@@ -36,8 +36,8 @@ def test_file_in_either_form_gives_the_same_points(tmp_path):
 def test_bad_files_are_named_in_one_line(tmp_path):
     path = tmp_path / "bad.csv"
     for text, complaint in (
-        ("omega_rad_s,real\n1,2\n", "line 1: need one of"),
-        ("omega_rad_s,real,imag\n1,2,x\n", "line 2: column 'imag' is 'x'"),
+        ("omega_rad_s,real\n1,2\n", "line 1: "),
+        ("omega_rad_s,real,imag\n1,2,x\n", "line 2: .*'imag' .*'x'"),
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=complaint) as error:
@@ -49,14 +49,28 @@ def test_bad_files_are_named_in_one_line(tmp_path):
 def test_label_must_exist(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("omega_rad_s,real,imag\n1,2,3\n")
-    with pytest.raises(ValueError, match="missing column date"):
+    with pytest.raises(ValueError, match=r"date.*'omega_rad_s', 'real', 'imag'"):
         FrfRepeats.from_csv(path, label="date")
-    with pytest.raises(ValueError, match="no point is labelled 'b'"):
+    with pytest.raises(ValueError, match="'b'"):
         FrfRepeats.from_csv(path).only("b")
-    with pytest.raises(ValueError, match="no measured point is left"):
+    with pytest.raises(ValueError, match="no measured point"):
         FrfRepeats.from_csv(path).band(5, 6)
-    with pytest.raises(ValueError, match="no such file"):
+    with pytest.raises(ValueError, match=r"none\.csv"):
         FrfRepeats.from_csv(tmp_path / "none.csv")
+
+
+def test_too_few_repeats_are_told_what_helps():
+    once = FrfRepeats(np.arange(1.0, 6.0), np.ones(5))
+    with pytest.raises(ValueError, match="variance_real"):
+        once.mean(DT)
+    # Two repeats give one degree of freedom each; with a neighbour on either side there are two at least.
+    twice = FrfRepeats(np.repeat(np.arange(1.0, 6.0), 2), np.ones(10))
+    with pytest.raises(ValueError, match=r"omega = 1 .*2 repeats.*at least 3.*pool_neighbours = 1"):
+        twice.mean(DT)
+    with pytest.raises(ValueError, match=r"pool_neighbours .*-1"):
+        twice.mean(DT, pool_neighbours=-1)
+    with pytest.raises(ValueError, match=r"outlier_threshold .*0"):
+        twice.mean(DT, outlier_threshold=0.0)
 
 
 def test_opened_loop_is_exact_and_agrees_with_the_mapped_ellipses():
@@ -109,12 +123,12 @@ def test_shared_gain_is_one_direction_of_the_posterior():
 
 
 def test_records_are_checked_and_locked():
-    with pytest.raises(ValueError, match="of one length"):
+    with pytest.raises(ValueError, match=r"\(2,\), \(3,\) and 2"):
         FrfRepeats(np.ones(2), np.ones(3), ("", ""))
     with pytest.raises(ValueError, match="finite"):
         FrfRepeats(np.array([np.nan]), np.ones(1), ("",))
     with pytest.raises(ValueError, match="read-only"):
         repeats(np.random.default_rng(5), 1).response[0] = 0
     assert isinstance(repeats(np.random.default_rng(6), 4).mean(DT), FrequencyUncertainty)
-    with pytest.raises(ValueError, match="exactly a / g"):
+    with pytest.raises(ValueError, match="omega = 1 rad/s"):
         FrfRepeats(np.ones(1), np.array([0.5]), ("",)).open_loop(1.0, 2.0)

@@ -119,13 +119,16 @@ def test_coherence_is_the_share_of_linear_power():
 
 def test_bad_input_is_refused():
     u = np.random.default_rng(6).standard_normal(50)
-    with pytest.raises(ValueError, match="at least one record"):
+    with pytest.raises(ValueError, match="record"):
         empirical_frf([])
-    with pytest.raises(ValueError, match="must be alike"):
+    with pytest.raises(ValueError, match=r"40 samples at 0.01 s.*50 at 0.01 s"):
         empirical_frf([record(u, u), record(u[:40], u[:40])])
-    with pytest.raises(ValueError, match="at least three lines"):
+    with pytest.raises(ValueError, match="half_width_lines >= 1"):
         empirical_frf([record(u, u)], half_width_lines=0)
-    with pytest.raises(ValueError, match="no averaging width"):
+    with pytest.raises(ValueError, match=r"half_width_lines .*-1"):
+        empirical_frf([record(u, u)], half_width_lines=-1)
+    with pytest.raises(ValueError, match=r"5 lines .*1000"):
         empirical_frf([record(u, u)], omega_min_rad_s=1000.0)
-    with pytest.raises(ValueError, match="do not excite"):
+    # Five lines of half a second: the first is 2 pi / 0.5 s.
+    with pytest.raises(ValueError, match=r"omega = 12\.5664 rad/s"):
         empirical_frf([record(np.zeros(50), u)])

@@ -32,11 +32,17 @@ def read(path, **kwargs):
 
 
 def complaint(path, **kwargs):
+    """The one line of the error, which names the file."""
     with pytest.raises(ValueError) as caught:
         read(path, **kwargs)
     message = str(caught.value)
     assert "\n" not in message
+    assert str(path) in message
     return message
+
+
+def names_all(message, *facts) -> bool:
+    return all(str(fact) in message for fact in facts)
 
 
 def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
@@ -52,38 +58,38 @@ def test_time_need_not_start_at_zero_and_may_jitter(tmp_path):
 def test_dt_can_be_given_instead_of_or_beside_time(good):
     assert read(good, time=None, dt_s=0.5).dt_s == 0.5
     assert read(good, dt_s=0.01).dt_s == 0.01
-    assert "dt_s = 0.02 s, but the time column 't_s' steps by 0.01 s" in complaint(good, dt_s=0.02)
-    assert "give the time column or dt_s" in complaint(good, time=None)
+    assert names_all(complaint(good, dt_s=0.02), "dt_s", "'t_s'", 0.01, 0.02)
+    assert names_all(complaint(good, time=None), "--time", "--dt-s", U, Y)
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -1.0, np.nan, np.inf])
 def test_dt_must_be_positive(good, dt_s):
-    assert f"{good}: dt_s must be a positive number of seconds" in complaint(good, time=None, dt_s=dt_s)
+    assert names_all(complaint(good, time=None, dt_s=dt_s), "dt_s", dt_s)
 
 
 HEAD = f"{T},{U},{Y}"
-# What is wrong with the lines of a log, and what the one line of the complaint must say.
+# What is wrong with the lines of a log, and the place and the facts that the complaint must name.
 FAULTS = {
     **{
         f"{text or 'empty'} for a number": (
             [HEAD, *rows(3), f"0.03,{text},1.5", *rows(2, start=4)],
-            [f"log.csv, line 5: column 'u_V' is {shown}; expected a finite number"],
+            ["line 5", "'u_V'", shown],
         )
         for text, shown in (
             *(("nan", "'nan'"), ("inf", "'inf'"), ("-Infinity", "'-Infinity'")),
             ("", "empty"),
         )
     },
-    "blank line": ([HEAD, *rows(3), "", *rows(3, start=3)], ["log.csv, line 5: column 't_s' is empty"]),
-    "short row": ([HEAD, *rows(3), "0.03,1", *rows(2, start=4)], ["line 5: column 'y_rad' is empty"]),
-    "long row": ([HEAD, *rows(3), "0.03,1,2,3", *rows(2, start=4)], ["line 5: 4 cells where line 1 has 3"]),
+    "blank line": ([HEAD, *rows(3), "", *rows(3, start=3)], ["line 5", "'t_s'", "empty"]),
+    "short row": ([HEAD, *rows(3), "0.03,1", *rows(2, start=4)], ["line 5", "'y_rad'", "empty"]),
+    "long row": ([HEAD, *rows(3), "0.03,1,2,3", *rows(2, start=4)], ["line 5", "4 cells", "line 1 has 3"]),
     "time stands still": (
         [HEAD, *rows(4), "0.030000,1,2", *rows(1, start=5)],
-        ["log.csv, line 6: time 't_s' goes from 0.03 to 0.03 s", "expected increasing time"],
+        ["line 6", "'t_s'", "from 0.03 to 0.03 s"],
     ),
     "repeated name": (
         [f"{T},{U},{U},{Y}", "0,1,2,3", "1,2,3,4"],
-        ["several columns 'u_V'; the file has #1 u_V, #2 u_V"],
+        ["'u_V'", "#1 u_V, #2 u_V"],
     ),
     "nothing": ([""], []),
     "blank lines only": (["", ""], []),
@@ -94,27 +100,39 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_faulty_log_is_one_line_with_file_and_place(tmp_path, fault):
-    lines, words = FAULTS[fault]
-    message = complaint(write(tmp_path / "log.csv", lines))
-    for word in (str(tmp_path / "log.csv"), *words):
-        assert word in message
+    lines, facts = FAULTS[fault]
+    assert names_all(complaint(write(tmp_path / "log.csv", lines)), *facts)
 
 
 def test_one_column_is_not_two_things(good):
-    with pytest.raises(ValueError, match="as input and output"):
+    with pytest.raises(ValueError, match=f"'{U}' .*input.*output"):
         Record.from_file(good, [U], [U], time=T)
-    with pytest.raises(ValueError, match="as time and as a signal"):
+    with pytest.raises(ValueError, match=f"'{T}' .*time.*signal"):
         Record.from_file(good, [T], [Y], time=T)
 
 
 def test_paths_that_are_not_there(tmp_path):
-    assert complaint(tmp_path / "no.csv") == f"{tmp_path / 'no.csv'}: no such file"
-    assert complaint(tmp_path) == f"{tmp_path}: not a file"
+    assert "no such file" in complaint(tmp_path / "no.csv")
+    assert "not a file" in complaint(tmp_path)
 
 
 def test_one_string_is_not_a_list_of_columns(good):
-    with pytest.raises(ValueError, match="must be a list of column names"):
+    with pytest.raises(ValueError, match=f"inputs .*list.*'{U}'"):
         Record.from_file(good, U, [Y], time=T)
+
+
+def test_a_statement_about_a_column_that_is_not_used_is_refused(good):
+    for statement in ("scale", "offset", "units", "unwrap"):
+        assert "'u_v'" in complaint(good, **{statement: {"u_v": 1.0}})
+
+
+def test_a_table_of_several_runs_asks_for_one_of_them(tmp_path):
+    lines = [f"{T},{U},{Y},run", *(f"{row},{run}" for run in (3, 4) for row in rows())]
+    path = write(tmp_path / "log.csv", lines)
+    assert names_all(complaint(path), "2 runs", "run 3", "run 4", "run = 0 to 1")
+    assert "run = 0 to 1" in complaint(path, run=2)
+    second = read(path, run=1)
+    assert (second.n_samples, second.name) == (6, "log, run 4")
 
 
 def arrays():
@@ -124,14 +142,14 @@ def arrays():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({U: np.array([1, -1, np.nan, 1, 2, 3])}, "index 2: column 'u_V' is nan; expected a finite number"),
-        ({U: np.arange(6) + 1j}, "'u_V' holds complex128; expected real numbers"),
-        ({U: np.array(list("abcdef"))}, "expected real numbers"),
-        ({U: np.ones((6, 2))}, r"no column 'u_V'; the file has u_V\[0\], u_V\[1\]"),
-        ({U: np.arange(5.0)}, "equally long"),
+        ({U: np.array([1, -1, np.nan, 1, 2, 3])}, "index 2: .*'u_V' .*nan"),
+        ({U: np.arange(6) + 1j}, "'u_V' .*complex128"),
+        ({U: np.array(list("abcdef"))}, "'u_V' .*text"),
+        ({U: np.ones((6, 2))}, r"'u_V'.* u_V\[0\], u_V\[1\]"),
+        ({U: np.arange(5.0)}, "'u_V': 5"),
     ],
 )
-def test_bad_npz_content(tmp_path, change, message):
+def test_an_archive_names_the_array_that_does_not_fit(tmp_path, change, message):
     path = tmp_path / "log.npz"
     np.savez(path, **(arrays() | change))
     with pytest.raises(ValueError, match=message):
@@ -141,10 +159,10 @@ def test_bad_npz_content(tmp_path, change, message):
 def test_files_of_another_kind(tmp_path, good):
     np.save(tmp_path / "one.npy", np.arange(3.0))
     for source, name, message in (
-        (good, "csv.npz", "not a numpy .npz archive"),
-        (good, "csv.mat", "not a MATLAB .mat file"),
-        (tmp_path / "one.npy", "npy.npz", "not a numpy .npz archive"),
-        (good, "log.docx", "unknown kind of file '.docx'; expected one of .csv"),
+        (good, "csv.npz", r"csv\.npz: .*\.npz"),
+        (good, "csv.mat", r"csv\.mat: .*\.mat"),
+        (tmp_path / "one.npy", "npy.npz", r"npy\.npz: .*\.npz"),
+        (good, "log.docx", r"'\.docx'.* \.csv"),
     ):
         path = tmp_path / name
         path.write_bytes(source.read_bytes())
@@ -181,25 +199,25 @@ def test_siso_and_slice():
     part = record.slice(1, 3)
     np.testing.assert_array_equal(part.input[:, 0], [3, 5])
     assert part.reference.shape == (2, 1)
-    with pytest.raises(ValueError, match="no input column 'z'; there is"):
+    with pytest.raises(ValueError, match=r"input .*'z'.*'a', 'b'"):
         two_by_two().siso("z", "e")
-    with pytest.raises(ValueError, match="0 <= start < stop <= 4"):
+    with pytest.raises(ValueError, match=r"2 to 2: .*4"):
         record.slice(2, 2)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dt_s": 0.0}, "dt_s must be a positive"),
-        ({"input": np.arange(8.0)}, r"input must be \(T, 2\)"),
-        ({"output": np.zeros((3, 3))}, "equally long"),
-        ({"output": np.full((4, 3), np.inf)}, "output column 'c' is inf at index 0"),
-        ({"output": np.full((4, 3), -1e200)}, r"output column 'c' is -1e\+200 at index 0; .*unit"),
-        ({"input_names": ("a", "a")}, "distinct"),
-        ({"reference": None}, "without a reference"),
-        ({"output_units": ("rad",)}, "one per column"),
+        ({"dt_s": 0.0}, "dt_s .*0.0"),
+        ({"input": np.arange(8.0)}, r"input .*\(T, 2\).*\(8,\)"),
+        ({"output": np.zeros((3, 3))}, "output has 3 samples .*4"),
+        ({"output": np.full((4, 3), np.inf)}, "output .*'c' is inf at index 0"),
+        ({"output": np.full((4, 3), -1e200)}, r"output .*'c' is -1e\+200 at index 0"),
+        ({"input_names": ("a", "a")}, r"input .*\['a', 'a'\]"),
+        ({"reference": None}, "reference_names"),
+        ({"output_units": ("rad",)}, r"output_units .*\('rad',\)"),
     ],
 )
-def test_bad_records_are_refused(change, message):
+def test_a_record_names_what_does_not_fit(change, message):
     with pytest.raises(ValueError, match=message):
         two_by_two(**change)

@@ -38,11 +38,11 @@ def test_gain_is_one_inside_and_small_outside(low, high):
 @pytest.mark.parametrize(
     ("band", "message"),
     [
-        ({}, "needs a lower or an upper"),
-        ({"low_rad_s": 30.0, "high_rad_s": 20.0}, "lower below upper"),
-        ({"high_rad_s": 700.0}, "must lie in"),
-        ({"low_rad_s": -1.0}, "must lie in"),
-        ({"low_rad_s": 1.0, "skip_s": 100.0}, "leaves nothing"),
+        ({}, "lower or an upper"),
+        ({"low_rad_s": 30.0, "high_rad_s": 20.0}, "30.0 to 20.0"),
+        ({"high_rad_s": 700.0}, r"628\.319.*700"),
+        ({"low_rad_s": -1.0}, r"628\.319.*-1"),
+        ({"low_rad_s": 1.0, "skip_s": 100.0}, "skip_s = 100.* 100 samples"),
     ],
 )
 def test_bad_bands_are_refused(band, message):
@@ -58,5 +58,5 @@ def test_increments_are_differences_of_every_signal():
     np.testing.assert_array_equal(found.output[:, 0], [1, 3, 5, 7, 9])
     np.testing.assert_array_equal(found.input[:, 0], [1, -1, 1, 0, -1])
     np.testing.assert_array_equal(found.reference, 2 * found.input)
-    with pytest.raises(ValueError, match="at least two samples"):
+    with pytest.raises(ValueError, match="two samples"):
         increments(record.slice(0, 1))

@@ -67,24 +67,23 @@ def test_readings_on_the_grid_stay_as_they_are_and_inputs_lie_between(tmp_path):
 def test_stamps_that_are_no_jitter_are_refused_with_their_row(tmp_path):
     even = DT_S * np.arange(400)
 
-    def said_of(time) -> str:
+    def complaint(time) -> str:
         with pytest.raises(ValueError) as caught:
             TimeGrid.of(table_of(tmp_path, time), "t", time)
         return str(caught.value)
 
     late = even.copy()
     late[50] += 0.3 * DT_S
-    assert "log.csv, line 52: time 't' is 0.30 of a step of 0.004 s off a uniform grid" in said_of(late)
-    assert "--repair takes 0.2: --resample-s 0.02" in said_of(late)
-    assert TimeGrid.of(table_of(tmp_path, even), "t", np.delete(even, range(70, 75))).missing == tuple(
-        range(70, 75)
-    )
-    gap = said_of(np.delete(even, range(70, 76)))
-    assert "line 72" in gap
-    assert "at most 5 rows" in gap
-    assert "line 202: time 't' goes from 0.796 to 0 s" in said_of(np.concatenate([even[:200], even[:200]]))
-    rare = said_of(np.delete(even, range(5, 400, 15)))
-    assert "27 of 400 rows are missing" in rare
+    for fact in ("log.csv, line 52", "'t'", "0.30 of a step of 0.004 s", "--resample-s 0.02"):
+        assert fact in complaint(late)
+    five_lost = np.delete(even, range(70, 75))
+    grid = TimeGrid.of(table_of(tmp_path, even), "t", five_lost)
+    assert grid.missing == tuple(range(70, 75))
+    for fact in ("line 72", "5 rows"):
+        assert fact in complaint(np.delete(even, range(70, 76)))
+    for fact in ("line 202", "'t'", "from 0.796 to 0 s"):
+        assert fact in complaint(np.concatenate([even[:200], even[:200]]))
+    assert "27 of 400 rows" in complaint(np.delete(even, range(5, 400, 15)))
 
 
 def clock(kind: str) -> np.ndarray:
@@ -175,7 +174,7 @@ def test_resampling_is_on_request_and_says_its_bounds(tmp_path):
     for wrong in (0.001, 100.0):
         with pytest.raises(ValueError, match=r"resample_s = .* try --resample-s 0\.02"):
             read(resample_s=wrong)
-    with pytest.raises(ValueError, match="needs a time column"):
+    with pytest.raises(ValueError, match=r"resample_s .* time column"):
         Record.from_file(path, ["u"], ["y"], dt_s=0.004, resample_s=0.02)
 
 

@@ -158,10 +158,10 @@ def test_a_record_says_it_and_unwraps_on_request_before_it_scales():
 @pytest.mark.parametrize(
     ("unwrap", "words"),
     [
-        ({"enc": 1000}, "spans 4092, more than the 1000 at which it is said to wrap"),
-        ({"enc": 0}, "wraps at a positive number"),
-        ({"enc": float("nan")}, "wraps at a positive number"),
-        ({"t": 360}, "which is not used as a signal"),
+        ({"enc": 1000}, "'enc' .*4092.*1000"),
+        ({"enc": 0}, "'enc' .*positive.*0"),
+        ({"enc": float("nan")}, "'enc' .*positive.*nan"),
+        ({"t": 360}, "'t'"),
     ],
 )
 def test_a_period_that_cannot_be_is_refused(unwrap, words):
