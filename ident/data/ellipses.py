@@ -77,6 +77,7 @@ def chi2_radius(level: float) -> float:
     """
     if not 0 < level < 1:
         raise ValueError(f"a confidence level lies between 0 and 1; got {level}")
+    # With two degrees of freedom the distribution is exponential, and its quantile -2 ln(1 - level).
     return float(np.sqrt(-2 * np.log1p(-level)))
 
 
@@ -119,6 +120,7 @@ def standard_axes(covariance: RealArray) -> StandardAxes:
     r = variance_re / unit
     i = variance_im / unit
     c = cross / unit
+    # Eigenvalues lie on either side of their mean; the determinant is their product.
     larger = 0.5 * (r + i) + np.hypot(0.5 * (r - i), c)
     smaller = np.divide(r * i - c * c, larger, out=np.zeros_like(larger), where=larger > 0)
     angle = 0.5 * np.arctan2(2 * c, r - i)
@@ -182,6 +184,7 @@ def ellipse_distance(offset: ComplexArray, ellipses: EllipseAxes, magnitude: Rea
     -------
     ndarray, shape (F,)
     """
+    # Turned so that the major axis is the real one.
     in_axes = offset * np.conj(ellipses.direction)
     shortest = np.maximum(ROUNDING * magnitude, np.finfo(np.float64).tiny)
     along_major = in_axes.real / np.maximum(ellipses.semi_major, shortest)
@@ -205,6 +208,7 @@ def hotelling_widening(freedom: npt.ArrayLike, level: float) -> npt.NDArray[np.f
         Of the shape of `freedom`: 2 f / (f - 1) F(2, f - 1) / chi2(2), quantiles at `level`. With it the
         chi-square ellipse of the covariance is Hotelling's.
     """
+    # T^2 of a mean with f degrees of freedom is 2 f / (f - 1) F(2, f - 1).
     f = np.asarray(freedom, dtype=np.float64)
     f_quantile = fdtri(2, f - 1, level)
     return np.asarray(2 * f / (f - 1) * f_quantile / chi2_radius(level) ** 2)

@@ -73,6 +73,7 @@ def shown(value: object, longest: int = 80) -> str:
     text = value if isinstance(value, str) else repr(value)
     # Enough is kept that blanks may shrink; a text of a gigabyte is not gone through.
     one_line = " ".join(text[: 4 * longest].split())
+    # Control characters in a file's names would act on the terminal that shows the message.
     printable = ""
     for character in one_line:
         printable += character if character.isprintable() else character.encode("unicode_escape").decode()
@@ -93,6 +94,7 @@ def as_typed(value: object) -> str:
         What a message cannot show as it is (control characters, runs of blanks, blanks that do not break) is
         written in the quotes of bash and zsh that take escapes: $'a\\tb'.
     """
+    # Messages join runs of blanks; such text could not be copied from them.
     text = str(value)
     if text.isprintable() and text == " ".join(text.split()):
         return shlex.quote(text)
@@ -176,6 +178,7 @@ def as_numbers(values: Any) -> np.ndarray[Any, np.dtype[Any]]:
         is_text = array.dtype.kind in "USO"
         content = "text" if is_text else f"{array.dtype}"
         raise ValueError(f"holds {shown(content)}; expected real numbers")
+    # Years and months have no fixed length, and durations without a unit have none that is known.
     if array.dtype.kind in INSTANT_KINDS and np.datetime_data(array.dtype)[0] in ("Y", "M", "generic"):
         raise ValueError(
             f"holds {array.dtype}, steps of no fixed length; expected instants, as datetime64[ns]"
@@ -243,6 +246,8 @@ def read_in_child(
 
     if process.returncode == 0:
         return process.stdout
+    # A negative code is the signal that ended the process: the limit of processor time, or the system where
+    # memory ran out.
     if process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
         raise ValueError(
             f": not read within {CPU_SECONDS} s of processor time, or the time and memory that this session "
@@ -279,6 +284,7 @@ def npz_arrays(content: bytes) -> dict[str, Any]:
         entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
     except (zipfile.BadZipFile, NotImplementedError, UnicodeDecodeError):
         raise ValueError("not a numpy .npz archive") from None
+    # The archive states the sizes of its entries: they are added up before anything is unpacked.
     if len(entries) < len(archive.infolist()):
         raise ValueError("damaged: a name is there twice")
     if sum(entry.file_size for entry in entries.values()) > LARGEST_BYTES:

@@ -91,6 +91,7 @@ class FrfRepeats:
         table = read_table(path)
         if label is not None and label not in table.names:
             raise ValueError(f"{table.path}, line 1: missing column {label}; found {list(table.names)}")
+        # Labels are text even where they look like numbers: a date, an amplitude.
         omega, response = read_response(table)
         if label is None:
             return cls(omega, response)
@@ -192,6 +193,7 @@ class FrfRepeats:
         for index in range(grid.size):
             is_of_frequency = group == index
             points = self.response[is_of_frequency]
+            # Outliers are left out before anything is averaged: a wild point moves the mean.
             if outlier_threshold is not None:
                 points = inliers(points, outlier_threshold)
             centre[index] = points.mean()
@@ -200,6 +202,7 @@ class FrfRepeats:
             scatter[index] = parts @ parts.T
             count[index] = points.size
 
+        # The mean takes one degree of freedom.
         freedom = count - 1
         if pool_neighbours:
             scatter, freedom = _pooled(scatter, freedom, centre, pool_neighbours)
@@ -330,6 +333,7 @@ def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
     median = np.median(points.real) + 1j * np.median(points.imag)
     distance = np.abs(points - median)
     spread = float(np.median(distance)) / RAYLEIGH_MEDIAN
+    # Half of the points or more are equal: nothing says how far the others may be.
     if not spread > 0:
         return points
     is_near = distance <= threshold * spread
@@ -347,6 +351,7 @@ def _pooled(
     """
     if np.any(centre == 0):
         raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")
+    # Division by the centre, a complex number, is a matrix on (Re, Im) that turns and scales.
     rotation = factor_matrices(centre)
     inverse = np.linalg.inv(rotation)
     relative = inverse @ scatter @ inverse.transpose(0, 2, 1)

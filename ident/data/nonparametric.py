@@ -207,6 +207,7 @@ def spectra_of(records: Sequence[Record], periodic: bool) -> Spectra:
         instrument = transform([reference[:, 0] for reference in references if reference is not None])
     else:
         instrument = input_spectra
+    # Line k of T samples has k periods in T dt.
     line_numbers = np.arange(1, input_spectra.shape[1] + 1)
     return Spectra(
         omega_rad_s=2 * np.pi * line_numbers / (first.n_samples * first.dt_s),
@@ -224,6 +225,7 @@ def _half_width(half_width_lines: int | None, n_records: int) -> int:
     Raises ValueError where it is negative, or leaves fewer than three terms (lines times records) for an
     estimate.
     """
+    # Three records give three terms in a single line; fewer need neighbouring lines.
     if half_width_lines is not None:
         half_width = half_width_lines
     elif n_records >= FEWEST_TERMS:

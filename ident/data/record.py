@@ -193,6 +193,7 @@ class Record(Shown):
                 f"{self.label}: need {expected} and one "
                 f"output, got {list(self.input_names)} and {list(self.output_names)}; choose with Record.siso"
             )
+        # A model of another sampling time would be another plant.
         if dt_s is not None and not abs(self.dt_s - dt_s) <= SAME_DT * dt_s:
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")
 
@@ -403,7 +404,8 @@ class Record(Shown):
                 signals.append(signal)
             return np.column_stack(signals)
 
-        # A stated unit counts, else the file's; of a scaled column nobody knows it.
+        # A stated unit counts, else the file's; of a scaled column nobody knows it. What the file says itself
+        # is kept beside, with the scale, to compare the logs of a set (`in_one_unit`).
         unit_of = {}
         own_units = {}
         for column in signal_names:
@@ -457,6 +459,7 @@ def _one_run(table: Table, time: str | None, run: int | None) -> Table:
     time: name of the time column; run: from 0. Raises ValueError where there are several runs and none is
     chosen, or no such run.
     """
+    # Runs are called by the column that numbers them, 'run 3'; they are chosen by their place.
     runs = table.runs(time)
     if run is None and len(runs) == 1:
         return table
@@ -539,6 +542,7 @@ def reading_notes(
         Rows left out, inputs held between their rows, units that contradict the name, numbers in brackets,
         outputs that seem to wrap, spikes, and numbers that stand for no reading.
     """
+    # Of a text file: lines that are no rows, and a last row that the file cuts.
     record = str(table.path)
     notes = list[Finding]()
     layout = table.layout
@@ -555,6 +559,7 @@ def reading_notes(
         for name in inputs:
             if not np.array_equal(table.clocks[name], table.clocks[outputs[0]]):
                 notes.append(finding(FindingKind.HELD, record=record, name=name, output=outputs[0]))
+    # The name of a column and what stands beside it may say two units.
     for name in (*inputs, *outputs):
         contradicting_units = table.contradiction(name)
         if contradicting_units:
@@ -651,6 +656,7 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
         units = dict(zip(names, (*record.input_units, *record.output_units), strict=False))
         units |= record.own_units
 
+        # What a number in this record's unit is to be multiplied with.
         factors = dict[str, float]()
         notes = list[Finding]()
         for name, unit in list(units.items()):

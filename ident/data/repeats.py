@@ -191,11 +191,13 @@ class Repeats:
         shift = float(weight @ (change * slope.conj()).real) / slope_power
         level = complex(weight @ change)
 
+        # By chance the difference may be smaller than its noise.
         power_beyond_noise = max(power - noise, np.finfo(np.float64).tiny)
+        difference = float(np.sqrt(max(power - noise, 0.0)))
         return AmplitudeBand(
             low_rad_s,
             high_rad_s,
-            difference=float(np.sqrt(max(power - noise, 0.0))),
+            difference=difference,
             chance=float(np.sqrt(noise)),
             scatter=float(np.sqrt(np.mean(variances))),
             gain=level.real,
@@ -320,11 +322,16 @@ def _experiment(group: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
     if np.any(input_power == 0):
         return None
     response = np.sum(spectra.output[:, lines] * instrument, axis=2) / input_power
-    rows_per_amplitude = [len(amplitude) for amplitude in repeated]
-    ends = np.cumsum(rows_per_amplitude)[:-1]
+    # The rows of the response are in the order of the amplitudes.
+    rms = []
+    names = []
+    for amplitude in repeated:
+        rms.append(float(np.mean([size for size, _ in amplitude])))
+        names.append(tuple(record.name for _, record in amplitude))
+    ends = np.cumsum([len(amplitude) for amplitude in repeated])[:-1]
     return Repeats(
-        rms=tuple(float(np.mean([size for size, _ in amplitude])) for amplitude in repeated),
-        names=tuple(tuple(record.name for _, record in amplitude) for amplitude in repeated),
+        rms=tuple(rms),
+        names=tuple(names),
         omega_rad_s=spectra.omega_rad_s[lines].mean(axis=1),
         responses=tuple(np.split(response, ends)),
     )

@@ -107,7 +107,7 @@ def band_edges(dt_s: float, low_rad_s: float | None, high_rad_s: float | None) -
     nyquist = np.pi / dt_s
     edges = [edge for edge in (low_rad_s, high_rad_s) if edge is not None]
     ascending = [0.0, *edges, nyquist]
-    # NaN compares as false, and is refused.
+    # Each edge above the one before is all that a band needs. NaN compares as false, and is refused.
     if not all(lower < upper for lower, upper in pairwise(ascending)):
         raise ValueError(
             f"the band must lie in (0, {nyquist:.6g}) rad/s, lower below upper; got {low_rad_s} to "
@@ -135,6 +135,7 @@ def settling_time_s(dt_s: float, low_rad_s: float, high_rad_s: float) -> float:
     _, poles, _ = scipy.signal.butter(
         2, [low_rad_s, high_rad_s], "bandpass", output="zpk", fs=2 * np.pi / dt_s
     )
+    # A mode with a pole of modulus r falls by r each sample.
     log_radius = np.log(np.abs(poles).max())
     return float(-SETTLED_TIME_CONSTANTS * dt_s / log_radius)
 

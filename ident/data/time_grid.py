@@ -126,6 +126,7 @@ def only_rounded(stamps: RealArray) -> bool:
     of that decimal, and a quarter more, as a line through rounded stamps is itself off by part of it.
     """
     since_first = stamps - stamps[0]
+    # The last decimal: a power of ten of which all stamps are multiples; 0 where there is none.
     digit = 0.0
     for decimals in range(10):
         if np.allclose(since_first, np.round(since_first, decimals), 0, 1e-10):
@@ -444,6 +445,7 @@ class TimeGrid:
         if len(samples) == len(values) and is_on_grid:
             return values
         filled = np.asarray(CubicSpline(self.rows + self.late, values)(samples))
+        # Readings on the grid are exact, the spline through them but for rounding.
         if is_on_grid:
             filled[self.rows] = values
         return filled

@@ -6,8 +6,8 @@ Formats and layouts of files: `test_forty_logs.py`.
 import numpy as np
 import pytest
 
-from ident.data import record_files
 from ident.data.record import Record
+from ident.data.record_files import READERS, reads
 from ident.data.table import Table
 
 T, U, Y = "t_s", "u_V", "y_rad"
@@ -170,14 +170,21 @@ def test_files_of_another_kind(tmp_path, good):
             Record.from_file(path, [U], [Y], time=T)
 
 
-def test_a_format_of_ones_own_is_one_registered_reader(tmp_path, good, monkeypatch):
-    monkeypatch.setattr(record_files, "READERS", dict(record_files.READERS))
+@pytest.fixture
+def rows_reader():
+    """A reader of files that end in '.rows', registered for one test."""
 
-    @record_files.reads(".rows")
-    def _read_rows(file, content):
+    @reads(".rows")
+    def read_rows(file, content):
         values = np.loadtxt(content.decode().splitlines())
         return Table(file, dict(zip((T, U, Y), values.T, strict=True)))
 
+    yield read_rows
+    READERS.pop(".rows")
+
+
+@pytest.mark.usefixtures("rows_reader")
+def test_a_format_of_ones_own_is_one_registered_reader(tmp_path, good):
     path = write(tmp_path / "log.rows", [row.replace(",", " ") for row in rows()])
     np.testing.assert_array_equal(read(path).output, read(good).output)
 
