@@ -47,7 +47,8 @@ FAITHFUL_MEAN_RAD = (FAITHFUL_SHARE * 12) ** 0.5
 # Parts of a log whose mean step is compared with that of the whole, to show how a clock drifts: enough for a
 # clock that warms up, and of two steps each at least.
 CLOCK_PARTS = 10
-# Readings in each step of a coarser grid that is proposed, about.
+# Usual steps of the log in each step of a coarser grid that is proposed: none is without a reading unless two
+# readings in a row are missing.
 READINGS_PER_STEP = 3
 # Multiples of a power of ten that a proposed step is.
 ROUND_MULTIPLES = (1, 2, 3, 5, 10)

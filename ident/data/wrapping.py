@@ -54,16 +54,18 @@ TIMER_PERIODS = _timer_periods()
 ENDS_OF_INTEGERS = _ends_of_integers()
 
 # Samples below which nothing is said of wrapping: a range and a usual step are hardly known from fewer.
+# Chosen: every sensor of the tests has thousands.
 FEWEST_READINGS = 20
 # A step of more than this share of the range is a jump: at a wrap it is nearly 1.
 JUMP_SHARE = 0.6
 # A step between this share and `JUMP_SHARE` is neither usual nor a jump.
 LONG_SHARE = 0.4
 # Long steps per jump, at most: few where it wraps. A sine near the Nyquist frequency, which jumps at every
-# sample, has .25; doubled, this would let it pass.
+# sample, has .25; with twice the number it would be left to the test of smoothness.
 LONG_STEPS_PER_JUMP = 0.15
 # Share of the readings in the middle 60 % of the range below which they hardly are in between: a signal that
-# switches between two levels, or a spike. A motion over whole turns has .6.
+# switches between two levels, or a spike. A motion over whole turns has .6. Half and double this share, and
+# of the next two numbers, judge no signal of the tests differently.
 SELDOM_BETWEEN = 0.1
 # Levels that readings have on each side of the range, where they wrap: a spike, or a reading that drops out,
 # stands at one level or a few.
@@ -72,7 +74,8 @@ FEWEST_LEVELS = 5
 # motion many more.
 MOTION_STEPS = 12.0
 # Unwrapped, the standard deviation of the second differences is smaller by this factor, at least. Of a true
-# wrap it is smaller by far more, of a jump that is no wrap it grows.
+# wrap it is smaller by far more, of a jump that is no wrap it grows. Twice this, no gain at all, takes steps
+# with a single outlier for wraps.
 SMOOTHER = 0.5
 # A step of more than this share of a period may go either way: half is the limit, where both are as long.
 NEARLY_HALF = 0.4
@@ -86,14 +89,17 @@ LONGEST_SEAM = 6.0
 # as large.
 INFINITE = 1e30
 # A number that programs write for no reading counts as one where it is so many times larger than the largest
-# of all others: a motion that happens to end at 9999 has readings near it.
+# of all others: a motion that happens to end at 9999 has readings near it. At 20, 65535 beside a signal of
+# 0 to 4095, as a converter of 12 bits has it, would be a reading.
 FAR = 10.0
 # A command may be a single pulse, which is meant. One that is so many times the range of the others away
 # from their median is none.
 FAR_OF_COMMAND = 100.0
-# Samples that may be spikes, as a share of all: more are a motion.
+# Samples that may be spikes, as a share of all: more are a motion. Chosen; half and double judge no signal of
+# the tests differently.
 SPIKES_SHARE = 0.05
-# The steps around a spike are so many times longer than any other step.
+# The steps around a spike are so many times longer than any other step. At 20 nothing changes in the tests;
+# at 5 the swings of a shock beside a spike pass for spikes.
 SPIKE_STEPS = 10.0
 # Share of the steps of a row counter that are 1, at least; at the others it starts again.
 COUNTING_SHARE = 0.95
