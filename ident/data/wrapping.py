@@ -93,7 +93,8 @@ INFINITE = 1e30
 # 0 to 4095, as a converter of 12 bits has it, would be a reading.
 FAR = 10.0
 # A command may be a single pulse, which is meant. One that is so many times the range of the others away
-# from their median is none.
+# from their median is none. Chosen: in the tests half of it takes out a pulse of 66 times the range, and
+# twice it leaves one of 199 times in.
 FAR_OF_COMMAND = 100.0
 # Samples that may be spikes, as a share of all: more are a motion. Chosen; half and double judge no signal of
 # the tests differently.
