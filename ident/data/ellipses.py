@@ -54,7 +54,7 @@ class EllipseAxes:
                 f"need three (F,) arrays; got {self.semi_major.shape}, {self.semi_minor.shape}, "
                 f"{self.direction.shape}"
             )
-        if not np.all((self.semi_major >= self.semi_minor) & (self.semi_minor >= 0)):
+        if not (np.all(self.semi_major >= self.semi_minor) and np.all(self.semi_minor >= 0)):
             raise ValueError("need semi_major >= semi_minor >= 0 at every frequency")
         for array in (self.semi_major, self.semi_minor, self.direction):
             array.setflags(write=False)

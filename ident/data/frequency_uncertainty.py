@@ -184,7 +184,7 @@ class FrequencyUncertainty:
         variances = table.columns(("variance_real", "variance_imag"))
         variance_re = variances["variance_real"]
         variance_im = variances["variance_imag"]
-        negative = np.flatnonzero((variance_re < 0) | (variance_im < 0))
+        negative = np.flatnonzero(np.minimum(variance_re, variance_im) < 0)
         if negative.size:
             raise ValueError(f"{path}, {table.place(int(negative[0]))}: a variance is negative")
         if CROSS_COLUMN in table.names:

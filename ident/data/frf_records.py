@@ -111,8 +111,9 @@ class FrfRepeats:
 
     def band(self, omega_min_rad_s: float, omega_max_rad_s: float) -> FrfRepeats:
         """Return the points with omega_min <= omega <= omega_max. Raises ValueError if there is none."""
-        is_inside = (self.omega_rad_s >= omega_min_rad_s) & (self.omega_rad_s <= omega_max_rad_s)
-        return self._chosen(is_inside)
+        is_above = self.omega_rad_s >= omega_min_rad_s
+        is_below = self.omega_rad_s <= omega_max_rad_s
+        return self._chosen(is_above & is_below)
 
     def open_loop(self, reference_gain: float, feedback_gain: float) -> FrfRepeats:
         """Return plant responses from those of a closed loop r -> y, point by point.
