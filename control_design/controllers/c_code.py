@@ -34,6 +34,8 @@ _NO_LIMIT = 3e38
 
 # Frequencies at which single precision is compared with double: from 1e-4 of Nyquist on, a hundred a decade.
 _COMPARED_FREQUENCIES = 400
+
+# Share of the Nyquist frequency at which they begin: 0.3 rad/s at 1 kHz, below the band of most loops.
 _LOWEST_NYQUIST_SHARE = 1e-4
 
 

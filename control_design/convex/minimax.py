@@ -49,7 +49,12 @@ _SMALLEST_SINGULAR_SHARE = 1e-14
 # A least-squares start is shortened, up to so many times by this factor, until all denominators exceed the
 # margin: y = 0 is the loop without Q, whose denominators are about one.
 _MOST_START_SHORTENINGS = 30
+
+# Factor of each shortening, 0.7^30 = 2e-5 in all. Chosen; a smaller one throws more of the start away.
 _START_SHORTENING = 0.7
+
+# Denominator that all rows must exceed before a start is taken. Chosen: on the edge of feasibility the next
+# point has an infinite ratio.
 _START_MARGIN = 0.05
 
 # The search for a point with positive denominators ends when all exceed this.

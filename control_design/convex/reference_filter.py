@@ -46,17 +46,27 @@ _SEARCH_THINNING = 3
 # Decay rates that are searched lie between these shares of the Nyquist frequency; starts keep the distance
 # from both ends in logarithms.
 _SLOWEST_SHARE = 1e-5
+
+# The fastest one: next to Nyquist a pole is a delay of one sample, which F does not need.
 _FASTEST_SHARE = 0.95
+
+# Distance of starts from both ends, in logarithms: a simplex that begins on a limit collapses onto it.
 _LOG_DISTANCE_FROM_ENDS = 0.1
 
 # Starts of the simplex: the poles are spread by factors of four around the model's corner times each of
 # these.
 _POLE_SPREAD = 4.0
+
+# Factors on the model's corner at which the three simplexes begin: below, at and above it by about four.
 _START_FACTORS = (0.3, 1.0, 4.0)
 
 # Evaluations of the simplex for each pole, and its tolerances: 1 % of a decay rate, 1e-4 of the error.
 _EVALUATIONS_PER_POLE = 30
+
+# The simplex ends within 1 % of a decay rate, which moves the error by its square only ...
 _LOG_RATE_TOLERANCE = 1e-2
+
+# ... and within this part of the error, a fifth of what the exchange of frequencies accepts.
 _ERROR_TOLERANCE = 1e-4
 
 # Frequencies that are added to each plant's grid in a round, at most.

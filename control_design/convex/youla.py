@@ -47,7 +47,11 @@ _ELLIPSE_ROUNDS = 20
 # width before: from a quarter turn down to 5e-5 of it. The margin is flat at its maximum, so this is exact to
 # 1e-8.
 _ANGLE_REFINEMENTS = 6
+
+# Points of each refinement: a tenth of the width apart, less than the eighth that the next one spans.
 _ANGLE_POINTS = 21
+
+# Factor by which each refinement is narrower; at most the half number of points, so that no maximum is lost.
 _ANGLE_NARROWING = 8.0
 
 # Ellipses whose centres differ from the base plant by less than this, relative to the loop, stand on it.

@@ -27,6 +27,8 @@ _SLOWEST_MIRRORED_SHARE = 3e-3
 # Fastest pole as a share of the Nyquist frequency, and slowest one as a share of the specification's
 # frequency: beyond them Q is constant for all that the requirements see.
 _FASTEST_SHARE = 0.95
+
+# The slowest real pole as a share of the specification's frequency, for plants without a slow corner.
 _SLOWEST_SHARE = 0.02
 
 # Poles of the plant slower than this share of the specification's frequency count as integrators.
@@ -37,8 +39,14 @@ _DEADBEAT_BELOW = 1e-6
 
 # Damping ratios of the pairs at a mode: from a little above its own, within limits, to well damped.
 _OWN_DAMPING_FACTOR = 1.3
+
+# Smallest damping ratio that pairs begin at: less is narrower than the grid of frequencies resolves.
 _LEAST_DAMPING = 0.005
+
+# Largest damping ratio that pairs begin at, so that a spread up to the last one is left.
 _MOST_OWN_DAMPING = 0.3
+
+# Damping ratio of the last pair: without a resonance peak.
 _LARGEST_DAMPING = 0.7
 
 # Weight of the states beside the output in the linear-quadratic gains, relative to the output's: lets the

@@ -52,12 +52,18 @@ _LEAST_MODE_POINTS = 20
 
 # Share of a dense check's points that are logarithmic; the others stand around the modes.
 _DENSE_LOG_SHARE = 0.7
+
+# Share of its points that stand around the modes: what the logarithmic ones leave.
 _DENSE_MODE_SHARE = 0.3
 
 # First partition of the frequency axis: logarithmic edges (in all at least, and per decade) and edges around
 # each mode. Intervals on which a bound is not tight are split later, so the number changes time, no result.
 _LEAST_EDGES = 60
+
+# Edges per decade.
 _EDGES_PER_DECADE = 40
+
+# Edges around each mode.
 _EDGES_PER_MODE = 40
 
 

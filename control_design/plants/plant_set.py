@@ -34,6 +34,8 @@ _BATCH_FREQUENCIES = 2048
 
 # A pole in z with a smaller imaginary part is real, one nearer to z = 0 has died out within a sample.
 _REAL_BELOW = 1e-9
+
+# A pole in z nearer to 0 has died out within a sample: its frequency would be the logarithm of rounding.
 _DEADBEAT_BELOW = 1e-6
 
 # Zeros farther out in z are at infinity: rounding of a zero that the discrete system does not have.

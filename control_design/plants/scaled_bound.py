@@ -45,11 +45,15 @@ _LONGEST_SECANT_STEP = 3.0
 
 # Shortenings of a step that promised a decrease and had none, and the factor of each: 0.3^8 = 6e-5.
 _MOST_SHORTENINGS = 8
+
+# Factor of each of them. Chosen: between the usual half, which needs twice as many, and a tenth.
 _SHORTENING = 0.3
 
 # Where no scaling shows stability, all are made e^3 = 20 times smaller, up to so many times, towards scalings
 # at which robust stability alone counts.
 _MOST_SHRINKINGS = 12
+
+# Step in log t of each of them.
 _SHRINKING = 3.0
 
 # Smallest curvature that a step divides by, relative to the logarithm of gamma^2: flatter ones are rounding.
@@ -60,6 +64,8 @@ _LARGEST_LOG_T = 300.0
 
 # Diagonal of a Gram matrix that is nearly singular, relative to its trace: lets Cholesky's factor exist.
 _JITTER_SHARE = 1e-14
+
+# The same share for a block that stands for the performance: of rank one, whose inverse enters the bound.
 _BLOCK_JITTER_SHARE = 1e-12
 
 # A pivot of I - R^H C R below this is no proof of stability: some thousand times the rounding of a number
