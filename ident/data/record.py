@@ -652,8 +652,9 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
     first_said = dict[str, tuple[str, str]]()
     converted = list[Record]()
     for record in records:
-        names = (*record.input_names, *record.output_names)
-        units = dict(zip(names, (*record.input_units, *record.output_units), strict=False))
+        # Each side by itself: one that says no unit has an empty tuple, and would take over the other one's.
+        units = dict(zip(record.input_names, record.input_units, strict=False))
+        units |= zip(record.output_names, record.output_units, strict=False)
         units |= record.own_units
 
         # What a number in this record's unit is to be multiplied with.

@@ -353,6 +353,7 @@ def read(path, **more):
         (("kV", "rev"), (1e3, 2 * np.pi), {"angle", "voltage"}),
         (("Volts", "mrad"), (1, 1e-3), {"angle"}),
         (("V", ""), (1, 1), set()),
+        (("", "deg"), (1, np.pi / 180), {"angle"}),
         (("V", "radians"), (1, 1), set()),
     ],
 )
