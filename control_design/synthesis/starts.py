@@ -1,17 +1,24 @@
-"""Where the search starts from: random low-gain loops, loops shaped by hand-book rules, and for unstable
-plants loops that a search for stability has found.
+"""Starts of the search for a controller of fixed structure: where a descent to a local minimum begins.
 
-A start is worth the more the closer it already is to what is asked. The *shaped* starts wish for a loop gain
-L where the specification speaks: large and positive real at the peak of a mode that is to be damped (1 + L =
-peak over allowed peak, so L points away from -1), falling like an integrator where tracking is asked, small
-elsewhere. Poles are drawn at random; the numerator that comes nearest to the wishes is linear least squares.
-Many are drawn, few kept.
+A descent ends in the valley where it began, so the search needs several starts of different kinds, each
+already close to what is asked. `StartMaker` draws parameter vectors of one `Cascade` in three ways.
+
+`shaped` wishes for a loop gain L = G K where the specification speaks: large and positive real at the peak of
+a mode that is to be damped (1 + L = peak over allowed peak, so that L points away from -1), falling like an
+integrator where tracking is asked, small elsewhere. Poles are drawn at random, and the numerator that comes
+nearest to the wishes is linear least squares. `low_gain` draws all sections at random and lowers the gain
+until the nominal loops are stable. `stabilising` serves plants that are unstable in open loop: it draws leads
+around the unstable poles and minimises the largest closed-loop pole modulus.
+
+Corners and gains are in the Tustin plane p of the cascade, s over `cascade.scale_rad_s`. The functions at the
+end work on parameter vectors: a factor on the gain, one section more that cancels itself, and sections from
+one numerator polynomial. All ranges of random draws are choices; what they are worth is said beside them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,16 +30,129 @@ from control_design.specification.requirement import LoopFunction
 from control_design.specification.specification import ModulusMargin
 from ident.data.arrays import real_rows
 
-_DECADES_OF_TRACKING = 1.5  # below the crossover, in which the integrator-like loop is wished for
-_DRAWN_UNSTABLE, _FOLLOWED = 400, 12  # loops around unstable poles drawn, and led to stability
-_HIGHEST = 0.95  # of Nyquist: the Tustin frequency has its pole there
+# Shaped starts.
+# Factor on the gain of a shaped loop that is unstable, before it is given up.
+_RETRY_GAIN = 0.4
+# Two shaped loops count as one where their nominal sensitivities differ by less than this on average.
+_SAME_SENSITIVITY = 0.05
+# Damping ratio of random pairs of poles, as powers of ten.
+_POLE_DAMPING_DECADES = (-1.0, 0.1)
+# Decades below the crossover in which the integrator-like loop is wished for.
+_DECADES_OF_TRACKING = 1.5
+# Crossover that is wished for, over the highest frequency at which |S| > 1 would violate the weight on S.
+_CROSSOVER_RATIOS = (0.7, 2.0)
+# Peak that remains of a damped mode, over the allowed one, is the inverse of a factor in this range.
+_PEAK_RATIOS = (1.0, 2.0)
+# Loop gain at a peak that is only just too high: less than this would not show beside the other wishes.
+_LEAST_EXCESS = 0.2
+# Standard deviation, rad, of the phase of the wished loop gain at a peak; 0 would point exactly away from -1.
+_PHASE_SPREAD_RAD = 0.4
+# Weight of the wish at one peak over that at one frequency of tracking, of which there are dozens.
+_PEAK_WEIGHT = 10.0
+# Weight of "small elsewhere", as powers of ten, over the specification's own weight on the loop.
+_QUIET_DECADES = (-1.5, 0.0)
+# Plant gain above which "small elsewhere" weighs no heavier: an integrator's grows without end.
+_LARGEST_PLANT_GAIN = 1e3
+# Of Nyquist, up to which wishes are stated: the Tustin frequency has its pole there.
+_HIGHEST_WISH = 0.95
+# Corners of random poles: from this times the lowest frequency that matters ..
+_LOWEST_CORNER_RATIO = 0.3
+# .. to this times the highest, but no higher than the share of Nyquist below.
+_HIGHEST_CORNER_RATIO = 3.0
+_HIGHEST_CORNER_OF_NYQUIST = 0.9
+
+# Random starts.
+# Corner of a random section, as powers of ten of the scale: a factor of 5 to either side.
+_CORNER_DECADES = (-0.7, 0.7)
+# Damping ratio of a random section: no resonance, no two poles far apart.
+_SECTION_DAMPING = (0.3, 1.0)
+# Standard deviation of a random section's numerator, relative to its denominator.
+_NUMERATOR_JITTER = 0.3
+# Integral gain of a random section over its corner: slow, as a fast one destabilises.
+_INTEGRAL_SHARE = 0.1
+# Crossover of a loop of little gain, as powers of ten of the scale.
+_LOW_CROSSOVER_DECADES = (-1.5, -0.3)
+# Crossover of the first lead around two integrators, as powers of ten of the scale ..
+_LEAD_CROSSOVER_DECADES = (-0.7, 0.0)
+# .. and its factor from trial to trial.
+_SLOWER_LEAD = 0.6
+# Trials of a random start, each with half the gain: 12 halvings are a factor of 4096.
+_TRIALS = 12
+_LESS_GAIN = 0.5
+
+# Lead sections.
+# Zero and poles of a lead over its crossover: a ratio of 16 lifts the phase by 62 degrees for one pole.
+_LEAD_ZERO = 0.25
+_LEAD_POLES = 4.0
+# Corner of sections beside the lead, as powers of ten of the scale.
+_OTHER_CORNER_DECADES = (-0.3, 0.7)
+# Standard deviation of the lead's zeros, relative.
+_LEAD_JITTER = 0.1
+# Zero of the PI section over the crossover: it costs 3 degrees of phase there.
+_PI_ZERO = 0.05
+# Damping term of the numerator of an idle notch over its corner; its denominator has 2: nearly no notch.
+_IDLE_NOTCH = 1.8
+
+# Starts for unstable plants.
+# Loops around the unstable poles that are drawn, and the best of them that are led to stability.
+_DRAWN_UNSTABLE = 400
+_FOLLOWED = 12
+# Crossover over the fastest unstable pole, as powers of ten: a loop slower than the pole does not catch it.
+_UNSTABLE_CROSSOVER_DECADES = (-0.1, 0.9)
+# Highest crossover, of Nyquist: above, the computational delay leaves no phase.
+_UNSTABLE_CROSSOVER_OF_NYQUIST = 0.6
+# Gain over the one that puts the crossover there, as powers of ten.
+_UNSTABLE_GAIN_DECADES = (-0.2, 0.5)
+# Where tracking is asked without an integrator: share of draws with a slow lag in its place.
+_SLOW_LAG_SHARE = 0.6
+# Below this draws are leads, the rest random sections.
+_LEAD_SHARE = 0.8
+# The slow lag's pole, its zeros and its fast pole, over the crossover.
+_SLOW_POLE_DECADES = (-5.0, -2.0)
+_LAG_ZERO_DECADES = (-1.3, -0.3)
+_FAST_POLE_RATIOS = (3.0, 10.0)
+# Edge of the first simplex: of a parameter, or absolute for parameters (logarithms) near zero.
+_SIMPLEX_SHARE = 0.2
+_SIMPLEX_EDGE = 0.1
+_NEAR_ZERO = 1e-3
+# Evaluations for each parameter: of the radius until the loop is stable, then of the worst case.
+_RADIUS_EVALUATIONS = 200
+_WORST_CASE_EVALUATIONS = 60
+# Cost of a loop of which nothing finite is known; larger than any pole modulus that is seen.
+_LARGEST_COST = 1e6
+
+# Damping of drawn pairs over what is asked of the controller's own poles: clear of the bound by 1 %.
+_CLEAR_OF_BOUND = 1.01
+# No division by zero; far below any response.
+_TINY = 1e-300
+
+
+class _Wishes(NamedTuple):
+    """Controller values that are wished for: K and weight of the squared miss, each (n,), at omega (n,)."""
+
+    omega_rad_s: Real
+    controller: Complex
+    weight: Real
 
 
 class StartMaker:
     """Draws parameter vectors of one cascade for given plants; all randomness comes from `rng`.
 
-    data: every plant on a lean grid. score: worst case of a parameter vector, inf where a loop is unstable.
-    keeps_sign: the gain at low frequency has to be positive (tracking or integrators).
+    Parameters
+    ----------
+    cascade : Cascade
+        Kinds of sections, sampling time and scale of the parameter vectors (n,).
+    data : sequence of PlantData
+        Every plant on a lean grid: ellipses (centre and semi-axes (F,)), computational delay (F,), weights.
+    integrators : int
+        Integrators of the loop, of controller and plant together.
+    score : callable
+        Worst case of a parameter vector; inf where a nominal loop is unstable or an ellipse covers -1.
+    rng : numpy.random.Generator
+    controller_damping : float or None
+        Least damping ratio asked of the controller's own pairs of poles.
+    keeps_sign : bool
+        The gain at low frequency has to be positive (tracking or integrators).
     """
 
     def __init__(
@@ -46,16 +166,35 @@ class StartMaker:
         controller_damping: float | None,
         keeps_sign: bool,
     ) -> None:
-        self.cascade, self.data, self.integrators = cascade, data, integrators
-        self.score, self.rng = score, rng
+        """Keep the arguments; see whether any weight on S asks for tracking."""
+        self.cascade = cascade
+        self.data = data
+        self.integrators = integrators
+        self.score = score
+        self.rng = rng
         self.least_damping = controller_damping or 0.0
         self.keeps_sign = keeps_sign
+        # A weight above 1 asks |S| < 1, which only feedback gives.
         self.tracks = any(np.any(part.sensitivity > 1.0) for part in data)
 
     # Shaped starts
 
     def shaped(self, draws: int, most: int) -> list[tuple[Real, float]]:
-        """Best `most` different ones of `draws` shaped loops: (parameters, score), the best first."""
+        """Shaped loops that are stable and differ, the best first.
+
+        Parameters
+        ----------
+        draws : int
+            Loops that are drawn; each costs about 1 ms.
+        most : int
+            Loops that are returned at most.
+
+        Returns
+        -------
+        list of (parameters (n,), score)
+            Empty for structures with notches, whose zeros are not free, and for two integrators or more in
+            the loop: least squares does not see stability, and seldom finds the lead that they need.
+        """
         if "notch" in self.cascade.sections or self.integrators >= 2:
             return []
         pool: list[tuple[Real, float]] = []
@@ -65,7 +204,7 @@ class StartMaker:
                 continue
             gamma = self.score(parameters)
             if not np.isfinite(gamma):
-                parameters = with_gain(self.cascade, parameters, 0.4)
+                parameters = with_gain(self.cascade, parameters, _RETRY_GAIN)
                 gamma = self.score(parameters)
             if np.isfinite(gamma):
                 pool.append((parameters, gamma))
@@ -73,203 +212,292 @@ class StartMaker:
         return self._different(pool, most)
 
     def _different(self, pool: Sequence[tuple[Real, float]], most: int) -> list[tuple[Real, float]]:
-        """Greedy: drop what has nearly the loop gain of something better."""
-        kept: list[tuple[Real, float]] = []
-        loops: list[Complex] = []
+        """At most `most` entries (parameters, score) of a pool sorted by score, without near duplicates.
+
+        An entry is left out whose nominal sensitivity of the first plant is nearly that of a better one.
+        """
+        selected: list[tuple[Real, float]] = []
+        sensitivities: list[Complex] = []
         data = self.data[0]
         for parameters, gamma in pool:
             k = self.cascade.response(parameters, data.ellipses.omega_rad_s) * data.delay
             sensitivity = 1.0 / (1.0 + k * data.ellipses.centre)
-            if all(float(np.mean(np.abs(sensitivity - other))) > 0.05 for other in loops):
-                kept.append((parameters, gamma))
-                loops.append(sensitivity)
-            if len(kept) == most:
+            differences = [float(np.mean(np.abs(sensitivity - other))) for other in sensitivities]
+            if all(difference > _SAME_SENSITIVITY for difference in differences):
+                selected.append((parameters, gamma))
+                sensitivities.append(sensitivity)
+            if len(selected) == most:
                 break
-        return kept
+        return selected
 
     def _shaped(self) -> Real | None:
-        """One draw: wishes, poles, least squares, numerator dealt to sections; None if nothing is wished."""
-        parts = [self._wishes(data) for data in self.data]
-        omega, wanted, weight = (np.concatenate([part[i] for part in parts]) for i in range(3))
+        """Parameters (n,) of one shaped loop; None where the specification gives no wish.
+
+        Wishes and poles are drawn; the numerator of the whole cascade is the least-squares answer to the
+        wishes of all plants together, and its roots are dealt to the sections. Nothing makes it stable.
+        """
+        wishes = [self._wishes(data) for data in self.data]
+        omega = np.concatenate([part.omega_rad_s for part in wishes])
+        wanted = np.concatenate([part.controller for part in wishes])
+        weight = np.concatenate([part.weight for part in wishes])
         if not np.any(np.abs(wanted) > 0):
             return None
-        p = 1j * tustin_frequency(omega, self.cascade.dt_s) / self.cascade.scale_rad_s
+
+        # One denominator for each section, with random corners, evenly distributed on a logarithmic scale.
         low, high = self._corner_range()
         denominators: list[Real] = []
         for kind in self.cascade.sections:
             corner = np.exp(self.rng.uniform(np.log(low), np.log(high)))
-            damping = max(10 ** self.rng.uniform(-1.0, 0.1), self.least_damping * 1.01)
+            drawn_damping = 10 ** self.rng.uniform(*_POLE_DAMPING_DECADES)
+            damping = max(drawn_damping, self.least_damping * _CLEAR_OF_BOUND)
             if kind == "integrator":
                 denominators.append(np.array([1.0, 0.0]))
             elif kind == "first_order":
                 denominators.append(np.array([1.0, corner]))
             else:
                 denominators.append(np.array([1.0, 2 * damping * corner, corner**2]))
-        whole = np.ones(p.size, dtype=np.complex128)
-        for denominator in denominators:
-            whole = whole * np.polyval(denominator, p)
-        n = self.cascade.order
-        columns = np.stack([p**power / whole for power in range(n, -1, -1)], axis=1) * weight[:, None]
-        size = np.linalg.norm(columns, axis=0)
-        solution = np.linalg.lstsq(real_rows(columns) / size, real_rows(wanted * weight), rcond=1e-9)[0]
-        return in_sections(self.cascade.sections, solution / size, denominators)
 
-    def _wishes(self, data: PlantData) -> tuple[Real, Complex, Real]:
-        """(omega, wanted K, weight), each (n,), for one plant on its lean grid."""
+        # K = (n_m p^m + .. + n_0) / denominator is linear in the coefficients of the numerator.
+        p = 1j * tustin_frequency(omega, self.cascade.dt_s) / self.cascade.scale_rad_s
+        denominator_values = np.ones(p.size, dtype=np.complex128)
+        for denominator in denominators:
+            denominator_values = denominator_values * np.polyval(denominator, p)
+        powers = range(self.cascade.order, -1, -1)
+        basis = np.stack([p**power / denominator_values for power in powers], axis=1)
+        columns = basis * weight[:, None]
+        # Columns of one size, so that the cut-off of small singular values means the same for each.
+        column_sizes = np.linalg.norm(columns, axis=0)
+        scaled_rows = real_rows(columns) / column_sizes
+        solution = np.linalg.lstsq(scaled_rows, real_rows(wanted * weight), rcond=1e-9)[0]
+        return in_sections(self.cascade.sections, solution / column_sizes, denominators)
+
+    def _wishes(self, data: PlantData) -> _Wishes:
+        """What K should be for one plant, at frequencies of its lean grid; one draw.
+
+        A wish for the loop gain L is one for K = L / (G e^{-j w delay}), and its weight makes a relative miss
+        count the same everywhere. Frequencies may come twice, with different wishes.
+        """
         grid = data.ellipses.omega_rad_s
-        usable = grid < _HIGHEST * data.plant.nyquist_rad_s
+        usable = grid < _HIGHEST_WISH * data.plant.nyquist_rad_s
         plant = data.ellipses.centre * data.delay
         peak = data.open_loop_disturbance
         omega: list[Real] = []
         wanted: list[Complex] = []
         weight: list[Real] = []
-        lowest = 0.0
+
+        # Tracking: L = crossover / (j w), somewhat below the crossover.
+        lowest_quiet = 0.0
         tracked = np.flatnonzero(data.sensitivity > 1.0)
         if tracked.size:
-            crossover = grid[tracked[-1]] * self.rng.uniform(0.7, 2.0)
-            lowest = crossover
-            use = usable & (grid < crossover) & (grid > crossover * 10**-_DECADES_OF_TRACKING)
-            k = crossover / (1j * grid[use]) / plant[use]
-            omega, wanted, weight = [grid[use]], [k], [1.0 / np.abs(k)]
+            crossover = grid[tracked[-1]] * self.rng.uniform(*_CROSSOVER_RATIOS)
+            lowest_quiet = crossover
+            below_crossover = grid < crossover
+            not_far_below = grid > crossover * 10**-_DECADES_OF_TRACKING
+            tracking = usable & below_crossover & not_far_below
+            k = crossover / (1j * grid[tracking]) / plant[tracking]
+            omega.append(grid[tracking])
+            wanted.append(k)
+            weight.append(1.0 / np.abs(k))
+
+        # Peaks of modes to be damped: 1 + L = peak over allowed peak, about.
         for index in local_maxima(peak):
             if not (usable[index] and peak[index] > 1.0):
                 continue
-            excess = max(peak[index] * self.rng.uniform(1.0, 2.0) - 1.0, 0.2)
-            k = np.array([excess * np.exp(1j * self.rng.normal(0.0, 0.4)) / plant[index]])
+            excess = max(peak[index] * self.rng.uniform(*_PEAK_RATIOS) - 1.0, _LEAST_EXCESS)
+            phase = np.exp(1j * self.rng.normal(0.0, _PHASE_SPREAD_RAD))
+            k = np.array([excess * phase / plant[index]])
             omega.append(grid[index : index + 1])
             wanted.append(k)
-            weight.append(10.0 / np.abs(k))
-        quiet = usable & (grid > lowest)
-        strength = 10 ** self.rng.uniform(-1.5, 0.0)
+            weight.append(_PEAK_WEIGHT / np.abs(k))
+
+        # Elsewhere K = 0, weighed by what the specification says of K S and of S = 1 / (1 + L).
+        not_tracked = grid > lowest_quiet
+        quiet = usable & not_tracked
+        strength = 10 ** self.rng.uniform(*_QUIET_DECADES)
+        small_loop = data.of(ModulusMargin) * np.minimum(np.abs(plant), _LARGEST_PLANT_GAIN)
+        against_controller = np.maximum(data.largest(LoopFunction.EFFORT), small_loop)
+        quiet_weight = strength * against_controller[quiet]
+        if peak.max(initial=0.0) > 1.0:
+            # Where the mode is to be damped, a large L is no harm.
+            quiet_weight = quiet_weight / np.maximum(1.0, peak[quiet]) ** 2
         omega.append(grid[quiet])
         wanted.append(np.zeros(int(np.sum(quiet)), dtype=np.complex128))
-        small_loop = data.of(ModulusMargin) * np.minimum(np.abs(plant), 1e3)
-        weight.append(strength * np.maximum(data.largest(LoopFunction.EFFORT), small_loop)[quiet])
-        if peak.max(initial=0.0) > 1.0:  # where the mode is to be damped, a large L is no harm
-            weight[-1] = weight[-1] / np.maximum(1.0, peak[quiet]) ** 2
-        return np.concatenate(omega), np.concatenate(wanted), np.concatenate(weight)
+        weight.append(quiet_weight)
+        return _Wishes(np.concatenate(omega), np.concatenate(wanted), np.concatenate(weight))
 
     def _corner_range(self) -> tuple[float, float]:
-        """Corners of random poles in p: 0.3 of the lowest frequency spoken of to 3 times the highest."""
-        spoken: list[float] = [self.cascade.scale_rad_s]
+        """Lowest and highest corner of random poles, in units of the scale.
+
+        They enclose the scale, the first mode of each plant and the bands in which damping is asked.
+        """
+        relevant: list[float] = [self.cascade.scale_rad_s]
         for data in self.data:
-            spoken += [m.omega_rad_s for m in data.plant.modes[:1]]
-            band = data.ellipses.omega_rad_s[data.open_loop_disturbance > 0]
-            spoken += [] if band.size == 0 else [float(band[0]), float(band[-1])]
-        ceiling = 0.9 * self.data[0].plant.nyquist_rad_s
-        high = float(tustin_frequency(np.array([min(max(spoken), ceiling)]), self.cascade.dt_s)[0])
-        return 0.3 * min(spoken) / self.cascade.scale_rad_s, 3.0 * high / self.cascade.scale_rad_s
+            relevant += [mode.omega_rad_s for mode in data.plant.modes[:1]]
+            damped = data.open_loop_disturbance > 0
+            band = data.ellipses.omega_rad_s[damped]
+            if band.size:
+                relevant += [float(band[0]), float(band[-1])]
+        ceiling = _HIGHEST_CORNER_OF_NYQUIST * self.data[0].plant.nyquist_rad_s
+        highest = min(max(relevant), ceiling)
+        # The lowest is so far below Nyquist that warping does not matter to it.
+        warped_highest = float(tustin_frequency(np.array([highest]), self.cascade.dt_s)[0])
+        low = _LOWEST_CORNER_RATIO * min(relevant) / self.cascade.scale_rad_s
+        high = _HIGHEST_CORNER_RATIO * warped_highest / self.cascade.scale_rad_s
+        return low, high
 
     # Random starts
 
     def low_gain(self) -> Real:
-        """A random low-gain cascade with stable nominal loops: smaller gains, or slower leads, until it is
-        stable."""
-        crossover = 10 ** self.rng.uniform(-0.7, 0.0)
+        """Parameters (n,) of a random cascade of little gain, whose nominal loops are mostly stable.
+
+        Until they are, the gain is halved; with two integrators, which less gain does not stabilise, a lead
+        around a slower and slower crossover is drawn. After 12 trials the last one is returned as it is.
+        """
+        crossover = 10 ** self.rng.uniform(*_LEAD_CROSSOVER_DECADES)
         parameters = self._random_sections()
         parameters = with_gain(self.cascade, parameters, self._low_gain(parameters))
-        for _ in range(12):
+        for _ in range(_TRIALS):
             if self.integrators >= 2:
-                # Less gain does not stabilise two integrators: a lead around a slower and slower crossover
-                # does.
                 parameters = self._lead_sections(crossover)
                 gain = self._crossover_gain(parameters, crossover * self.cascade.scale_rad_s)
                 parameters = with_gain(self.cascade, parameters, gain)
-                crossover *= 0.6
+                crossover *= _SLOWER_LEAD
             if np.isfinite(self.score(parameters)):
                 break
-            parameters = with_gain(self.cascade, parameters, 0.5)
+            parameters = with_gain(self.cascade, parameters, _LESS_GAIN)
         return parameters
 
     # Starts for plants that are unstable in open loop
 
     def stabilising(self, radius: Callable[[Real], float], most: int) -> list[Real]:
-        """Up to `most` loops led to stability, those with the smallest worst case first.
+        """Loops of unstable plants that were led to stability, those with the smallest worst case first.
 
-        radius: largest pole modulus of the nominal loops of a parameter vector. Neither little gain nor much
-        of it stabilises an unstable plant: the best of many leads and random sections around the unstable
-        poles are taken and the radius is minimised from there, below 1 the share of |1 + L| that the
-        ellipses leave (Nelder and Mead's simplex, as the radius has kinks).
+        Parameters
+        ----------
+        radius : callable
+            Largest pole modulus of the nominal loops of a parameter vector (n,).
+        most : int
+            Parameter vectors that are returned at most; no more are led on once so many are stable.
+
+        Returns
+        -------
+        list of ndarray, shape (n,)
+            Those that could not be stabilised come last.
+
+        Notes
+        -----
+        Neither little gain nor much of it stabilises an unstable plant: of many leads and random sections
+        around the unstable poles the best are taken, and the radius is minimised from there. Below 1 it is
+        replaced by the share of |1 + L| that the ellipses leave. Nelder and Mead's simplex is used, as the
+        radius has kinks.
         """
 
         def cost(x: Real) -> float:
+            """What is minimised: the radius plus missing damping, or, where stable, at most 1."""
             ringing = max(self.least_damping - self.cascade.least_damping(x), 0.0)
-            found = radius(x)
-            if not found < 1.0 or ringing > 0:
-                return min(found, 1e6) + ringing
-            left = 1.0
+            pole_radius = radius(x)
+            if not pole_radius < 1.0 or ringing > 0:
+                return min(pole_radius, _LARGEST_COST) + ringing
+            # Smallest |1 + L| at the centre after the ellipse has taken its share; 1 without any loop.
+            smallest_share = 1.0
             for data in self.data:
                 loop = self.cascade.response(x, data.ellipses.omega_rad_s) * data.delay
-                back = np.abs(1.0 + loop * data.ellipses.centre)
+                distance = np.abs(1.0 + loop * data.ellipses.centre)
                 reach = np.abs(loop) * data.ellipses.semi_major
-                left = min(left, float(np.min(back / (1.0 + reach / np.maximum(back, 1e-300)))))
-            return 1.0 - left
+                share = distance / (1.0 + reach / np.maximum(distance, _TINY))
+                smallest_share = min(smallest_share, float(np.min(share)))
+            return 1.0 - smallest_share
 
-        drawn = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
-        drawn = sorted(drawn, key=cost)[:_FOLLOWED]
-        found: list[tuple[Real, float]] = []
-        for x in drawn:
+        def log_worst_case(x: Real) -> float:
+            """Logarithm of the score, finite also where the loop is unstable."""
+            return float(np.log(min(self.score(x), _LARGEST_COST)))
+
+        candidates = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
+        followed = sorted(candidates, key=cost)[:_FOLLOWED]
+        ends: list[tuple[Real, float]] = []
+        for x in followed:
             # Steps in proportion to the parameters, of which some are logarithms near zero.
-            size = np.where(np.abs(x) > 1e-3, 0.2 * np.abs(x), 0.1)
-            end = _simplex(cost, np.vstack([x, x + np.diag(size)]), 200 * x.size)
-            if np.isfinite(self.score(end)):  # on towards what is asked, over valleys the descent stays in
-                around = np.vstack([end, end + np.diag(size)])
-                end = _simplex(lambda x: float(np.log(min(self.score(x), 1e6))), around, 60 * x.size)
-            found.append((end, self.score(end)))
-            if sum(np.isfinite(gamma) for _, gamma in found) >= most:
+            edge = np.where(np.abs(x) > _NEAR_ZERO, _SIMPLEX_SHARE * np.abs(x), _SIMPLEX_EDGE)
+            end = _simplex(cost, np.vstack([x, x + np.diag(edge)]), _RADIUS_EVALUATIONS * x.size)
+            if np.isfinite(self.score(end)):
+                # On towards what is asked: a simplex steps over valleys that the descent stays in.
+                around = np.vstack([end, end + np.diag(edge)])
+                end = _simplex(log_worst_case, around, _WORST_CASE_EVALUATIONS * x.size)
+            ends.append((end, self.score(end)))
+            stable_ends = sum(np.isfinite(gamma) for _, gamma in ends)
+            if stable_ends >= most:
                 break
-        found.sort(key=lambda entry: entry[1])
-        return [x for x, _ in found[:most]]
+        ends.sort(key=lambda entry: entry[1])
+        return [x for x, _ in ends[:most]]
 
     def _around_unstable_poles(self) -> Real:
-        """Sections and a gain of either sign whose crossover lies at or above the unstable poles."""
-        speeds = [
-            float(np.max(np.abs(np.log(data.plant.poles[np.abs(data.plant.poles) > 1.0]))))
-            for data in self.data
-            if data.plant.unstable_poles
-        ]
-        nyquist = self.data[0].plant.nyquist_rad_s
-        crossover = max(speeds, default=0.0) / self.cascade.dt_s * 10 ** self.rng.uniform(-0.1, 0.9)
-        crossover = min(crossover, 0.6 * nyquist)
+        """Parameters (n,) of one draw with its crossover near the unstable poles, and a gain of either sign.
+
+        Kinds of draws: a slow lag (only where tracking is asked without an integrator), leads, and random
+        sections (not for notches).
+        """
+        fastest_logs = []
+        for data in self.data:
+            if data.plant.unstable_poles:
+                outside = np.abs(data.plant.poles) > 1.0
+                speeds = np.abs(np.log(data.plant.poles[outside]))
+                fastest_logs.append(float(np.max(speeds)))
+        fastest_rad_s = max(fastest_logs, default=0.0) / self.cascade.dt_s
+        crossover = fastest_rad_s * 10 ** self.rng.uniform(*_UNSTABLE_CROSSOVER_DECADES)
+        crossover = min(crossover, _UNSTABLE_CROSSOVER_OF_NYQUIST * self.data[0].plant.nyquist_rad_s)
+
         kind = self.rng.uniform()
-        if self.tracks and "integrator" not in self.cascade.sections and kind < 0.6:
+        lacks_integrator = self.tracks and "integrator" not in self.cascade.sections
+        if lacks_integrator and kind < _SLOW_LAG_SHARE:
             parameters = self._slow_lag_sections(crossover / self.cascade.scale_rad_s)
-        elif "notch" in self.cascade.sections or kind < 0.8:
+        elif "notch" in self.cascade.sections or kind < _LEAD_SHARE:
             parameters = self._lead_sections(crossover / self.cascade.scale_rad_s)
         else:
             parameters = self._random_sections()
-        gain = abs(self._crossover_gain(parameters, crossover)) * 10 ** self.rng.uniform(-0.2, 0.5)
+        size = abs(self._crossover_gain(parameters, crossover))
+        gain = size * 10 ** self.rng.uniform(*_UNSTABLE_GAIN_DECADES)
         return with_gain(self.cascade, parameters, gain * self.rng.choice([-1.0, 1.0]))
 
     def _slow_lag_sections(self, crossover: float) -> Real:
-        """As `_lead_sections`, the first one with a slow real pole in place of an integrator, which tracking
-        without one needs."""
-        x, at = self._lead_sections(crossover), 0
-        slow = crossover * 10 ** self.rng.uniform(-5.0, -2.0)
-        low, high = crossover * 10 ** self.rng.uniform(-1.3, -0.3, 2), crossover * self.rng.uniform(3.0, 10.0)
+        """Parameters (n,) of lead sections around a crossover, of which one is a slow lag instead.
+
+        Its slow real pole stands in for an integrator, which tracking without one needs. crossover: in units
+        of the scale. The lag is the first section of second order, else the first of first order.
+        """
+        x = self._lead_sections(crossover)
+        slow_pole = crossover * 10 ** self.rng.uniform(*_SLOW_POLE_DECADES)
+        zeros = crossover * 10 ** self.rng.uniform(*_LAG_ZERO_DECADES, 2)
+        fast_pole = crossover * self.rng.uniform(*_FAST_POLE_RATIOS)
+        first = 0
         for kind in self.cascade.sections:
             if kind == "second_order":
-                x[at : at + 3] = np.poly(-low)
-                x[at + 3 : at + 5] = np.log([high + slow, high * slow])
+                x[first : first + 3] = np.poly(-zeros)
+                x[first + 3 : first + 5] = np.log([fast_pole + slow_pole, fast_pole * slow_pole])
                 return x
             if kind == "first_order" and "second_order" not in self.cascade.sections:
-                x[at : at + 3] = [1.0, low[0], np.log(slow)]
+                x[first : first + 3] = [1.0, zeros[0], np.log(slow_pole)]
                 return x
-            at += Cascade((kind,), 1.0, 1.0).parameters
+            first += Cascade((kind,), 1.0, 1.0).parameters
         return x
 
     def _random_sections(self) -> Real:
-        """Sections with corners within a factor 5 of the scale, numerators near their denominators."""
+        """Parameters (n,) of sections with corners around the scale and numerators near their denominators.
+
+        Gains are about one; the parameters of each kind of section are described in `biquads`.
+        """
         x: list[float] = []
         for kind in self.cascade.sections:
-            corner = 10 ** self.rng.uniform(-0.7, 0.7)
-            damping = max(self.rng.uniform(0.3, 1.0), self.least_damping * 1.01)
-            jitter = 1.0 + 0.3 * self.rng.standard_normal(3)
-            if kind == "integrator":  # proportional part first, slow integral action
-                x += [jitter[0], 0.1 * corner * abs(jitter[1])]
+            corner = 10 ** self.rng.uniform(*_CORNER_DECADES)
+            drawn_damping = self.rng.uniform(*_SECTION_DAMPING)
+            damping = max(drawn_damping, self.least_damping * _CLEAR_OF_BOUND)
+            jitter = 1.0 + _NUMERATOR_JITTER * self.rng.standard_normal(3)
+            if kind == "integrator":
+                # Proportional part first, slow integral action.
+                x += [jitter[0], _INTEGRAL_SHARE * corner * abs(jitter[1])]
             elif kind == "first_order":
                 x += [jitter[0], corner * abs(jitter[1]), np.log(corner)]
             elif kind == "notch":
+                # The numerator's damping is 1: a wide notch at the corner.
                 x += [np.log(2 * damping * corner), np.log(2 * corner), 2 * np.log(corner)]
             else:
                 numerator = np.array([1.0, 2 * damping * corner, corner**2]) * jitter
@@ -277,110 +505,191 @@ class StartMaker:
         return np.array(x)
 
     def _lead_sections(self, crossover: float) -> Real:
-        """PI far below, one lead (zero at a quarter, poles at four times) around the crossover, the rest near
-        one."""
+        """Parameters (n,) of a lead around a crossover, a PI far below it, and other sections near one.
+
+        crossover: in units of the scale. The first section that can be the lead is: zero at a quarter of the
+        crossover, poles at four times; of second order with two poles and one zero.
+        """
         x: list[float] = []
-        lead_left = True
+        lead_is_missing = True
+        zero = _LEAD_ZERO * crossover
+        pole = _LEAD_POLES * crossover
         for kind in self.cascade.sections:
-            low, high = 0.25 * crossover, 4.0 * crossover
-            jitter = 1.0 + 0.1 * self.rng.standard_normal(3)
-            corner = 10 ** self.rng.uniform(-0.3, 0.7)
+            jitter = 1.0 + _LEAD_JITTER * self.rng.standard_normal(3)
+            corner = 10 ** self.rng.uniform(*_OTHER_CORNER_DECADES)
             if kind == "integrator":
-                x += [1.0, 0.05 * crossover * jitter[0]]
+                x += [1.0, _PI_ZERO * crossover * jitter[0]]
+            elif kind == "first_order" and lead_is_missing:
+                x += [1.0, zero * jitter[0], np.log(pole)]
+                lead_is_missing = False
             elif kind == "first_order":
-                zero = low * jitter[0] if lead_left else corner * jitter[0]
-                x += [1.0, zero, np.log(high if lead_left else corner)]
-                lead_left = False
+                x += [1.0, corner * jitter[0], np.log(corner)]
             elif kind == "notch":
-                x += [np.log(1.8 * corner), np.log(2 * corner), 2 * np.log(corner)]
-            elif lead_left:
-                x += [0.0, high * jitter[0], high * low * jitter[1], np.log(2 * high), 2 * np.log(high)]
-                lead_left = False
+                x += [np.log(_IDLE_NOTCH * corner), np.log(2 * corner), 2 * np.log(corner)]
+            elif lead_is_missing:
+                numerator = [0.0, pole * jitter[0], pole * zero * jitter[1]]
+                x += [*numerator, np.log(2 * pole), 2 * np.log(pole)]
+                lead_is_missing = False
             else:
-                numerator = np.array([1.0, 2 * corner, corner**2]) * jitter
-                x += [*numerator, np.log(2 * corner), 2 * np.log(corner)]
+                numerator_values = np.array([1.0, 2 * corner, corner**2]) * jitter
+                x += [*numerator_values, np.log(2 * corner), 2 * np.log(corner)]
         return np.array(x)
 
     def _low_gain(self, parameters: Real) -> float:
-        """Signed factor that puts the centre's crossover at a random frequency below the scale."""
-        crossover = self.cascade.scale_rad_s * 10 ** self.rng.uniform(-1.5, -0.3)
+        """Signed factor that puts the crossover of the nominal loop at a random frequency below the scale."""
+        crossover = self.cascade.scale_rad_s * 10 ** self.rng.uniform(*_LOW_CROSSOVER_DECADES)
         gain = self._crossover_gain(parameters, crossover)
-        if not self.keeps_sign:
-            gain *= 1.0 if self.rng.uniform() < 0.5 else -1.0  # pure damping knows no sign
+        # Pure damping knows no sign.
+        if not self.keeps_sign and self.rng.uniform() >= 0.5:
+            gain *= -1.0
         return gain
 
     def _crossover_gain(self, parameters: Real, crossover_rad_s: float) -> float:
-        """Factor that makes |L| = 1 at the crossover, signed so that arg L(0+) = -i pi/2 (i integrators)."""
-        data = self.data[0]
-        omega = data.ellipses.omega_rad_s
-        loop = self.cascade.response(parameters, omega) * data.ellipses.centre
-        size = float(np.abs(loop[int(np.argmin(np.abs(omega - crossover_rad_s)))]))
-        return (1.0 if (loop[0] * 1j**self.integrators).real >= 0 else -1.0) / max(size, 1e-12)
+        """Signed factor that makes |L| = 1 of the first plant's centre at the crossover.
+
+        The sign makes L at the lowest frequency of the grid that of a positive gain times 1 / (j w)^i, with i
+        integrators in the loop. The delay is left out: it turns L, and does not change |L|.
+        """
+        ellipses = self.data[0].ellipses
+        omega = ellipses.omega_rad_s
+        loop = self.cascade.response(parameters, omega) * ellipses.centre
+        nearest = int(np.argmin(np.abs(omega - crossover_rad_s)))
+        size = float(np.abs(loop[nearest]))
+        turned_back = (loop[0] * 1j**self.integrators).real
+        sign = 1.0 if turned_back >= 0 else -1.0
+        # A loop that vanishes at the crossover gets a large gain and is dropped as unstable.
+        return sign / max(size, 1e-12)
 
 
 def _simplex(cost: Callable[[Real], float], start: Real, evaluations: int) -> Real:
-    """Least cost that Nelder and Mead's simplex finds from a simplex (n + 1, n)."""
+    """Parameters (n,) of the least cost that Nelder and Mead's simplex finds from a simplex (n + 1, n)."""
     from scipy.optimize import minimize  # here: every command would wait for it
 
+    # Costs are of the order of one; differences of 1e-4 decide nothing.
     options: Any = {"maxfev": evaluations, "initial_simplex": start, "adaptive": True, "fatol": 1e-4}
-    return np.asarray(minimize(cost, start[0], method="Nelder-Mead", options=options).x, dtype=np.float64)
+    result = minimize(cost, start[0], method="Nelder-Mead", options=options)
+    return np.asarray(result.x, dtype=np.float64)
 
 
 def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:
-    """The same controller times a factor (unchanged where the first section has no gain of its own)."""
-    first = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}[cascade.sections[0]]
+    """Parameters (n,) of the controller times a factor.
+
+    Parameters
+    ----------
+    cascade : Cascade
+    parameters : ndarray, shape (n,)
+    factor : float
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        A copy; unchanged where the first section is a notch, which has no gain of its own.
+    """
+    numerator_sizes = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}
+    numerator_size = numerator_sizes[cascade.sections[0]]
     scaled = np.array(parameters)
-    scaled[:first] *= factor
+    scaled[:numerator_size] *= factor
     return scaled
 
 
 def with_cancelling_section(
     lower: Cascade, parameters: Real, higher: Cascade, rng: np.random.Generator, *, damping: float = 0.8
 ) -> Real:
-    """The same controller in a cascade with one section of order two more: its zeros sit on its poles.
+    """Parameters of an unchanged controller in a cascade with one section of order two more.
 
-    The corner of the new section is drawn within a factor 5 of the scale; it does not change the response.
-    damping: of the new pair, at least what is asked of the controller's own poles.
+    Parameters
+    ----------
+    lower : Cascade
+        Of the controller.
+    parameters : ndarray, shape (n,)
+        Of the controller.
+    higher : Cascade
+        The sections of `lower`, and one of kind "second_order" or "notch" at the end.
+    rng : numpy.random.Generator
+        Draws the corner of the new section, within a factor 5 of the scale.
+    damping : float
+        Damping ratio of the new pair of poles: at least what is asked of the controller's own poles. The
+        default, .8, has no resonance.
+
+    Returns
+    -------
+    ndarray, shape (n + 3,) for a notch, else (n + 5,)
+        The zeros of the new section sit on its poles, so the response does not change; a descent can pull
+        them apart.
+
+    Raises
+    ------
+    ValueError
+        `higher` is not `lower` with one such section more.
     """
-    if higher.sections[:-1] != lower.sections or higher.sections[-1] not in ("second_order", "notch"):
+    added_kind = higher.sections[-1]
+    if higher.sections[:-1] != lower.sections or added_kind not in ("second_order", "notch"):
         raise ValueError(f"{higher.sections} is not {lower.sections} with one section of order two more")
-    corner = 10 ** rng.uniform(-0.7, 0.7)
+    corner = 10 ** rng.uniform(*_CORNER_DECADES)
     poles = [np.log(2 * damping * corner), 2 * np.log(corner)]
-    zeros = [poles[0]] if higher.sections[-1] == "notch" else [1.0, 2 * damping * corner, corner**2]
+    zeros = [poles[0]] if added_kind == "notch" else [1.0, 2 * damping * corner, corner**2]
     return np.concatenate([parameters, zeros, poles])
 
 
 def in_sections(
     sections: Sequence[SectionKind], numerator: Real, denominators: Sequence[Real]
 ) -> Real | None:
-    """Parameters of numerator/(product of denominators): roots dealt to sections, gain to the first.
+    """Parameters of a cascade with a given numerator over the product of given denominators.
 
-    Complex pairs go to second-order sections while there are any; where too many, a pair becomes two real
-    zeros of its size. None for a numerator that vanishes.
+    Parameters
+    ----------
+    sections : sequence of SectionKind
+        No notch, whose numerator is not free.
+    numerator : ndarray, shape (order + 1,)
+        Coefficients in p, highest power first.
+    denominators : sequence of ndarray
+        Of each section, in p, highest power first, monic.
+
+    Returns
+    -------
+    ndarray, shape (n,), or None
+        Roots of the numerator are dealt to the sections; the first one takes the gain. None for a numerator
+        that vanishes or is not finite.
+
+    Notes
+    -----
+    Complex pairs go to second-order sections while there are any. Where there are too many pairs, one becomes
+    two real zeros of its size, which changes the controller: an approximation that only starts make use of.
     """
-    large = float(np.max(np.abs(numerator), initial=0.0))
-    if not (np.isfinite(large) and large > 0):
+    largest = float(np.max(np.abs(numerator), initial=0.0))
+    if not (np.isfinite(largest) and largest > 0):
         return None
-    trimmed = np.trim_zeros(np.where(np.abs(numerator) > 1e-12 * large, numerator, 0.0), "f")
+    # Coefficients that are rounding would become roots far outside.
+    significant = np.where(np.abs(numerator) > 1e-12 * largest, numerator, 0.0)
+    trimmed = np.trim_zeros(significant, "f")
+    gain = trimmed[0]
+
     roots = np.roots(trimmed)
-    pairs = [np.real(np.poly([r, np.conj(r)])) for r in roots if r.imag > 0]
-    singles = sorted((float(r.real) for r in roots if r.imag == 0), key=abs)
-    second = sum(kind == "second_order" for kind in sections)
-    while len(pairs) > second:
+    pairs = [np.real(np.poly([root, np.conj(root)])) for root in roots if root.imag > 0]
+    real_zeros = sorted((float(root.real) for root in roots if root.imag == 0), key=abs)
+    second_order_sections = sum(kind == "second_order" for kind in sections)
+    while len(pairs) > second_order_sections:
         size = float(np.sqrt(pairs.pop()[2]))
-        singles += [-size, -size]
+        real_zeros += [-size, -size]
+
+    # Each section takes what it has room for; real zeros in ascending size, so that neighbours share one.
     numerators: list[Real] = []
     for kind in sections:
         if kind == "second_order" and pairs:
             numerators.append(pairs.pop())
         else:
-            count = 2 if kind == "second_order" else 1
-            take, singles = singles[:count], singles[count:]
-            numerators.append(np.atleast_1d(np.real(np.poly(take))))
+            room = 2 if kind == "second_order" else 1
+            section_zeros = real_zeros[:room]
+            real_zeros = real_zeros[room:]
+            numerators.append(np.atleast_1d(np.real(np.poly(section_zeros))))
+
     x: list[float] = []
     for number, (kind, top, bottom) in enumerate(zip(sections, numerators, denominators, strict=True)):
-        full = np.concatenate([np.zeros(bottom.size - top.size), top]) * (trimmed[0] if number == 0 else 1.0)
-        x += full.tolist()
+        # Fewer zeros than poles are leading zeros of the numerator.
+        coefficients = np.concatenate([np.zeros(bottom.size - top.size), top])
+        if number == 0:
+            coefficients = coefficients * gain
+        x += coefficients.tolist()
         if kind != "integrator":
             x += np.log(bottom[1:]).tolist()
     return np.array(x)
