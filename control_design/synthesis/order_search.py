@@ -1,4 +1,17 @@
-"""Search for the best controller of one order: starts, descent, exchange of frequencies."""
+"""Search for the controller of one order and structure with the smallest worst case.
+
+The worst case gamma of a parameter vector has many local minima. `OrderSearch` finds good ones in two ways.
+`quick` begins at controllers of any order (from the Youla bound, `youla_starts`), fitted by the structure,
+and says whether the search may end with what they lead to. `run` begins at many random and shaped loops
+(`starts`) and at controllers of a lower order. Both send each start down with `MinimaxDescent`.
+
+Descents see the worst case on a lean grid of frequencies only. What ends best is then improved by exchange
+(`_exchange`): frequencies at which the dense grid shows a larger worst case join the lean grid, and the
+descents go on. So two numbers belong to every end: `gamma_grid`, of the lean grid, and `gamma`, of the dense
+one.
+
+The constants below are efforts: larger ones take more time and may find a better valley.
+"""
 
 from __future__ import annotations
 
@@ -19,33 +32,63 @@ from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
 from control_design.synthesis.youla_starts import FreeControllers, fitted
 
+# Called with the share that is done, 0 to 1, and a message for the user.
 Progress = Callable[[float, str], None]
 
-_STEPS = 100  # of the descent
-_DRAWS = 200  # shaped loops drawn; each costs 1 ms
-_LOW_GAIN = 4  # with tracking: starts of little gain
-_CARRIED = 3  # candidates carried through the exchange, and shaped loops that are started from
-_HOPS, _LATER_HOPS = 4, 2  # starts beside the best end, in the first round and in later ones
-_HALVINGS = 20  # natural units of a section far from the loop's crossover are far too large
-_RETRIEVALS = 3  # rounds for ends that are good on the grid and not robustly stable between its points
-_RETREAT, _RETREATS = 0.8, 20  # factor on their gain, and how often, until they are stable on the finer grid
-_FINISHING = 10  # rounds for the best alone, until dense check and grid agree
-_AGREE = 1.001  # gammas that differ by less than a thousandth are of one optimum
-_NO_RESONANCE = 0.3  # damping that fits begin with: a narrow one of their own hides between grid points
-_WEIGHTED = 3  # rounds of fits with random weights
+# Steps of a descent. Of 700 descents 95 % ended by themselves within 60; one in a hundred is cut off.
+_STEPS = 100
+# Shaped loops that are drawn, of which the best are started from. Each costs 1 ms.
+_SHAPED_DRAWS = 200
+# Starts of little gain where tracking is asked; shaped loops are mostly better there.
+_LOW_GAIN_STARTS = 4
+# Ends that are carried through the exchange, and shaped loops that are started from where tracking is asked.
+_CARRIED = 3
+# Random neighbours of the best end that are started from, in the first round of exchange and in later ones.
+_FIRST_HOPS = 4
+_LATER_HOPS = 2
+# Halvings of a random hop until it is stable. Natural units of a section far from the crossover are far too
+# large.
+_HALVINGS = 20
+# Rounds for ends that are good on the lean grid and not robustly stable between its points.
+_RETRIEVALS = 3
+# Factor on the gain of such an end, again and again until it is stable on the finer grid; 20 times leave 1 %.
+_RETREAT = 0.8
+_RETREATS = 20
+# Rounds of exchange for the best end by itself: a limit for grids that never agree.
+_FINISHING = 10
+# Ratio of two worst cases up to which both are the same local minimum. Descents end within about 1e-4 of it.
+_AGREE = 1.001
+# Least damping ratio of fitted poles: a narrow resonance of a start stays, and hides between grid points.
+_NO_RESONANCE = 0.3
+# Rounds of fits with random weights, after the one with the weights of the bound.
+_WEIGHTED_ROUNDS = 3
 # Steps that every fit gets before the best of a round goes on alone. Read off the paths of random designs 0
 # to 21: after ten it mostly, not always, leads to the best end of its round; after five less often.
-_TRIAL = 10
-_ROUGH_DRAWS = 50  # shaped loops drawn where ten steps choose between them
-# Of the worst case that the small Youla problem reaches, and how far that lies above the default one's at
-# most: a design below both shows that it has ended in a valley, and is no bound.
-_NEAR, _FAIR, _FINER = 1.03, 1.05, 1.1
+_TRIAL_STEPS = 10
+# Shaped loops that are drawn where ten steps choose between them.
+_ROUGH_DRAWS = 50
+# Worst case over that of the small Youla problem (`youla_starts`) at which a search may end: near enough.
+_NEAR = 1.03
+# The same where several ends agree before all kinds of starts were tried.
+_FAIR = 1.05
+# How far the small problem's worst case lies above that of the default one, at most. A design below both
+# shows that the small problem has ended in a valley of its own, and that its value is no bound.
+_FINER = 1.1
 
 
 @dataclass(frozen=True, eq=False)
 class TriedController:
-    """Where a start ended: parameters, worst case on the lean grid it came from and on the dense grid (inf:
-    unstable, or not checked)."""
+    """Where the descent from one start ended.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (n,)
+        Of the cascade.
+    gamma_grid : float
+        Worst case on the lean grid of that descent; inf: unstable.
+    gamma : float
+        Worst case on the dense grid; inf: not robustly stable there, or not checked.
+    """
 
     parameters: Real
     gamma_grid: float
@@ -54,9 +97,18 @@ class TriedController:
 
 @dataclass(frozen=True, eq=False)
 class OrderResult:
-    """Best candidate of one order (None: nothing stable), how the starts did, gamma after every round.
+    """What the search of one order found.
 
-    nearest: without a best, the parameters of the end that came nearest to a robustly stable loop.
+    Attributes
+    ----------
+    best : TriedController or None
+        None: nothing was robustly stable on the dense grid.
+    reports : tuple of StartReport
+        One for each descent, in the order in which they were run.
+    history : tuple of float
+        Dense worst case of the best after the starts and after every round of exchange.
+    nearest : ndarray, shape (n,), or None
+        Without a best: parameters of the end that came nearest to a robustly stable loop.
     """
 
     best: TriedController | None
@@ -66,7 +118,20 @@ class OrderResult:
 
 
 class OrderSearch:
-    """One cascade on one problem; `given` are parameter vectors that are good already, from a lower order."""
+    """Searches for the parameters of one cascade on one problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        Plants, requirements, and lean grids `grids`, which grow while this searches.
+    cascade : Cascade
+        Sections of the controller.
+    rng : numpy.random.Generator
+        All starts and hops are drawn from it.
+    tell : Progress
+    known_starts : sequence of ndarray, shape (n,)
+        Parameter vectors that are good already, from a lower order; the first is checked before any descent.
+    """
 
     def __init__(
         self,
@@ -74,184 +139,172 @@ class OrderSearch:
         cascade: Cascade,
         rng: np.random.Generator,
         tell: Progress,
-        given: Sequence[Real] = (),
+        known_starts: Sequence[Real] = (),
     ) -> None:
-        self.problem, self.cascade, self.rng, self.tell, self.given = problem, cascade, rng, tell, given
-        self.options, self.spec = problem.options, problem.spec
+        """Keep the arguments; nothing is run yet."""
+        self.problem = problem
+        self.cascade = cascade
+        self.rng = rng
+        self.tell = tell
+        self.known_starts = known_starts
+        self.options = problem.options
+        self.spec = problem.spec
         self.reports: list[StartReport] = []
-        self._known: tuple[list[Real], MinimaxDescent] | None = None
+        # Lean grids and the descent on them, which takes a while to build.
+        self._latest_descent: tuple[list[Real], MinimaxDescent] | None = None
+
+    # The three searches
 
     def run(self) -> OrderResult:
-        """Starts, descent from each, exchange with hops."""
-        found = [
-            TriedController(x, self._descent().value(x), self.problem.gamma(self.cascade, x))
-            for x in self.given[:1]
-        ]
-        if self._enough(found):
-            return OrderResult(found[0], (), (found[0].gamma,))
-        starts = self._starts()
-        drawn = len(starts) - len(self.given)
-        least = len(self.given) + max((drawn + 1) // 2, min(drawn, 3))
+        """Best controller from many starts: descent from each, then exchange with hops.
+
+        Returns
+        -------
+        OrderResult
+            Ends early where a controller is good enough (`options.sufficient_gamma`).
+        """
         ends: list[TriedController] = []
-        for number, end in enumerate(map(self._end, starts)):
-            self.tell(0.5 * (number + 1) / len(starts), f"start {number + 1} of {len(starts)}")
+        for x in self.known_starts[:1]:
+            grid_gamma = self._descent().value(x)
+            ends.append(TriedController(x, grid_gamma, self.problem.gamma(self.cascade, x)))
+        if self._good_enough(ends):
+            return OrderResult(ends[0], (), (ends[0].gamma,))
+
+        starts = self._starts()
+        # Agreement counts not before half of the starts were tried: the first ones are of one kind.
+        drawn = len(starts) - len(self.known_starts)
+        fewest_starts = len(self.known_starts) + max((drawn + 1) // 2, min(drawn, 3))
+        ends_of_starts: list[TriedController] = []
+        for number, start in enumerate(starts, 1):
+            end = self._end(start)
+            self.tell(0.5 * number / len(starts), f"start {number} of {len(starts)}")
+            ends_of_starts.append(end)
             ends.append(end)
-            found.append(end)
-            if self._enough(found):
-                best = min(found, key=lambda c: c.gamma)
+            if self._good_enough(ends):
+                best = min(ends, key=lambda end: end.gamma)
                 return OrderResult(best, tuple(self.reports), (best.gamma,))
-            if number + 1 >= least and self._agree(found):
-                break  # not before half of the starts: the first ones are of one kind
-        found = self._retrieved(found)
-        if not found:
-            return OrderResult(None, tuple(self.reports), (), self._nearest(ends))
-        return self._exchange(found)
+            if number >= fewest_starts and self._agree(ends):
+                break
+
+        stable_ends = self._retrieved(ends)
+        if not stable_ends:
+            return OrderResult(None, tuple(self.reports), (), self._nearest(ends_of_starts))
+        return self._exchange(stable_ends)
 
     def quick(self, free: FreeControllers) -> tuple[OrderResult, bool]:
-        """From controllers of the Youla bound: the result, and whether the search may end with it.
+        """Best controller from those of the Youla bound, and whether the search may end with it.
 
-        One fit of each, then fits with random weights, then shaped and random loops, each round a race: see
-        `_raced`. It may end where the result lies within `_NEAR` of what the controllers of any order reach,
-        or where as many ends as asked agree on it and it meets the specification. A design that misses the
-        specification gets all fits, as another valley may meet it. Agreement before the last starts
-        counts within `_FAIR` only.
+        Parameters
+        ----------
+        free : FreeControllers
+            Responses of controllers of any order, and `gamma`, the worst case that they reach.
+
+        Returns
+        -------
+        result : OrderResult
+        settled : bool
+            The result is good enough, or lies within `_NEAR` of `free.gamma`, or meets the specification with
+            as many ends agreeing on it as are asked.
+
+        Notes
+        -----
+        Rounds of starts, each a race (`_raced`): one fit of each free controller, then fits with random
+        weights over frequency `_WEIGHTED_ROUNDS` times, then shaped and random loops. A round may be the last
+        if the best end so far is near `free.gamma` and meets the specification: a design that misses it gets
+        all fits, as another valley may meet it. It may also be the last if the ends agree on a design that
+        meets the specification within `_FAIR` of `free.gamma`.
         """
-        found: list[TriedController] = []
+        ends: list[TriedController] = []
 
-        def near(gamma: float) -> bool:
+        def near_free(gamma: float) -> bool:
+            """Whether a worst case is as good as an order can hope for, and the bound to be trusted."""
             return free.gamma / _FINER <= gamma <= _NEAR * free.gamma < np.inf
 
         def agreed(gamma: float, fair: float = np.inf) -> bool:
-            return gamma <= min(1.0, fair * free.gamma) and self._agree(found)
+            """Whether several ends agree and gamma meets the specification, within fair times the bound."""
+            return gamma <= min(1.0, fair * free.gamma) and self._agree(ends)
 
-        turn = 0
-        while turn < _WEIGHTED + 2:
-            least = min((c.gamma_grid for c in found), default=np.inf)
-            last = least <= 1.0 or turn > _WEIGHTED
-            if self._enough(found) or agreed(least, _FAIR) or (last and near(least)):
+        rounds = _WEIGHTED_ROUNDS + 2
+        for number in range(rounds):
+            least = min((end.gamma_grid for end in ends), default=np.inf)
+            all_fits_tried = number > _WEIGHTED_ROUNDS
+            may_end_near = least <= 1.0 or all_fits_tried
+            if self._good_enough(ends) or agreed(least, _FAIR) or (may_end_near and near_free(least)):
                 break
-            self.tell(0.1 * turn, f"start {turn + 1} of {_WEIGHTED + 2}, from controllers of any order")
-            starts = self._fits(free, turn) if turn <= _WEIGHTED else self._others()
-            found, turn = found + self._raced(starts), turn + 1
-        ends = self._retrieved(self._checked(found))
-        if not ends:
-            return OrderResult(None, tuple(self.reports), (), self._nearest(found) if found else None), False
-        result = self._exchange(ends, hops=False)
+            self.tell(0.1 * number, f"start {number + 1} of {rounds}, from controllers of any order")
+            starts = self._other_starts() if all_fits_tried else self._fits(free, weighted=number > 0)
+            ends = ends + self._raced(starts)
+
+        stable_ends = self._retrieved(self._checked(ends))
+        if not stable_ends:
+            nearest = self._nearest(ends) if ends else None
+            return OrderResult(None, tuple(self.reports), (), nearest), False
+        result = self._exchange(stable_ends, hops=False)
         assert result.best is not None
         gamma = result.best.gamma
-        return result, self._enough([result.best]) or near(gamma) or agreed(gamma)
+        settled = self._good_enough([result.best]) or near_free(gamma) or agreed(gamma)
+        return result, settled
 
     def fits_only(self, free: FreeControllers) -> OrderResult:
-        """From one fit of each controller of any order, and what is given of a lower order: a race."""
-        ends = self._retrieved(self._checked(self._raced([*self.given, *self._fits(free, 0)])))
-        return self._exchange(ends, hops=False) if ends else OrderResult(None, tuple(self.reports), ())
+        """Best controller from one fit of each free controller and from the known starts: one race.
 
-    def _raced(self, starts: Sequence[Real]) -> list[TriedController]:
-        """Where `_TRIAL` steps lead from each start, the best first and from there to its end; not checked
-        between the points of the grid unless it may be enough."""
-        tried = sorted((self._end(x, _TRIAL, checked=False) for x in starts), key=lambda c: c.gamma_grid)
-        if tried and np.isfinite(tried[0].gamma_grid):
-            tried[0] = self._end(tried[0].parameters, checked=False)
-            if tried[0].gamma_grid <= self.options.sufficient_gamma:
-                tried[:1] = self._checked(tried[:1])
-        return tried
+        Parameters
+        ----------
+        free : FreeControllers
 
-    def _checked(self, found: Sequence[TriedController]) -> list[TriedController]:
-        """Those of different optima, best first, with their worst cases on the dense grid, until as many as
-        are carried are stable there."""
-        checked: list[TriedController] = []
-        for c in different(found, len(found), on_grid=True):
-            if np.isfinite(c.gamma_grid):
-                checked.append(replace(c, gamma=self.problem.gamma(self.cascade, c.parameters)))
-            if sum(np.isfinite(c.gamma) for c in checked) == _CARRIED:
-                break
-        return checked
+        Returns
+        -------
+        OrderResult
+        """
+        starts = [*self.known_starts, *self._fits(free, weighted=False)]
+        ends = self._retrieved(self._checked(self._raced(starts)))
+        if not ends:
+            return OrderResult(None, tuple(self.reports), ())
+        return self._exchange(ends, hops=False)
 
-    def _fits(self, free: FreeControllers, turn: int) -> list[Real]:
-        """Stable fits of the controllers of any order; from the second turn on with random weights."""
+    # Starts
+
+    def _fits(self, free: FreeControllers, *, weighted: bool) -> list[Real]:
+        """Parameters (n,) of a stable fit of each free controller that has one; weighted: at random."""
         damping = max(1.01 * (self.spec.controller_damping or 0.0), _NO_RESONANCE)
-        rng = self.rng if turn else None
+        rng = self.rng if weighted else None
         fits = [fitted(self.cascade, each, least_damping=damping, rng=rng) for each in free.each]
-        value = self._descent().value
-        stable = [x if np.isfinite(value(x)) else self._retreat(x) for x in fits if x is not None]
-        return [x for x in stable if x is not None]
+        worst_case = self._descent().value
+        stable = []
+        for x in fits:
+            if x is None:
+                continue
+            start = x if np.isfinite(worst_case(x)) else self._retreat(x)
+            if start is not None:
+                stable.append(start)
+        return stable
 
-    def _others(self) -> list[Real]:
-        """Shaped loops and random ones of little gain."""
+    def _other_starts(self) -> list[Real]:
+        """Parameters (n,) of a few shaped loops and random ones of little gain; none for unstable plants."""
         if any(plant.unstable_poles for plant in self.problem.plants):
             return []
         maker = self._maker()
         shaped = [x for x, _ in maker.shaped(_ROUGH_DRAWS, _CARRIED)]
         return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _CARRIED))]
 
-    def _nearest(self, ends: Sequence[TriedController]) -> Real:
-        """Parameters that are stable on the grid, the smallest worst case first; else nearest to the
-        circle."""
-        key = [(c.gamma_grid, self._radius(c.parameters)) for c in ends]
-        return ends[min(range(len(ends)), key=lambda at: key[at])].parameters
-
-    def _radius(self, parameters: Real) -> float:
-        """Largest pole modulus of the nominal loops."""
-        poles = self.problem.closed_loop_poles(self.cascade, parameters)
-        return max(float(np.max(np.abs(z), initial=0.0)) for z in poles)
-
-    def _retrieved(self, found: Sequence[TriedController]) -> list[TriedController]:
-        """What is stable on the dense grid, best first, enlarged by what can be saved of the rest.
-
-        An end that is better on the grid than the best, and reaches -1 between its points, has found a valley
-        worth having: with its violated frequencies on the grid it goes on, with less gain at first.
-        """
-        kept = [c for c in found if np.isfinite(c.gamma)]
-        lost = [c for c in found if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
-        for _ in range(_RETRIEVALS):
-            limit = min((c.gamma for c in kept), default=np.inf) * (1 - EXCHANGE_TOLERANCE)
-            lost = different([c for c in lost if c.gamma_grid < limit], _CARRIED, on_grid=True)
-            if not lost or self._enough(kept):
-                break
-            for c in lost:
-                self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
-            retreats = [self._retreat(c.parameters) for c in lost]
-            lost = [self._end(x) for x in retreats if x is not None]
-            kept += [c for c in lost if np.isfinite(c.gamma)]
-            lost = [c for c in lost if np.isfinite(c.gamma_grid) and not np.isfinite(c.gamma)]
-        return sorted(kept, key=lambda c: c.gamma)
-
-    def _retreat(self, parameters: Real) -> Real | None:
-        """The same with less gain, until it is stable on the grids as they are now; None if it never is."""
-        for number in range(1, _RETREATS + 1):
-            trial = with_gain(self.cascade, parameters, _RETREAT**number)
-            if np.isfinite(self._descent().value(trial)):
-                return trial
-        return None
-
-    def _agree(self, found: Sequence[TriedController]) -> bool:
-        """Enough descents ended at the best value: more of them would hardly find another."""
-        stable = [c.gamma_grid for c in found if np.isfinite(c.gamma_grid)]
-        return sum(g <= min(stable) * _AGREE for g in stable) >= self.options.agreeing_starts
-
-    def _enough(self, found: Sequence[TriedController]) -> bool:
-        return min((c.gamma for c in found), default=np.inf) <= self.options.sufficient_gamma
-
-    def _end(self, start: Real, steps: int = _STEPS, *, checked: bool = True) -> TriedController:
-        """Where the descent from a start ends; checked: on the dense grid, too. What was run is noted."""
-        x, gamma, taken = self._descent().run(start, steps)
-        dense = self.problem.gamma(self.cascade, x) if checked and np.isfinite(gamma) else np.inf
-        seen = min(gamma, LARGEST_GAMMA), dense if np.isfinite(dense) else None
-        self.reports.append(StartReport("descent", taken, *seen))
-        return TriedController(x, gamma, dense)
-
-    def _descent(self) -> MinimaxDescent:
-        """On the lean grids as they are now; kept until they change."""
-        problem, cascade, grids = self.problem, self.cascade, list(self.problem.grids)
-        if self._known is None or not all(map(np.array_equal, self._known[0], grids)):
-            damping = self.spec.controller_damping
-            descent = MinimaxDescent(
-                cascade, problem.rows(grids), partial(problem.stable, cascade), controller_damping=damping
-            )
-            self._known = grids, descent
-        return self._known[1]
+    def _starts(self) -> list[Real]:
+        """Parameters (n,) of all starts of `run`: the known ones first, then those that are drawn."""
+        maker = self._maker()
+        if any(plant.unstable_poles for plant in self.problem.plants):
+            stabilised = maker.stabilising(self._radius, max(self.options.starts, _CARRIED))
+            return [*self.known_starts, *stabilised]
+        shaped = [x for x, _ in maker.shaped(_SHAPED_DRAWS, self.options.starts)]
+        random = [maker.low_gain() for _ in range(self.options.starts)]
+        if self.problem.asks_tracking:
+            return [*self.known_starts, *random[:_LOW_GAIN_STARTS], *shaped[:_CARRIED]]
+        # In turn, so that an early end has seen both kinds.
+        mixed: list[Real] = []
+        for pair in zip_longest(shaped, random):
+            mixed += [start for start in pair if start is not None]
+        return [*self.known_starts, *mixed]
 
     def _maker(self) -> StartMaker:
+        """Source of random starts, scored on the lean grids as they are now."""
         return StartMaker(
             self.cascade,
             self.problem.lean(),
@@ -262,75 +315,211 @@ class OrderSearch:
             keeps_sign=self.problem.asks_tracking or self.problem.integrators > 0,
         )
 
-    def _starts(self) -> list[Real]:
-        maker = self._maker()
-        if any(plant.unstable_poles for plant in self.problem.plants):
-            return [*self.given, *maker.stabilising(self._radius, max(self.options.starts, _CARRIED))]
-        shaped = [x for x, _ in maker.shaped(_DRAWS, self.options.starts)]
-        random = [maker.low_gain() for _ in range(self.options.starts)]
-        if self.problem.asks_tracking:
-            return [*self.given, *random[:_LOW_GAIN], *shaped[:_CARRIED]]
-        mixed = (start for pair in zip_longest(shaped, random) for start in pair if start is not None)
-        return [*self.given, *mixed]
+    # Descents
 
-    def _exchange(self, found: list[TriedController], *, hops: bool = True) -> OrderResult:
-        """Add violated frequencies of the best candidates, improve them on the finer grid, and again.
+    def _descent(self) -> MinimaxDescent:
+        """Descent on the lean grids as they are now; built again only when they have changed."""
+        grids = list(self.problem.grids)
+        if self._latest_descent is not None:
+            known_grids, known_descent = self._latest_descent
+            if all(map(np.array_equal, known_grids, grids)):
+                return known_descent
+        descent = MinimaxDescent(
+            self.cascade,
+            self.problem.rows(grids),
+            partial(self.problem.stable, self.cascade),
+            controller_damping=self.spec.controller_damping,
+        )
+        self._latest_descent = (grids, descent)
+        return descent
 
-        Several are carried along at first: the best on a coarse grid is often not the best on a finer one.
-        In between, hops from the best look for a better valley.
+    def _end(self, start: Real, steps: int = _STEPS, *, checked: bool = True) -> TriedController:
+        """Where the descent from a start (n,) ends after at most so many steps; its report is noted.
+
+        checked: gamma of the dense grid, too; without it that is inf.
         """
-        history, tolerance = [found[0].gamma], EXCHANGE_TOLERANCE
-        pool, fresh = different(found, _CARRIED), list[TriedController]()
+        x, gamma_grid, steps_taken = self._descent().run(start, steps)
+        gamma = np.inf
+        if checked and np.isfinite(gamma_grid):
+            gamma = self.problem.gamma(self.cascade, x)
+        # Reports are stored as JSON, which knows no infinity.
+        reported_gamma = gamma if np.isfinite(gamma) else None
+        report = StartReport("descent", steps_taken, min(gamma_grid, LARGEST_GAMMA), reported_gamma)
+        self.reports.append(report)
+        return TriedController(x, gamma_grid, gamma)
+
+    def _raced(self, starts: Sequence[Real]) -> list[TriedController]:
+        """Where `_TRIAL_STEPS` steps lead from each start, and for the best of them a whole descent.
+
+        In ascending order of gamma_grid after the trial steps. Not checked on the dense grid, unless the best
+        is good enough on the lean one to end the search.
+        """
+        trials = [self._end(x, _TRIAL_STEPS, checked=False) for x in starts]
+        trials.sort(key=lambda end: end.gamma_grid)
+        if trials and np.isfinite(trials[0].gamma_grid):
+            trials[0] = self._end(trials[0].parameters, checked=False)
+            if trials[0].gamma_grid <= self.options.sufficient_gamma:
+                trials[:1] = self._checked(trials[:1])
+        return trials
+
+    # Judgement of ends
+
+    def _checked(self, ends: Sequence[TriedController]) -> list[TriedController]:
+        """Ends in different minima with their gamma on the dense grid, best on the lean grid first.
+
+        Stops once `_CARRIED` of them are robustly stable there, as the dense check is the dearer one.
+        """
+        checked: list[TriedController] = []
+        for end in different(ends, len(ends), on_grid=True):
+            if np.isfinite(end.gamma_grid):
+                dense_gamma = self.problem.gamma(self.cascade, end.parameters)
+                checked.append(replace(end, gamma=dense_gamma))
+            stable = sum(np.isfinite(end.gamma) for end in checked)
+            if stable == _CARRIED:
+                break
+        return checked
+
+    def _good_enough(self, ends: Sequence[TriedController]) -> bool:
+        """Whether the smallest dense gamma is one at which the user wants the search to stop."""
+        return min((end.gamma for end in ends), default=np.inf) <= self.options.sufficient_gamma
+
+    def _agree(self, ends: Sequence[TriedController]) -> bool:
+        """Whether enough descents ended at the best value: more of them would hardly find another.
+
+        There must be an end that is stable on the lean grid.
+        """
+        stable = [end.gamma_grid for end in ends if np.isfinite(end.gamma_grid)]
+        agreeing = sum(gamma <= min(stable) * _AGREE for gamma in stable)
+        return agreeing >= self.options.agreeing_starts
+
+    def _nearest(self, ends: Sequence[TriedController]) -> Real:
+        """Parameters (n,) of the end nearest to a robustly stable loop.
+
+        That is the smallest gamma_grid; where none is stable on the lean grid, the smallest pole modulus.
+        """
+        nearest = min(ends, key=lambda end: (end.gamma_grid, self._radius(end.parameters)))
+        return nearest.parameters
+
+    def _radius(self, parameters: Real) -> float:
+        """Largest pole modulus of all nominal loops, in z; below 1: stable."""
+        poles_of_loops = self.problem.closed_loop_poles(self.cascade, parameters)
+        return max(float(np.max(np.abs(poles), initial=0.0)) for poles in poles_of_loops)
+
+    # From the lean grid to the dense one
+
+    def _retrieved(self, ends: Sequence[TriedController]) -> list[TriedController]:
+        """Ends that are stable on the dense grid, best first, with those of the others that could be saved.
+
+        An end that is better on the lean grid than the best, and reaches -1 between its points, has found a
+        valley worth having: the frequencies that it violates join the lean grid, and it goes on from there,
+        with less gain at first.
+        """
+        stable = [end for end in ends if np.isfinite(end.gamma)]
+        lost = _lost_between_points(ends)
+        for _ in range(_RETRIEVALS):
+            limit = min((end.gamma for end in stable), default=np.inf) * (1 - EXCHANGE_TOLERANCE)
+            promising = [end for end in lost if end.gamma_grid < limit]
+            lost = different(promising, _CARRIED, on_grid=True)
+            if not lost or self._good_enough(stable):
+                break
+            for end in lost:
+                self.problem.add_violated(self.cascade, end.parameters, end.gamma_grid)
+            retreats = [self._retreat(end.parameters) for end in lost]
+            new_ends = [self._end(x) for x in retreats if x is not None]
+            stable += [end for end in new_ends if np.isfinite(end.gamma)]
+            lost = _lost_between_points(new_ends)
+        return sorted(stable, key=lambda end: end.gamma)
+
+    def _retreat(self, parameters: Real) -> Real | None:
+        """Parameters (n,) with as little less gain as makes them stable on the lean grids; None: never."""
+        for number in range(1, _RETREATS + 1):
+            trial = with_gain(self.cascade, parameters, _RETREAT**number)
+            if np.isfinite(self._descent().value(trial)):
+                return trial
+        return None
+
+    def _exchange(self, ends: list[TriedController], *, hops: bool = True) -> OrderResult:
+        """Best end after rounds of adding violated frequencies to the lean grid and descending again.
+
+        ends: stable on the dense grid, best first, at least one. Several are carried along at first, one less
+        in each round: the best on a coarse grid is often not the best on a finer one. hops: random neighbours
+        of the best are started from as well, which may lie in a better valley.
+        """
+        tolerance = EXCHANGE_TOLERANCE
+        history = [ends[0].gamma]
+        pool = different(ends, _CARRIED)
+        new_ends: list[TriedController] = []
         for number in range(self.options.exchange_rounds):
             self.tell(0.5 + 0.5 * number / self.options.exchange_rounds, f"exchange {number + 1}")
-            if self._enough(pool):
+            if self._good_enough(pool):
                 break
-            # Also of what lost: better on the grid and worse between its points, it may yet win.
-            added = sum(
-                self.problem.add_violated(self.cascade, c.parameters, c.gamma_grid)
-                for c in different([*pool, *fresh], _CARRIED)
-            )
+
+            # Frequencies that new ends violate count, too: better on the grid and worse between its points,
+            # such an end may win yet.
+            added = 0
+            for end in different([*pool, *new_ends], _CARRIED):
+                added += self.problem.add_violated(self.cascade, end.parameters, end.gamma_grid)
             if added == 0 and number > 0:
                 break
-            starts = [c.parameters for c in pool]
-            if fresh and min(c.gamma_grid for c in fresh) < pool[0].gamma * (1 - tolerance):
-                starts.append(min(fresh, key=lambda c: c.gamma_grid).parameters)
-            count = min(_HOPS if number == 0 else _LATER_HOPS, self.options.starts) if hops else 0
-            starts += [self._hop(pool[0].parameters) for _ in range(count)]
-            fresh = []
-            for at, end in enumerate(map(self._end, starts)):
-                fresh.append(end)
-                if number == 0 and at >= len(pool) and self._agree(fresh):
+
+            # Starts of this round: the pool, a new end that was better on the grid, and hops.
+            starts = [end.parameters for end in pool]
+            if new_ends:
+                best_on_grid = min(new_ends, key=lambda end: end.gamma_grid)
+                if best_on_grid.gamma_grid < pool[0].gamma * (1 - tolerance):
+                    starts.append(best_on_grid.parameters)
+            hop_count = 0
+            if hops:
+                hop_count = min(_FIRST_HOPS if number == 0 else _LATER_HOPS, self.options.starts)
+            starts += [self._hop(pool[0].parameters) for _ in range(hop_count)]
+
+            # Descents on the finer grid. In the first round, hops end where enough ends agree.
+            new_ends = []
+            for position, start in enumerate(starts):
+                new_ends.append(self._end(start))
+                if number == 0 and position >= len(pool) and self._agree(new_ends):
                     break
-            fresh = [c for c in self._retrieved([pool[0], *fresh]) if c is not pool[0]]
-            pool = different([*pool, *fresh], max(1, _CARRIED - 1 - number))
-            # More frequencies raise an optimum: what lies above the best already stays there.
-            pool = pool[:1] + [c for c in pool[1:] if c.gamma_grid <= pool[0].gamma]
-            history.append(pool[0].gamma)
-            settled = min([c.gamma_grid for c in fresh], default=np.inf) > pool[0].gamma * (1 - tolerance)
-            if number > 0 and settled and history[-1] > history[-2] * (1 - tolerance):
+            retrieved = self._retrieved([pool[0], *new_ends])
+            new_ends = [end for end in retrieved if end is not pool[0]]
+
+            # The pool of the next round. More frequencies raise an optimum: what lies above the best already
+            # stays there.
+            pool = different([*pool, *new_ends], max(1, _CARRIED - 1 - number))
+            best_gamma = pool[0].gamma
+            pool = pool[:1] + [end for end in pool[1:] if end.gamma_grid <= best_gamma]
+            history.append(best_gamma)
+
+            # Settled: no new end promises more on its grid, and the round has gained nothing.
+            least_on_grid = min([end.gamma_grid for end in new_ends], default=np.inf)
+            promises_nothing = least_on_grid > best_gamma * (1 - tolerance)
+            gained_nothing = history[-1] > history[-2] * (1 - tolerance)
+            if number > 0 and promises_nothing and gained_nothing:
                 break
+
         best = self._finished(pool[0])
         if best.gamma < history[-1]:
             history.append(best.gamma)
         return OrderResult(best, tuple(self.reports), tuple(history))
 
     def _finished(self, best: TriedController) -> TriedController:
-        """The best alone, violated frequencies added and improved until dense check and grid agree."""
+        """Best of an end and its improvements, by exchange until dense check and lean grid agree."""
         current = best
         for _ in range(_FINISHING):
-            agreed = current.gamma <= current.gamma_grid * (1 + EXCHANGE_TOLERANCE)
-            if agreed or self._enough([best]):
+            grids_agree = current.gamma <= current.gamma_grid * (1 + EXCHANGE_TOLERANCE)
+            if grids_agree or self._good_enough([best]):
                 break
             self.problem.add_violated(self.cascade, current.parameters, current.gamma_grid)
             current = self._end(current.parameters)
             if not np.isfinite(current.gamma):
                 break
-            best = min(best, current, key=lambda c: c.gamma)
+            best = min(best, current, key=lambda end: end.gamma)
         return best
 
     def _hop(self, parameters: Real) -> Real:
-        """A stable neighbour: every parameter moved by up to a natural unit, less until it is stable."""
+        """Random neighbour (n,) of parameters (n,), moved by a tenth to one natural unit in every parameter.
+
+        Moved less until it is stable, at most `_HALVINGS` times.
+        """
         size = 10 ** self.rng.uniform(-1.0, 0.0)
         direction = self.rng.standard_normal(parameters.size) * natural_units(self.cascade, parameters)
         for _ in range(_HALVINGS):
@@ -340,17 +529,36 @@ class OrderSearch:
         return np.asarray(parameters + size * direction, dtype=np.float64)
 
 
+def _lost_between_points(ends: Sequence[TriedController]) -> list[TriedController]:
+    """Ends that are stable on the lean grid and not robustly stable on the dense one."""
+    return [end for end in ends if np.isfinite(end.gamma_grid) and not np.isfinite(end.gamma)]
+
+
 def different(
     candidates: Sequence[TriedController], most: int, *, on_grid: bool = False
 ) -> list[TriedController]:
-    """Best candidates that differ in gamma (on_grid: of their lean grid) by more than 0.1 %: the same optimum
-    twice teaches nothing."""
+    """Candidates in different local minima, the best first.
 
+    Parameters
+    ----------
+    candidates : sequence of TriedController
+    most : int
+        Candidates that are returned at most.
+    on_grid : bool
+        Judged by `gamma_grid` instead of `gamma`.
+
+    Returns
+    -------
+    list of TriedController
+        Of two whose worst cases differ by less than .1 % only the better one: the same minimum twice teaches
+        nothing.
+    """
     gamma = attrgetter("gamma_grid" if on_grid else "gamma")
-    kept: list[TriedController] = []
+    selected: list[TriedController] = []
     for candidate in sorted(candidates, key=gamma):
-        if all(abs(gamma(candidate) / gamma(other) - 1) > _AGREE - 1 for other in kept):
-            kept.append(candidate)
-        if len(kept) == most:
+        differences = [abs(gamma(candidate) / gamma(other) - 1) for other in selected]
+        if all(difference > _AGREE - 1 for difference in differences):
+            selected.append(candidate)
+        if len(selected) == most:
             break
-    return kept
+    return selected
