@@ -1,11 +1,14 @@
 """Descent on the worst case itself: from any stable controller to a local minimum, stable at every step.
 
-gamma(x) is a maximum of smooth functions, one per frequency and requirement. Each step models their
-logarithms at the worst member of the ellipse (`rows`): slopes, and one common curvature, that of the sum
-weighted by the multipliers of the step before. It solves
-"smallest largest row within a box" (`minimax_step`) and accepts only where the true value falls and all
-nominal loops stay stable. With curvature, convergence near the end is that of Newton's method also where
-fewer rows are active than there are parameters.
+The worst case gamma(x) of parameters x is a maximum of smooth functions, one per frequency and requirement.
+Each step models their logarithms at the worst member of the ellipse (`rows`): slopes, and one common
+curvature, that of the sum weighted by the multipliers of the step before. It solves "smallest largest row
+within a box" (`minimax_step`) and accepts the answer only where the true value falls and all nominal loops
+stay stable. With curvature, convergence near the end is that of Newton's method also where fewer rows are
+active than there are parameters (sequential quadratic programming of a minimax; trust region as in Nocedal
+and Wright, Numerical Optimization, 2nd ed., chapters 4 and 18).
+
+Steps are measured in natural units of the parameters (`natural_units`), in which the box is a cube.
 """
 
 from __future__ import annotations
@@ -16,19 +19,51 @@ from typing import NamedTuple
 
 import numpy as np
 
-from control_design.controllers.biquads import Cascade
+from control_design.controllers.biquads import Cascade, SectionKind
 from control_design.plants.ellipses import Real
-from control_design.synthesis.minimax_step import MinimaxStep, minimax_step
+from control_design.synthesis.minimax_step import (
+    ACCEPTED_SHARE,
+    FIRST_BOX,
+    SMALLEST_BOX,
+    MinimaxStep,
+    adapted_box,
+    minimax_step,
+)
 from control_design.synthesis.rows import LoopRows, Rows
 
-_FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4  # of a step, in natural units
-_PATIENCE, _SLOW = 15, 1e-3  # give up where so many steps gain less than this share
-_LEAST_GAIN = 1e-7  # predicted gain of a step, in the logarithm, not worth taking
-_FAR_BELOW = 2.5  # rows this far (in log) below the worst cannot become it within one step and are left out
+# A descent ends where so many steps ..
+_PATIENCE = 15
+# .. gain less than this in the logarithm of the worst case: a tenth of a per cent.
+_SLOW = 1e-3
+# Predicted gain of a step, in the logarithm, that is not worth taking: a hundredth of the digits that count.
+_LEAST_GAIN = 1e-7
+# Rows this far below the worst, in the logarithm, are left out of a step: they cannot become it within one.
+_FAR_BELOW = 2.5
+# A step that gains less than this share of what it promised is corrected to second order.
+_CORRECTED_BELOW = 0.25
+# Least logarithms of a section's denominator and a notch's numerator, in units of the scale: e^a is a
+# corner or a damping term, e^b a corner squared. Their negatives are the largest. So corners stay within
+# e^12 or e^10 of the scale, four to five decades, and exp() never overflows in a wild step.
+_LEAST_LOG = -12.0
+_LEAST_LOG_OF_SQUARE = -20.0
+# Least gain of a section in its natural units: one whose numerator vanishes can still move.
+_LEAST_GAIN_OF_SECTION = 1e-9
 
 
 class MinimaxDescent:
-    """Descent for one cascade and one set of rows ."""
+    """Descents of one cascade on one set of rows.
+
+    Parameters
+    ----------
+    cascade : Cascade
+        Sections of the controller, of n parameters.
+    plants : sequence of Rows
+        Ellipses and weights of every plant on its grid.
+    stable : callable
+        Whether all nominal loops are stable under parameters (n,).
+    controller_damping : float, optional
+        Least damping ratio of the controller's own pairs of poles; None: none asked.
+    """
 
     def __init__(
         self,
@@ -38,46 +73,86 @@ class MinimaxDescent:
         *,
         controller_damping: float | None = None,
     ) -> None:
-        self.cascade, self.stable = cascade, stable
+        """Build the rows, the bounds of all parameters, and the side conditions on damping."""
+        self.cascade = cascade
+        self.stable = stable
         self.rows = LoopRows(cascade, plants)
-        # Logarithms kept within a few decades of the scale: exp() never overflows in a wild step.
+
+        # Numerators are free, logarithms are bounded.
+        free = -np.inf
+        least: dict[SectionKind, list[float]] = {
+            "integrator": [free, free],
+            "first_order": [free, free, _LEAST_LOG],
+            "second_order": [free, free, free, _LEAST_LOG, _LEAST_LOG_OF_SQUARE],
+            "notch": [_LEAST_LOG, _LEAST_LOG, _LEAST_LOG_OF_SQUARE],
+        }
         low: list[float] = []
         for kind in cascade.sections:
-            low += {
-                "integrator": [-np.inf] * 2,
-                "first_order": [-np.inf] * 2 + [-12.0],
-                "second_order": [-np.inf] * 3 + [-12.0, -20.0],
-                "notch": [-12.0, -12.0, -20.0],
-            }[kind]
-        self._low, self._high = np.array(low), -np.array(low)
-        slack = [] if controller_damping is None else list(cascade.pair_positions)
-        self._damping_rows = np.zeros((len(slack), cascade.parameters))
-        for row, at in enumerate(slack):
-            self._damping_rows[row, at], self._damping_rows[row, at + 1] = -1.0, 0.5
-        limit = 0.0 if controller_damping is None else -float(np.log(2 * controller_damping))
-        self._damping_limit = np.full(len(slack), limit)
+            low += least[kind]
+        self._low = np.array(low)
+        self._high = -np.array(low)
+
+        # zeta = exp(a - b / 2) / 2 >= zeta_0 is -a + b / 2 <= -log(2 zeta_0) in the logarithms a and b.
+        pairs: list[int] = []
+        damping_limit = 0.0
+        if controller_damping is not None:
+            pairs = list(cascade.pair_positions)
+            damping_limit = -float(np.log(2 * controller_damping))
+        self._damping_rows = np.zeros((len(pairs), cascade.parameters))
+        for row, position in enumerate(pairs):
+            self._damping_rows[row, position] = -1.0
+            self._damping_rows[row, position + 1] = 0.5
+        self._damping_limit = np.full(len(pairs), damping_limit)
 
     def value(self, parameters: Real) -> float:
-        """Worst case on the boundary points; inf for an unstable nominal loop or an ellipse over -1."""
+        """Worst case on the grid of the rows.
+
+        Parameters
+        ----------
+        parameters : ndarray, shape (n,)
+
+        Returns
+        -------
+        float
+            Over boundary points of the ellipses; inf for an unstable nominal loop or an ellipse over -1.
+        """
         logs = self._logs(parameters)
         return float("inf") if logs is None else float(np.exp(np.max(logs)))
 
     def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
-        """At most `steps` steps from a start with stable nominal loops: parameters where it ended, the worst
-        case seen there (boundary points, own grid; inf: the start is unstable), steps taken."""
+        """Descend from a start with stable nominal loops.
+
+        Parameters
+        ----------
+        start : ndarray, shape (n,)
+        steps : int
+            At most; steps that are not accepted count.
+
+        Returns
+        -------
+        x : ndarray, shape (n,)
+            Parameters where it ended.
+        gamma : float
+            Worst case there, as `value`; inf: the start is unstable, and x is the start.
+        taken : int
+            Steps taken.
+        """
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
         logs = self._logs(x)
         if logs is None:
             return x, float("inf"), 0
-        best, box, taken = float(np.max(logs)), _FIRST_BOX, 0
+        best = float(np.max(logs))
+        best_before = best
+        box = FIRST_BOX
+        taken = 0
         local: _Local | None = None
         multipliers: Real | None = None
-        earlier = best
         for number in range(steps):
             if number % _PATIENCE == 0 and number > 0:
-                if best > earlier - _SLOW:
+                if best > best_before - _SLOW:
                     break
-                earlier = best
+                best_before = best
+            # The model of a point serves all steps from it, in smaller and smaller boxes.
             if local is None:
                 local = self._local(x, multipliers)
             taken += 1
@@ -88,35 +163,43 @@ class MinimaxDescent:
             predicted = best - step.level - 0.5 * float(move @ local.curvature @ move)
             if predicted < _LEAST_GAIN:
                 break
-            trial, after = x + move, self._logs(x + move)
-            if after is not None and best - float(np.max(after)) < 0.25 * predicted:
+            trial = x + move
+            after = self._logs(trial)
+            if after is not None and best - float(np.max(after)) < _CORRECTED_BELOW * predicted:
                 # The rows bend more than their common curvature says: once more, with the rows as they are
                 # at the trial point (second-order correction).
-                again = self._step(x, local, after - local.slope @ move, box)
-                if again is not None:
-                    second = x + again.step * local.unit
-                    corrected = self._logs(second)
-                    if corrected is not None and np.max(corrected) < np.max(after):
-                        step, trial, after = again, second, corrected
+                second_step = self._step(x, local, after - local.slope @ move, box)
+                if second_step is not None:
+                    second_trial = x + second_step.step * local.unit
+                    second_after = self._logs(second_trial)
+                    if second_after is not None and np.max(second_after) < np.max(after):
+                        step = second_step
+                        trial = second_trial
+                        after = second_after
             actual = -np.inf if after is None else best - float(np.max(after))
-            if after is not None and actual > 0.02 * predicted:
-                x, best, local, multipliers = trial, float(np.max(after)), None, step.multipliers
-            if actual > 0.7 * predicted:
-                box = min(2.0 * box, _LARGEST_BOX)
-            elif actual < 0.25 * predicted:
-                box *= 0.35
-            if box < _SMALLEST_BOX:
+            if after is not None and actual > ACCEPTED_SHARE * predicted:
+                x = trial
+                best = float(np.max(after))
+                local = None
+                multipliers = step.multipliers
+            box = adapted_box(box, actual, predicted)
+            if box < SMALLEST_BOX:
                 break
         return x, float(np.exp(best)), taken
 
     def _logs(self, x: Real) -> Real | None:
-        """Logarithms (R,) of all weighted values; None for an unstable loop or an ellipse over -1."""
+        """Logarithms (R,) of all weighted values at x (n,); None: an unstable loop or an ellipse over -1."""
         inside = self.stable(x) and not self.rows.covers_minus_one(x)
         return self.rows.rows(x) if inside else None
 
     def _local(self, x: Real, multipliers: Real | None) -> _Local:
-        """Rows, slopes and (with multipliers of the rows) their common curvature, made semi-definite."""
-        curvature, unit = np.zeros((x.size, x.size)), natural_units(self.cascade, x)
+        """Model of the rows at x (n,): values, slopes, and their curvature weighted by multipliers (R,).
+
+        The curvature is made positive semi-definite in natural units, so that the programme of a step is
+        convex; without multipliers, in the first step, it is zero.
+        """
+        curvature = np.zeros((x.size, x.size))
+        unit = natural_units(self.cascade, x)
         if multipliers is not None:
             scales = np.outer(unit, unit)
             size, axes = np.linalg.eigh(self.rows.curvature(x, multipliers) * scales)
@@ -124,7 +207,11 @@ class MinimaxDescent:
         return _Local(self.rows.rows(x), self.rows.slopes(x), curvature, unit)
 
     def _step(self, x: Real, local: _Local, log: Real, box: float) -> MinimaxStep | None:
-        """Smallest largest row, |d| <= box in natural units; multipliers of all rows; None where it fails."""
+        """Step d (n,) in natural units with the smallest largest row, |d| <= box; None where that fails.
+
+        log (R,): values of the rows, which a second-order correction changes. Bounds of the parameters and
+        the damping asked are kept. The multipliers returned are those of all rows (R,).
+        """
         unit = local.unit
         near = log > np.max(log) - _FAR_BELOW
         step = minimax_step(
@@ -153,16 +240,31 @@ class _Local(NamedTuple):
 
 
 def natural_units(cascade: Cascade, x: Real) -> Real:
-    """A substantial change of each parameter: numerators relative to their section's gain and corner."""
+    """A substantial change of each parameter of a cascade.
+
+    Parameters
+    ----------
+    cascade : Cascade
+    x : ndarray, shape (n,)
+        Where the change starts from.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+        Of logarithms: 1. Of numerators: the section's gain times its corner to the power that the
+        coefficient's p lacks, so that each changes the section by about its gain at its corner.
+    """
     units: list[float] = []
     for kind, (numerator, denominator) in zip(cascade.sections, cascade.split(x), strict=True):
-        degree = numerator.size - 1
-        corner = 1.0 if kind == "integrator" else float(denominator[-1] ** (1.0 / degree))
-        powers = corner ** np.arange(degree + 1)
         if kind == "notch":
             units += [1.0, 1.0, 1.0]
             continue
-        gain = max(float(np.max(np.abs(numerator) / powers)), 1e-9)
+        degree = numerator.size - 1
+        # An integrator has no corner of its own: the scale.
+        corner = 1.0 if kind == "integrator" else float(denominator[-1] ** (1.0 / degree))
+        powers = corner ** np.arange(degree + 1)
+        gain = max(float(np.max(np.abs(numerator) / powers)), _LEAST_GAIN_OF_SECTION)
         units += (gain * powers).tolist()
-        units += [] if kind == "integrator" else [1.0] * degree
+        if kind != "integrator":
+            units += [1.0] * degree
     return np.array(units)

@@ -3,10 +3,14 @@
     minimise  s + d' H d / 2   over (d, s)
     with      f + F d <= s,  A d <= b,  low <= d <= high.
 
-A primal-dual interior point (Mehrotra's predictor and corrector) in n + 1 unknowns: the rows enter only
-through an (n + 1) x (n + 1) matrix. H = 0 makes it a linear programme. Compiled: for so few rows a call of
-numpy would cost more than the arithmetic. A QP solver that begins anew each time costs more still; one that
-begins at the last problem makes the result depend on it.
+`minimax_step` solves it by a primal-dual interior point (Mehrotra's predictor and corrector, SIAM Journal
+on Optimization 2, 1992) in n + 1 unknowns: the rows enter only through an (n + 1) x (n + 1) matrix. H = 0
+makes it a linear programme. The iterations are compiled: for so few rows a call of numpy would cost more
+than the arithmetic. A QP solver that begins anew each time costs more still; one that begins at the last
+problem makes the result depend on it.
+
+`adapted_box` says how large the next box is. Both descents, of one joint (`descent`) and of several
+(`multivariable_descent`), use the box in natural units of the parameters, so its sizes stand here.
 """
 
 from __future__ import annotations
@@ -19,77 +23,179 @@ import numpy as np
 from control_design.plants.ellipses import Real
 from ident.data.arrays import COMPILED, INSIDE
 
-_MOST = 40  # iterations; 8 to 15 are usual
-_ACCURACY = 1e-8  # complementarity and row residuals, in the logarithm of the worst case
-_STATIONARY = 1e-5  # residual of the stationarity, of a step of natural size; rounding leaves 1e-7
-_LEAST_ROOM = 1e-9  # a bound met exactly still leaves the interior point an interior
+# Half width of the first box, in natural units: a third of a substantial change of every parameter.
+FIRST_BOX = 0.3
+# Largest half width: beyond a natural unit no linear row says anything.
+LARGEST_BOX = 1.0
+# Half width below which a descent ends: it changes no worst case that is stated to four digits.
+SMALLEST_BOX = 1e-4
+# Share of its predicted gain that a step has to reach to be accepted; any small number proves convergence
+# (Nocedal and Wright, Numerical Optimization, 2nd ed., algorithm 4.1).
+ACCEPTED_SHARE = 0.02
+# Shares of the predicted gain above which the box doubles, and below which it shrinks: those of the algorithm
+# named above are 3/4 and 1/4.
+_ENLARGED_ABOVE = 0.7
+_SHRUNK_BELOW = 0.25
+_ENLARGEMENT = 2.0
+_SHRINKAGE = 0.35
+
+# Iterations of the interior point; 8 to 15 are usual.
+_MOST_ITERATIONS = 40
+# Complementarity and row residuals at the end, in the logarithm of the worst case.
+_ACCURACY = 1e-8
+# Residual of the stationarity at the end, of a step of natural size; rounding leaves 1e-7.
+_STATIONARY = 1e-5
+# Complementarity with which an end counts although the iterations ran out or stopped at rounding.
+_USABLE_GAP = 1e-5
+# Excess over the box that is rounding, and clipped.
+_ROUNDING = 1e-6
+# Room of a bound that is met exactly: the interior point needs an interior.
+_LEAST_ROOM = 1e-9
+# Height of the first s above the largest row, in logarithms, so that every row has slack.
+_FIRST_SLACK = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class MinimaxStep:
-    """d (n,), the smallest largest row s of the linear model there, multipliers (R,) of f + F d <= s."""
+    """Solution of one programme.
+
+    Attributes
+    ----------
+    step : ndarray, shape (n,)
+        d, within the box.
+    level : float
+        Largest row f + F d of the linear model there, without the curvature.
+    multipliers : ndarray, shape (R,)
+        Of the rows f + F d <= s; they add up to one. Rows that are not active have about 0.
+    """
 
     step: Real
     level: float
     multipliers: Real
 
 
+def adapted_box(box: float, actual: float, predicted: float) -> float:
+    """Half width of the box of the next step.
+
+    Parameters
+    ----------
+    box : float
+        Half width of the step before, in natural units.
+    actual : float
+        What that step gained; -inf: it left stability.
+    predicted : float
+        What its model promised.
+
+    Returns
+    -------
+    float
+        Doubled, to at most `LARGEST_BOX`, where the model was right; shrunk where it was wrong.
+    """
+    if actual > _ENLARGED_ABOVE * predicted:
+        return min(_ENLARGEMENT * box, LARGEST_BOX)
+    if actual < _SHRUNK_BELOW * predicted:
+        return box * _SHRINKAGE
+    return box
+
+
 def minimax_step(
     value: Real, slope: Real, curvature: Real, low: Real, high: Real, a: Real, b: Real
 ) -> MinimaxStep | None:
-    """Solve it for value (R,), slope (R, n), curvature (n, n) positive semi-definite, low < 0 < high (n,), a
-    (L, n), b (L,); None where the interior point fails (no d with a d <= b in the box, or rounding)."""
-    n, rows, bounds = slope.shape[1], value.size, 2 * slope.shape[1]
-    matrix, limit = np.zeros((rows + bounds + a.shape[0], n + 1)), np.empty(rows + bounds + a.shape[0])
-    matrix[:rows, :n], matrix[:rows, n] = slope, -1.0
-    matrix[rows : rows + n, :n], matrix[rows + n : rows + bounds, :n] = np.eye(n), -np.eye(n)
+    """Step with the smallest largest row plus curvature.
+
+    Parameters
+    ----------
+    value : ndarray, shape (R,)
+        Rows f at d = 0.
+    slope : ndarray, shape (R, n)
+        Their slopes F.
+    curvature : ndarray, shape (n, n)
+        H, positive semi-definite.
+    low, high : ndarray, shape (n,)
+        Box; low < 0 < high.
+    a : ndarray, shape (L, n)
+        Side conditions a d <= b; L may be 0.
+    b : ndarray, shape (L,)
+
+    Returns
+    -------
+    MinimaxStep or None
+        None where the interior point fails: no d of the box meets a d <= b, or rounding spoils the solution.
+    """
+    n = slope.shape[1]
+    rows = value.size
+    bounds = 2 * n
+    constraints = rows + bounds + a.shape[0]
+
+    # All inequalities as matrix v <= limit for v = (d, s): rows, upper and lower bounds, side conditions.
+    matrix = np.zeros((constraints, n + 1))
+    matrix[:rows, :n] = slope
+    matrix[:rows, n] = -1.0
+    matrix[rows : rows + n, :n] = np.eye(n)
+    matrix[rows + n : rows + bounds, :n] = -np.eye(n)
     matrix[rows + bounds :, :n] = a
-    limit[:rows], limit[rows + bounds :] = -value, b + _LEAST_ROOM
-    limit[rows : rows + n], limit[rows + n : rows + bounds] = (
-        np.maximum(high, _LEAST_ROOM),
-        np.maximum(-low, _LEAST_ROOM),
-    )
+    limit = np.empty(constraints)
+    limit[:rows] = -value
+    limit[rows : rows + n] = np.maximum(high, _LEAST_ROOM)
+    limit[rows + n : rows + bounds] = np.maximum(-low, _LEAST_ROOM)
+    limit[rows + bounds :] = b + _LEAST_ROOM
     hessian = np.zeros((n + 1, n + 1))
     hessian[:n, :n] = curvature
-    v = np.append(np.zeros(n), float(np.max(value)) + 0.1)
+
+    v = np.append(np.zeros(n), float(np.max(value)) + _FIRST_SLACK)
     z, gap = _interior_point(matrix, limit, hessian, v, rows)
     d = v[:n]
-    done = gap < 1e-5 and np.all(np.isfinite(v))
-    if not (done and np.all(d <= high + 1e-6) and np.all(d >= low - 1e-6)):
+    solved = gap < _USABLE_GAP and np.all(np.isfinite(v))
+    inside = np.all(d <= high + _ROUNDING) and np.all(d >= low - _ROUNDING)
+    if not (solved and inside):
         return None
-    return MinimaxStep(np.clip(d, low, high), float(np.max(value + slope @ d)), z[:rows] / np.sum(z[:rows]))
+    level = float(np.max(value + slope @ d))
+    return MinimaxStep(np.clip(d, low, high), level, z[:rows] / np.sum(z[:rows]))
 
 
 @numba.njit(**COMPILED)
 def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int) -> tuple[Real, float]:
-    """From v (n + 1,) in place to the optimum: multipliers (rows of the matrix,) and complementarity."""
+    """Multipliers (m,) of matrix v <= limit at the optimum, and the complementarity reached.
+
+    matrix (m, n + 1), limit (m,), hessian (n + 1, n + 1); v (n + 1,) is where it begins, and is moved to the
+    optimum in place. The first `rows` inequalities are those of the rows, whose multipliers add up to one.
+    Neither the iterations running out nor rounding is an error here: the caller sees the complementarity.
+    """
+    # Slacks far enough from 0 for a first step, and multipliers whose products with them are alike.
     slack = np.maximum(limit - matrix @ v, 1e-3)
     z = 0.1 / slack
     z[:rows] /= np.sum(z[:rows])
-    for _ in range(_MOST):
+    for _ in range(_MOST_ITERATIONS):
+        # Residuals of the optimality conditions; the last unknown, s, has slope 1 in the objective.
         dual = hessian @ v + z @ matrix
         dual[-1] += 1.0
         primal = matrix @ v + slack - limit
         missed = max(np.sum(slack * z), np.max(np.abs(primal)))
         if missed < _ACCURACY and np.max(np.abs(dual)) < _STATIONARY:
             break
-        ratio, centre = z / slack, slack * z
+        # Normal equations, with a trace of 1e-12 on the diagonal where rows leave a direction free.
+        ratio = z / slack
+        centre = slack * z
         normal = hessian + (matrix.T * ratio) @ matrix
         for j in range(v.size):
             normal[j, j] += 1e-12 * (1.0 + normal[j, j])
         if not np.all(np.isfinite(normal)):
-            break  # a slack has run to its bound: no step from here
+            # A slack has run to its bound: no step from here.
+            break
         gap = np.mean(centre)
+        # Predictor: Newton's direction towards complementarity 0. Corrector: towards a smaller gap than now
+        # (the cube of what the predictor reached, after Mehrotra), with the predictor's second-order term.
         for corrector in range(2):
-            # Newton's direction of the perturbed optimality conditions.
             pull = (z * primal - centre) / slack
             step = -np.linalg.solve(normal, dual + pull @ matrix)
             moved = primal + matrix @ step
             dz = ratio * moved - centre / slack
-            first, second = _longest(slack, -moved), _longest(z, dz)
+            first = _longest(slack, -moved)
+            second = _longest(z, dz)
             if corrector == 0:
                 after = np.mean((slack - first * moved) * (z + second * dz))
                 centre = centre - moved * dz - gap * min(1.0, after / gap) ** 3
+        # 0.995: not quite to the boundary, where the next step would have no room.
         v += 0.995 * first * step
         slack -= 0.995 * first * moved
         z += 0.995 * second * dz
@@ -98,7 +204,7 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
 
 @numba.njit(**INSIDE)
 def _longest(value: Real, step: Real) -> float:
-    """The longest step in [0, 1] that keeps all values positive."""
+    """Longest length in [0, 1] for which value + length * step (m,) stays positive; value > 0."""
     length = 1.0
     for i in range(value.size):
         if length * step[i] < -value[i]:

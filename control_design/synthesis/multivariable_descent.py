@@ -1,8 +1,18 @@
 """Descent of a matrix controller on the worst case over its plants, with exact slopes.
 
-Rows are log gamma of every requirement, plant and frequency (`scaled_bound`); their slope holds the scalings
-fixed (envelope theorem). The curvature is that of the rows' sum weighted by their multipliers, from
-differences of slopes, so that steps near the end are those of Newton's method.
+The worst case of several joints is the largest of many rows: log gamma^2 of every requirement, plant and
+frequency, by the bound over scalings of `scaled_bound`. `stacked_rows` puts them in one stack,
+`MatrixDescent` minimises the largest. gamma^2 of a row is the largest eigenvalue of a Hermitian matrix H,
+and where the worst case is smallest several eigenvalues meet, so that the row has a kink. A step therefore
+bounds the largest eigenvalue of the linearised matrix, by u^H H u <= s for several directions u.
+
+Slopes of H in the controller's parameters hold the optimal scalings fixed (envelope theorem). The curvature
+is that of the matrices' sum weighted by the multipliers of the step before, from differences of slopes, so
+that steps near the end are those of Newton's method. Every step is one `minimax_step` in a box, whose size
+follows from what the step before gained of what it promised.
+
+In shapes: R rows of the stack, r of them near the worst, n parameters, w = Y outputs (the size of H), U
+actuators, N blocks of uncertainty with one scaling log t each.
 """
 
 from __future__ import annotations
@@ -10,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,25 +29,81 @@ from control_design.plants.ellipses import Complex, Integer, Real
 from control_design.plants.multivariable import MultivariablePlant, tustin_s
 from control_design.plants.scaled_bound import Bound, BoundRows, conjugate, expansion, scaled_bound
 from control_design.specification.multivariable import MultivariableSpecification, gram
-from control_design.synthesis.minimax_step import minimax_step
+from control_design.synthesis.minimax_step import (
+    ACCEPTED_SHARE,
+    FIRST_BOX,
+    SMALLEST_BOX,
+    adapted_box,
+    minimax_step,
+)
 from control_design.synthesis.modal_controller import ModalForm
 
-_SHIFT = 1e-5  # of a parameter, in natural units, in the difference quotient of slopes
-_ACCURACY = 1e-6  # of gamma in a step
-_FIRST_BOX, _LARGEST_BOX, _SMALLEST_BOX = 0.3, 1.0, 1e-4
-_LEAST_GAIN = 2e-6  # predicted fall of log gamma^2 that is not worth a step
-_FAR_BELOW = 2.0  # rows so far below the worst (log gamma^2) cannot become it within one step
-_REACH = 0.5  # of the sum of all slopes: how far a row is taken to rise in a box
-_SCALING_BOX = 3.0  # box of log t in that of the parameters
-_CUTS, _MISSED = 4, 0.05  # rounds of adding directions; share of the predicted fall that may be missed
-_ACTIVE = 1e-4  # share of the largest multiplier below which a row bends nothing
+# Shift of a parameter in the difference quotient of slopes, in natural units. The quotient errs by about the
+# shift times the third derivative, and by rounding over the shift: 1e-5 and 1e-11.
+_SHIFT = 1e-5
+# Relative accuracy of gamma in a step.
+_ACCURACY = 1e-6
+# Factor on the box where the programme of a step fails, mostly by rounding.
+_SHORTER = 0.3
+# Predicted fall of log gamma^2 that is not worth a step: 1e-6 of gamma, as accurate as it is known.
+_LEAST_GAIN = 2e-6
+# Rows so far below the worst, in log gamma^2, are left out of a step: they cannot become it within one.
+_FAR_BELOW = 2.0
+# How far a row is taken to rise within a box, over the sum of all its slopes times the box. All parameters at
+# the edge of the box, each in the row's direction of ascent, would be 1.
+_REACH = 0.5
+# Box of a scaling log t, over that of the parameters: scalings follow the controller freely.
+_SCALING_BOX = 3.0
+# Rounds of adding directions u to the programme of a step.
+_CUTS = 4
+# Share of the predicted fall by which the largest eigenvalue may exceed the programme's level; beyond it, a
+# direction is added.
+_MISSED = 0.05
+# Share of the largest multiplier below which a row does not enter the curvature.
+_ACTIVE = 1e-4
+# A step that gains less than this share of what it promised is corrected to second order.
+_CORRECTED_BELOW = 0.7
+# No division by zero where no row near the worst depends on a parameter.
+_NO_SLOPE = 1e-12
+# Sections of an interval in the search for a scaling: each leaves .55 of it, 14 of them 2e-4.
+_SECTIONS = 14
+# Ends of the overlapping sections, over the interval.
+_LEFT_SECTION = 0.45
+_RIGHT_SECTION = 0.55
 
 
 @dataclass(frozen=True, eq=False)
 class StackedRows:
-    """Rows of all plants and requirements: s (R,), omega (R,), plant and requirement number (R,)."""
+    """Rows of all plants and requirements on their grids.
+
+    Attributes
+    ----------
+    rows : BoundRows
+        R rows, as `scaled_bound` takes them.
+    s : ndarray, shape (R,)
+        Tustin's s at the row's frequency, where `ModalForm.response` evaluates K.
+    omega_rad_s : ndarray, shape (R,)
+    plant : ndarray, shape (R,)
+        Number of the row's plant.
+    requirement : ndarray, shape (R,)
+        Number of the row's requirement, in the order of `MultivariableSpecification.weights`.
+    """
 
     rows: BoundRows
+    s: Complex
+    omega_rad_s: Real
+    plant: Real
+    requirement: Real
+
+
+class _RowArrays(NamedTuple):
+    """Arrays of some rows, first axis: rows; named as in `BoundRows` and `StackedRows`."""
+
+    G: Complex
+    seen: Complex
+    entering: Complex
+    V_y: Real
+    V_u: Real
     s: Complex
     omega_rad_s: Real
     plant: Real
@@ -51,35 +117,75 @@ def stacked_rows(
     *,
     together: bool = False,
 ) -> StackedRows:
-    """Every requirement of every plant at the frequencies (F,) of its grid, but for weights on S that
-    stronger ones cover."""
+    """Every requirement of every plant at the frequencies of its grid.
+
+    Parameters
+    ----------
+    plants : sequence of MultivariablePlant
+        Nominal plant, ball and errors of channels.
+    specification : MultivariableSpecification
+        Weights of each requirement, on S (outputs) or on K S (actuators).
+    grids : sequence of ndarray, shape (F,)
+        Of each plant, rad/s, below Nyquist.
+    together : bool
+        As of `BoundRows`: uncertainty grows with 1 / gamma (mu) instead of keeping its size.
+
+    Returns
+    -------
+    StackedRows
+        Without rows of weights on S that an earlier requirement covers in every output.
+    """
     delay = specification.computational_delay_samples
-    parts: list[tuple[Complex, ...]] = []
+    parts: list[_RowArrays] = []
     for number, (plant, omega) in enumerate(zip(plants, grids, strict=True)):
         G, seen, entering = plant.blocks(omega, delay)
         s = tustin_s(omega, plant.dt_s)
+        nothing_on_y = np.zeros((omega.size, plant.outputs, plant.outputs))
+        nothing_on_u = np.zeros((omega.size, plant.inputs, plant.inputs))
+        # Largest weight on S so far, by frequency and output.
         covered = np.zeros((omega.size, plant.outputs))
-        for which, (of, weights) in enumerate(specification.weights(plant.inputs, plant.outputs).values()):
+        requirements = specification.weights(plant.inputs, plant.outputs).values()
+        for which, (channel_kind, weights) in enumerate(requirements):
             size = gram(weights, s)
-            none_y, none_u = (np.zeros((omega.size, n, n)) for n in (plant.outputs, plant.inputs))
-            on_y, on_u = (size, none_u) if of == "y" else (none_y, size)
-            place = np.full(omega.size, number), np.full(omega.size, which)
-            every: tuple[Any, ...] = (G, seen, entering, on_y, on_u, s, omega, *place)
-            sizes = np.diagonal(on_y, axis1=1, axis2=2)
-            use = np.ones(omega.size, bool) if of == "u" else np.any(sizes > covered, axis=1)
-            covered = np.maximum(covered, sizes)
-            parts.append(tuple(each[use] for each in every))
-    G, seen, entering, on_y, on_u, s, omega, plant_of, which_of = (
-        np.concatenate([part[i] for part in parts]) for i in range(9)
-    )
-    return StackedRows(BoundRows(G, seen, entering, on_y, on_u, together), s, omega, plant_of, which_of)
+            if channel_kind == "u":
+                on_y, on_u = nothing_on_y, size
+                use = np.ones(omega.size, bool)
+            else:
+                on_y, on_u = size, nothing_on_u
+                sizes = np.diagonal(on_y, axis1=1, axis2=2)
+                use = np.any(sizes > covered, axis=1)
+                covered = np.maximum(covered, sizes)
+            plant_number = np.full(omega.size, number)
+            requirement_number = np.full(omega.size, which)
+            every = (G, seen, entering, on_y, on_u, s, omega, plant_number, requirement_number)
+            parts.append(_RowArrays(*(array[use] for array in every)))
+    joined = _RowArrays(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    rows = BoundRows(joined.G, joined.seen, joined.entering, joined.V_y, joined.V_u, together)
+    return StackedRows(rows, joined.s, joined.omega_rad_s, joined.plant, joined.requirement)
 
 
 @dataclass(frozen=True, eq=False)
 class _NearWorst:
-    """Rows near the worst at a point, each the Hermitian matrix of log H in its eigenvectors, w = Y of them,
-    largest first, as real numbers (`_entries`): value (r, w^2), slope (r, w^2, n), in_t (r, w^2, N). basis
-    (r, Y, w), top (r,)."""
+    """First-order model of the r rows near the worst at one point.
+
+    Each row is the Hermitian matrix M of log H, in the eigenvectors of H at that point, largest first. Its
+    w^2 real numbers are ordered as `_entries` does: the diagonal, then real and imaginary parts above it.
+
+    Attributes
+    ----------
+    index : ndarray, shape (r,)
+        Number of the row in the stack.
+    value : ndarray, shape (r, w^2)
+        M; its largest eigenvalue is log gamma^2.
+    slope : ndarray, shape (r, w^2, n)
+        dM by parameter.
+    in_t : ndarray, shape (r, w^2, N)
+        dM by log t of each scaling.
+    basis : ndarray, shape (r, w, w)
+        Eigenvectors of H in coordinates of the outputs, as columns.
+    top : ndarray, shape (r,)
+        Largest eigenvalue of H: gamma^2.
+    """
 
     index: Integer
     value: Real
@@ -89,246 +195,384 @@ class _NearWorst:
     top: Real
 
 
+class _Move(NamedTuple):
+    """A step (n,) in natural units, the predicted fall of log gamma^2, and multipliers (r, w, w).
+
+    The multipliers of one row are sum_u z_u u u^H over its directions u, in the row's basis.
+    """
+
+    step: Real
+    predicted: float
+    multipliers: Complex
+
+
 class MatrixDescent:
     """From any controller with stable nominal loops to a local minimum of the worst case on a grid.
 
-    Largest eigenvalues meet where the worst case is smallest, and have kinks there: a step therefore bounds
-    the largest eigenvalue of the linearised matrix, by cuts, with the scalings as unknowns, and one common
-    curvature, that of the matrices' sum weighted by their multipliers. Loops stay stable.
+    All nominal loops stay stable at every step.
+
+    Parameters
+    ----------
+    form : ModalForm
+        Response and slopes of K (U, Y) in parameters (n,), and their bounds and natural units.
+    stack : StackedRows
+        Of the lean grid.
+    loops : sequence of NominalLoop
+        One for each plant: closed-loop poles of a discrete controller.
     """
 
     def __init__(self, form: ModalForm, stack: StackedRows, loops: Sequence[NominalLoop]) -> None:
-        self.form, self.stack, self.loops = form, stack, tuple(loops)
+        """Keep the arguments, and the bounds (n,) of the parameters."""
+        self.form = form
+        self.stack = stack
+        self.loops = tuple(loops)
         self._low, self._high = form.bounds()
 
     def stable(self, x: Real) -> bool:
-        """Whether all nominal loops are."""
+        """Whether all nominal loops are stable under parameters x (n,): poles strictly inside the circle."""
         a, b, c, d = self.form.discrete(x)
         return all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops)
 
     def bound(self, x: Real, log_t: Real | None) -> Bound | None:
-        """Of all rows; None without stability."""
+        """Worst case of every row.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+        log_t : ndarray, shape (R, N), or None
+            Scalings to begin with; None: from the sizes of the blocks.
+
+        Returns
+        -------
+        Bound or None
+            gamma (R,), scalings log_t (R, N), worst output (R, Y). None where a nominal loop is unstable, or
+            some row shows no robust stability.
+        """
         if not self.stable(x):
             return None
         K = self.form.response(x[None], self.stack.s)[0]
-        found = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY)
-        return found if np.all(np.isfinite(found.gamma)) else None
+        bound = scaled_bound(self.stack.rows, K, log_t, accuracy=_ACCURACY)
+        return bound if np.all(np.isfinite(bound.gamma)) else None
 
     def run(self, start: Real, steps: int) -> tuple[Real, float, int]:
-        """At most `steps` steps: parameters where it ended, worst case on the grid (inf: unstable start),
-        steps taken. A step that falls short is corrected to second order, for one evaluation more."""
+        """Descend from a start.
+
+        Parameters
+        ----------
+        start : ndarray, shape (n,)
+        steps : int
+            At most; steps that are not accepted count.
+
+        Returns
+        -------
+        x : ndarray, shape (n,)
+            Parameters where it ended.
+        gamma : float
+            Worst case on the grid there; inf: the start is not robustly stable.
+        taken : int
+            Steps taken.
+
+        Notes
+        -----
+        A step that falls short of its prediction is corrected to second order, for one evaluation more.
+        """
         x = np.clip(np.asarray(start, dtype=np.float64), self._low, self._high)
         bound = self.bound(x, None)
         if bound is None:
             return x, float("inf"), 0
-        box, taken, weights = _FIRST_BOX, 0, None
-        best = 2 * float(np.log(np.max(bound.gamma)))
+        best = _largest_log(bound)
+        box = FIRST_BOX
+        taken = 0
+        multipliers: Complex | None = None
         local: _NearWorst | None = None
-        while taken < steps and box > _SMALLEST_BOX:
+        while taken < steps and box > SMALLEST_BOX:
+            # The model of a point serves all steps from it, in smaller and smaller boxes.
             if local is None:
                 local = self._local(x, bound)
+                # No unit is longer than what changes some row's log gamma^2 by one.
                 steepest = np.max(np.abs(local.slope[:, 0]), axis=0)
-                unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, 1e-12))
-                curvature = self._curvature(x, bound, local, weights, unit)
+                unit = np.minimum(self.form.units(x), 1.0 / np.maximum(steepest, _NO_SLOPE))
+                curvature = self._curvature(x, bound, local, multipliers, unit)
             taken += 1
-            step = self._step(x, local, curvature, unit, box)
-            if step is None:
-                box *= 0.3
+            move = self._step(x, local, curvature, unit, box)
+            if move is None:
+                box *= _SHORTER
                 continue
-            move, predicted, multipliers = step
+            predicted = move.predicted
             if predicted < _LEAST_GAIN:
                 break
-            trial = np.clip(x + move * unit, self._low, self._high)
+            change = move.step * unit
+            trial = np.clip(x + change, self._low, self._high)
             after = self.bound(trial, bound.log_t)
-            actual = -np.inf if after is None else best - 2 * float(np.log(np.max(after.gamma)))
-            if after is not None and actual < 0.7 * predicted:
-                again = self._step(x, self._bent(local, move * unit, after, box), curvature, unit, box)
-                if again is not None:
-                    other = np.clip(x + again[0] * unit, self._low, self._high)
-                    there = self.bound(other, after.log_t)
-                    gained = -np.inf if there is None else best - 2 * float(np.log(np.max(there.gamma)))
-                    if gained > actual:
-                        trial, after, actual, multipliers = other, there, gained, again[2]
-            if after is not None and actual > 0.02 * predicted:
+            actual = _fall(best, after)
+
+            # Second-order correction: the step again, with the rows as they are at its end.
+            if after is not None and actual < _CORRECTED_BELOW * predicted:
+                bent = self._bent(local, change, after, box)
+                second_move = self._step(x, bent, curvature, unit, box)
+                if second_move is not None:
+                    second_trial = np.clip(x + second_move.step * unit, self._low, self._high)
+                    second_after = self.bound(second_trial, after.log_t)
+                    second_actual = _fall(best, second_after)
+                    if second_actual > actual:
+                        move = second_move
+                        trial = second_trial
+                        after = second_after
+                        actual = second_actual
+
+            if after is not None and actual > ACCEPTED_SHARE * predicted:
                 outputs = local.basis.shape[1]
-                weights = np.zeros((self.stack.s.size, outputs, outputs), dtype=np.complex128)
-                # Multipliers in coordinates of the outputs: eigenvectors turn from step to step.
-                weights[local.index] = local.basis @ multipliers @ conjugate(local.basis)
-                x, bound, best, local = trial, after, best - actual, None
-            if actual > 0.7 * predicted:
-                box = min(2.0 * box, _LARGEST_BOX)
-            elif actual < 0.25 * predicted:
-                box *= 0.35
+                # In coordinates of the outputs: eigenvectors turn from step to step.
+                multipliers = np.zeros((self.stack.s.size, outputs, outputs), dtype=np.complex128)
+                multipliers[local.index] = local.basis @ move.multipliers @ conjugate(local.basis)
+                x = trial
+                bound = after
+                best = best - actual
+                local = None
+            box = adapted_box(box, actual, predicted)
         return x, float(np.exp(0.5 * best)), taken
 
     def _local(self, x: Real, bound: Bound) -> _NearWorst:
+        """First-order model of the rows near the worst at parameters x (n,), with the scalings of `bound`."""
         log = 2 * np.log(bound.gamma)
         index = np.flatnonzero(log > np.max(log) - _FAR_BELOW)
-        rows, s = self.stack.rows.part(index), self.stack.s[index]
-        found = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[index])
-        sizes, vectors = np.linalg.eigh(found.H)
-        sizes, basis, top = sizes[:, ::-1], vectors[:, :, ::-1], sizes[:, -1]
+        rows = self.stack.rows.part(index)
+        s = self.stack.s[index]
+        first_order = expansion(rows, self.form.response(x[None], s)[0], bound.log_t[index])
+
+        # Eigenvectors of H, the largest eigenvalue first, and dH = left^H dK right + (.)^H in them.
+        ascending, vectors = np.linalg.eigh(first_order.H)
+        sizes = ascending[:, ::-1]
+        basis = vectors[:, :, ::-1]
+        top = ascending[:, -1]
         width = sizes.shape[1]
-        left, right = found.left @ basis, found.right @ basis
+        left = first_order.left @ basis
+        right = first_order.right @ basis
 
         def slopes(i: int, j: int) -> Complex:
-            return np.asarray(self.form.slopes(x[None], s, left[None, :, :, i], right[None, :, :, j])[0])
+            """left_i^H dK right_j by parameter, (r, n)."""
+            by_parameter = self.form.slopes(x[None], s, left[None, :, :, i], right[None, :, :, j])
+            return np.asarray(by_parameter[0])
 
-        above = list(combinations(range(width), 2))
+        # d log H = dH / top at the largest eigenvalue; the others are expanded alike, about log top.
         slope = [2 * slopes(i, i).real for i in range(width)]
-        for i, j in above:
+        for i, j in combinations(range(width), 2):
             entry = slopes(i, j) + np.conj(slopes(j, i))
             slope += [entry.real, entry.imag]
-        turned = conjugate(basis)[:, None] @ found.in_t @ basis[:, None] / top[:, None, None, None]
+        turned = conjugate(basis)[:, None] @ first_order.in_t @ basis[:, None]
+        in_t = np.moveaxis(_entries(turned / top[:, None, None, None]), 1, 2)
         value = np.zeros((index.size, width**2))
         value[:, :width] = log[index][:, None] + sizes / top[:, None] - 1.0
-        in_t = np.moveaxis(_entries(turned), 1, 2)
         return _NearWorst(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
 
     def _bent(self, local: _NearWorst, change: Real, after: Bound, box: float) -> _NearWorst:
-        """The rows with what they missed at x + change added: a second-order correction, with which the next
-        step from the same point follows a curved edge between rows."""
+        """Model of the rows with what it missed at x + change (n,) added to its values.
+
+        A second-order correction: the next step from the same point follows a curved edge between rows.
+        """
         width = local.basis.shape[2]
-        said, _ = _lowered(local.value + local.slope @ change, local.in_t, _SCALING_BOX * box, width)
+        predicted, _ = _lowered(local.value + local.slope @ change, local.in_t, _SCALING_BOX * box, width)
+        missed = 2 * np.log(after.gamma[local.index]) - predicted
         value = local.value.copy()
-        value[:, :width] += (2 * np.log(after.gamma[local.index]) - said)[:, None]
+        value[:, :width] += missed[:, None]
         return replace(local, value=value)
 
     def _curvature(
-        self, x: Real, bound: Bound, local: _NearWorst, weights: Complex | None, unit: Real
+        self, x: Real, bound: Bound, local: _NearWorst, multipliers: Complex | None, unit: Real
     ) -> Real:
-        """Of the blocks' sum weighted by the multipliers of the step before, in natural units (n, n)."""
+        """Second derivative (n, n), in natural units, of the rows' sum weighted by multipliers (R, w, w).
+
+        The multipliers are those of the step before, in coordinates of the outputs; None: the first step,
+        which is taken without curvature. Negative curvature is left out, so that the programme is convex.
+        """
         n = x.size
-        if weights is None:
+        if multipliers is None:
             return np.zeros((n, n))
-        size = np.trace(weights[local.index], axis1=1, axis2=2).real
+        size = np.trace(multipliers[local.index], axis1=1, axis2=2).real
         use = np.flatnonzero(size > _ACTIVE * np.max(size, initial=1e-300))
         index = local.index[use]
-        rows, s = self.stack.rows.part(index), self.stack.s[index]
-        # W = sum_k w_k w_k^H, so that tr(W dH) = 2 Re sum_k (left w_k)^H dK (right w_k).
-        sizes, axes = np.linalg.eigh(weights[index])
-        factors = axes * np.sqrt(np.maximum(sizes, 0.0) / local.top[use][:, None])[:, None, :]
+        rows = self.stack.rows.part(index)
+        s = self.stack.s[index]
+        # With W = sum_k w_k w_k^H a row's share is tr(W dH) = 2 Re sum_k (left w_k)^H dK (right w_k).
+        weights, axes = np.linalg.eigh(multipliers[index])
+        roots = np.sqrt(np.maximum(weights, 0.0) / local.top[use][:, None])
+        factors = axes * roots[:, None, :]
 
         def gradient(points: Real) -> Real:
+            """Slopes (P, n) of the weighted sum at points (P, n), all in one call."""
             count = points.shape[0]
             copies = np.tile(np.arange(index.size), count)
             K = self.form.response(points, s)
-            found = expansion(rows.part(copies), K.reshape(-1, *K.shape[2:]), bound.log_t[index][copies])
-            left, right = found.left @ factors[copies], found.right @ factors[copies]
+            K_of_rows = K.reshape(-1, *K.shape[2:])
+            first_order = expansion(rows.part(copies), K_of_rows, bound.log_t[index][copies])
+            left = first_order.left @ factors[copies]
+            right = first_order.right @ factors[copies]
             total = np.zeros((count, n))
             for k in range(factors.shape[2]):
-                pair = [each[:, :, k].reshape(count, index.size, -1) for each in (left, right)]
-                total += 2 * np.sum(self.form.slopes(points, s, *pair).real, axis=1)
+                left_k = left[:, :, k].reshape(count, index.size, -1)
+                right_k = right[:, :, k].reshape(count, index.size, -1)
+                total += 2 * np.sum(self.form.slopes(points, s, left_k, right_k).real, axis=1)
             return total
 
         points = np.vstack([x[None], x + _SHIFT * np.diag(unit)])
-        found = gradient(points)
-        change = (found[1:] - found[0]) * unit / _SHIFT
-        sizes, axes = np.linalg.eigh(0.5 * (change + change.T))
-        return np.asarray((axes * np.maximum(sizes, 0.0)) @ axes.T)
+        gradients = gradient(points)
+        change = (gradients[1:] - gradients[0]) * unit / _SHIFT
+        curvatures, directions = np.linalg.eigh(0.5 * (change + change.T))
+        return np.asarray((directions * np.maximum(curvatures, 0.0)) @ directions.T)
 
-    def _step(
-        self, x: Real, local: _NearWorst, curvature: Real, unit: Real, box: float
-    ) -> tuple[Real, float, Complex] | None:
-        """Step (n,) in natural units, predicted fall of log gamma^2, multipliers (r, w, w); None where it
-        fails. Rows are u^H M u for directions u of every matrix; the worst are added in rounds."""
-        value, change, fall = local.value, local.slope * unit, local.in_t
+    def _step(self, x: Real, local: _NearWorst, curvature: Real, unit: Real, box: float) -> _Move | None:
+        """Step from x (n,) within a box, with the smallest largest row of the model; None where it fails.
+
+        curvature (n, n) is in natural units (unit, (n,)), in which the box is stated. Rows of the programme
+        are u^H M u for directions u of every matrix M; the worst directions are added in rounds.
+        """
+        value = local.value
+        change = local.slope * unit
+        fall = local.in_t
         width = local.basis.shape[2]
         best = float(np.max(value[:, 0]))
+
+        # First directions: the largest eigenvector of every row that may become the worst ..
         reach = _REACH * box * np.sum(np.abs(change), axis=2)
         near = np.flatnonzero(value[:, 0] + reach[:, 0] > best - box)
-        rows, sides = [near], [np.eye(width, dtype=np.complex128)[np.zeros(near.size, dtype=int)]]
+        first_axis = np.eye(width, dtype=np.complex128)[np.zeros(near.size, dtype=int)]
+        rows = [near]
+        directions = [first_axis]
+        # .. and four directions between two eigenvectors, where the second may become the worst.
         for number, (i, j) in enumerate(combinations(range(width), 2)):
-            apart = change[:, width + 2 * number : width + 2 * number + 2]
-            off = 2 * _REACH * box * np.sum(np.hypot(apart[:, 0], apart[:, 1]), axis=1)
-            both = near[(value[:, j] + reach[:, j] + off > best - box)[near]]
+            off_diagonal = change[:, width + 2 * number : width + 2 * number + 2]
+            size = np.hypot(off_diagonal[:, 0], off_diagonal[:, 1])
+            off_reach = 2 * _REACH * box * np.sum(size, axis=1)
+            may_meet = value[:, j] + reach[:, j] + off_reach > best - box
+            meeting = near[may_meet[near]]
             for factor in (1.0, -1.0, 1j, -1j):
-                u = np.zeros(width, dtype=np.complex128)
-                u[i], u[j] = np.sqrt(0.5), np.sqrt(0.5) * factor
-                rows.append(both)
-                sides.append(np.tile(u, (both.size, 1)))
-        at, u = np.concatenate(rows), np.concatenate(sides)
+                between = np.zeros(width, dtype=np.complex128)
+                between[i] = np.sqrt(0.5)
+                between[j] = np.sqrt(0.5) * factor
+                rows.append(meeting)
+                directions.append(np.tile(between, (meeting.size, 1)))
+        at = np.concatenate(rows)
+        u = np.concatenate(directions)
+        # Only where eigenvalues may meet are further directions looked for.
         pairs = np.unique(at[near.size :])
-        low, high = np.maximum(-box, (self._low - x) / unit), np.minimum(box, (self._high - x) / unit)
-        none = np.zeros((0, x.size)), np.zeros(0)
-        found = None
-        room = _SCALING_BOX * box  # for each log t in the same step
+
+        low = np.maximum(-box, (self._low - x) / unit)
+        high = np.minimum(box, (self._high - x) / unit)
+        no_rows = np.zeros((0, x.size))
+        no_limits = np.zeros(0)
+        scaling_room = _SCALING_BOX * box
+        solution = None
         for _ in range(_CUTS if pairs.size else 1):
             factors = _weights(u)
             level = np.einsum("ri,ri->r", factors, value[at])
-            if width > 1:  # the scalings lower a row as far as they may
-                level -= room * np.sum(np.abs(np.einsum("ri,rin->rn", factors, fall[at])), axis=1)
-            found = minimax_step(
-                level, np.einsum("ri,rin->rn", factors, change[at]), curvature, low, high, *none
-            )
-            if found is None or not pairs.size:
+            if width > 1:
+                # Scalings lower a row as far as they may.
+                by_scaling = np.abs(np.einsum("ri,rin->rn", factors, fall[at]))
+                level -= scaling_room * np.sum(by_scaling, axis=1)
+            row_slope = np.einsum("ri,rin->rn", factors, change[at])
+            solution = minimax_step(level, row_slope, curvature, low, high, no_rows, no_limits)
+            if solution is None or not pairs.size:
                 break
-            worst, turned = _lowered(value[pairs] + change[pairs] @ found.step, fall[pairs], room, width)
-            cut = worst - found.level > _MISSED * max(best - found.level, 0.0)
+            # Largest eigenvalues at the step: where one exceeds the programme's, its direction is added.
+            matrices = value[pairs] + change[pairs] @ solution.step
+            worst, eigenvectors = _lowered(matrices, fall[pairs], scaling_room, width)
+            cut = worst - solution.level > _MISSED * max(best - solution.level, 0.0)
             if not np.any(cut):
                 break
-            at, u = np.concatenate([at, pairs[cut]]), np.vstack([u, turned[cut]])
-        if found is None:
+            at = np.concatenate([at, pairs[cut]])
+            u = np.vstack([u, eigenvectors[cut]])
+        if solution is None:
             return None
-        d, given = found.step, found.multipliers
-        used = u[: given.size]
+
+        # Directions that were added after the last solution have no multiplier.
+        step = solution.step
+        count = solution.multipliers.size
+        used = u[:count]
+        weighted = solution.multipliers[:, None, None] * used[:, :, None]
         multipliers = np.zeros((value.shape[0], width, width), dtype=np.complex128)
-        np.add.at(
-            multipliers, at[: given.size], given[:, None, None] * used[:, :, None] * np.conj(used[:, None, :])
-        )
-        return d, best - found.level - 0.5 * float(d @ curvature @ d), multipliers
+        np.add.at(multipliers, at[:count], weighted * np.conj(used[:, None, :]))
+        predicted = best - solution.level - 0.5 * float(step @ curvature @ step)
+        return _Move(step, predicted, multipliers)
+
+
+def _largest_log(bound: Bound) -> float:
+    """log gamma^2 of the worst row."""
+    return 2 * float(np.log(np.max(bound.gamma)))
+
+
+def _fall(before: float, after: Bound | None) -> float:
+    """Fall of the worst log gamma^2 from `before`; -inf where the loop is not robustly stable any more."""
+    return -np.inf if after is None else before - _largest_log(after)
 
 
 def _entries(matrix: Complex) -> Real:
-    """Hermitian matrices (..., w, w) as real numbers (..., w^2): diagonal, then real and imaginary part of
-    each entry above it."""
+    """Real numbers (..., w^2) of Hermitian matrices (..., w, w).
+
+    The diagonal, then real and imaginary part of each entry above it, row by row.
+    """
     width = matrix.shape[-1]
-    found = [matrix[..., i, i].real for i in range(width)]
+    numbers = [matrix[..., i, i].real for i in range(width)]
     for i, j in combinations(range(width), 2):
-        found += [matrix[..., i, j].real, matrix[..., i, j].imag]
-    return np.stack(found, axis=-1)
+        numbers += [matrix[..., i, j].real, matrix[..., i, j].imag]
+    return np.stack(numbers, axis=-1)
 
 
 def _weights(u: Complex) -> Real:
-    """Of `_entries` in u^H M u, (r, w^2) for directions u (r, w)."""
+    """Weights (r, w^2) with which u^H M u is a sum of M's `_entries`, for directions u (r, w)."""
     width = u.shape[1]
-    found = [np.abs(u[:, i]) ** 2 for i in range(width)]
+    weights = [np.abs(u[:, i]) ** 2 for i in range(width)]
     for i, j in combinations(range(width), 2):
+        # 2 Re(conj(u_i) M_ij u_j)
         product = 2 * np.conj(u[:, i]) * u[:, j]
-        found += [product.real, -product.imag]
-    return np.stack(found, axis=1)
+        weights += [product.real, -product.imag]
+    return np.stack(weights, axis=1)
 
 
 def _matrix(entries: Real, width: int) -> Complex:
-    """Inverse of `_entries`."""
-    found = np.zeros((*entries.shape[:-1], width, width), dtype=np.complex128)
+    """Hermitian matrices (..., w, w) with given `_entries` (..., w^2)."""
+    matrix = np.zeros((*entries.shape[:-1], width, width), dtype=np.complex128)
     for i in range(width):
-        found[..., i, i] = entries[..., i]
+        matrix[..., i, i] = entries[..., i]
     for number, (i, j) in enumerate(combinations(range(width), 2)):
         entry = entries[..., width + 2 * number] + 1j * entries[..., width + 2 * number + 1]
-        found[..., i, j], found[..., j, i] = entry, np.conj(entry)
-    return found
+        matrix[..., i, j] = entry
+        matrix[..., j, i] = np.conj(entry)
+    return matrix
 
 
 def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Complex]:
-    """Largest eigenvalue (r,) of matrices with entries value (r, w^2), lowered by moves within +-room along
-    fall (r, w^2, N), and its eigenvector (r, w): sections of one scaling at a time."""
+    """Largest eigenvalues (r,) of matrices, lowered by their scalings, and the eigenvectors (r, w).
+
+    value (r, w^2) are the entries of the matrices, fall (r, w^2, N) their slopes by log t; each log t moves
+    within +-room. One scaling after the other is set by a search in sections (the largest eigenvalue is
+    convex in it), several scalings twice.
+    """
     shift = np.zeros((value.shape[0], fall.shape[2]))
 
     def largest(by: Real) -> Real:
+        """Largest eigenvalue (r,) with scalings moved by (r, N)."""
         at = value + np.einsum("rin,rn->ri", fall, by)
         if width == 2:
+            # In closed form: a fraction of the time of a general solver.
             apart = np.hypot(at[:, 0] - at[:, 1], 2 * np.hypot(at[:, 2], at[:, 3]))
             return np.asarray(0.5 * (at[:, 0] + at[:, 1] + apart))
         return np.asarray(np.linalg.eigvalsh(_matrix(at, width))[:, -1])
 
-    for i in list(range(shift.shape[1])) * (1 if shift.shape[1] == 1 else 2):
-        low, high = np.full(value.shape[0], -room), np.full(value.shape[0], room)
-        for _ in range(14):
-            left, right = shift.copy(), shift.copy()
-            left[:, i], right[:, i] = low + 0.45 * (high - low), low + 0.55 * (high - low)
+    scalings = list(range(shift.shape[1]))
+    # A second sweep where they depend on each other.
+    sweeps = 1 if len(scalings) == 1 else 2
+    for i in scalings * sweeps:
+        low = np.full(value.shape[0], -room)
+        high = np.full(value.shape[0], room)
+        for _ in range(_SECTIONS):
+            left = shift.copy()
+            left[:, i] = low + _LEFT_SECTION * (high - low)
+            right = shift.copy()
+            right[:, i] = low + _RIGHT_SECTION * (high - low)
             smaller = largest(left) < largest(right)
-            low, high = np.where(smaller, low, left[:, i]), np.where(smaller, right[:, i], high)
+            low = np.where(smaller, low, left[:, i])
+            high = np.where(smaller, right[:, i], high)
         shift[:, i] = 0.5 * (low + high)
-    sizes, axes = np.linalg.eigh(_matrix(value + np.einsum("rin,rn->ri", fall, shift), width))
+    lowered = _matrix(value + np.einsum("rin,rn->ri", fall, shift), width)
+    sizes, axes = np.linalg.eigh(lowered)
     return sizes[:, -1], axes[:, :, -1]
