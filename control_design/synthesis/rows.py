@@ -5,10 +5,14 @@ largest:
 
     G = c + cos(a) major + sin(a) minor,   F = G^i K^j / (1 + G K z^-d),   i, j in {0, 1}.
 
-Members are looked for in compiled code, on `_BOUNDARY` points of each ellipse's boundary, refined by a
+Members are looked for in compiled code (`_worst_members`), on points of each ellipse's boundary, refined by a
 parabola and Newton's method: good for a direction, not for a certificate. There the angle a is one more
 unknown: a row is the largest psi(x, a), its slope psi_x (envelope theorem), its second derivative psi_xx -
 psi_xa psi_xa' / psi_aa, for a long ellipse bends the row although its worst member moves only along it.
+
+`row_functions` builds the CasADi functions of one structure, `_Mapped` calls them at many frequencies at
+once, and `LoopRows` puts the rows of all plants and requirements together. In shapes: F frequencies of all
+plants, R rows, n parameters.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import casadi as ca
 import numba
@@ -27,18 +31,31 @@ from control_design.plants.ellipses import Complex, Ellipses, Integer, Real
 from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import COMPILED, INSIDE
 
-_BOUNDARY = 40  # every 9 degrees; parabola and Newton steps go on from the worst
-_REFINEMENTS = 2  # Newton steps from the vertex of the parabola to the worst member
-_NOTHING = 1e-9  # bend along a boundary, or share of the largest multiplier, that bends no row
-_AT_ONCE = 8  # rows whose curvature is taken in one call: more are not often active
+# Points of a boundary, every 9 degrees; parabola and Newton steps go on from the worst.
+_BOUNDARY = 40
+# Newton steps from the vertex of the parabola to the worst member. With two, the worst case agrees with the
+# exact geometry to 1e-3 or better (tests of the descent).
+_REFINEMENTS = 2
+# Bend along a boundary, or share of the largest multiplier, below which it bends no row: rounding.
+_NOTHING = 1e-9
+# Rows whose curvature is taken in one call: more are not often active, and each costs the same.
+_ROWS_PER_CALL = 8
+# No logarithm of zero; far below any value of a row.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """What is asked of one plant (or delayed copy) on its grid; all arrays (F,).
+    """What is asked of one plant, or of a copy of it with more delay, on its grid.
 
-    delay : z^-d times a delay copy, multiplies K. weights : magnitude (F,) of the weights on functions of the
-    members, 0 = no row.
+    Attributes
+    ----------
+    ellipses : Ellipses
+        Frequencies (F,), rad/s, and the plant's ellipses there.
+    delay : ndarray, shape (F,)
+        z^-d, times a delay copy's own; multiplies K.
+    weights : tuple of (LoopFunction, ndarray of shape (F,))
+        Magnitude of the weights on functions of the members; 0: no row.
     """
 
     ellipses: Ellipses
@@ -48,143 +65,267 @@ class Rows:
 
 @lru_cache(maxsize=64)
 def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
-    """Of controllers with these sections: K at one frequency; the slope of a row; its second derivative times
-    a multiplier. CasADi functions of the parameters, the angle, p and the plant (`LoopRows`)."""
+    """CasADi functions of one row for controllers of one structure.
+
+    Parameters
+    ----------
+    sections : tuple of SectionKind
+
+    Returns
+    -------
+    response : casadi.Function
+        Real and imaginary part of K without delay, of parameters x (n,) and p (2,).
+    slope : casadi.Function
+        Slope (n,) of the row, of x, the angle a of the member, p and plant (10,).
+    bend : casadi.Function
+        Second derivative (n, n) times a multiplier; the multiplier is the last argument.
+
+    Notes
+    -----
+    p (2,) states the Tustin frequency as (v, 1) / max(v, 1). plant (10,) holds real and imaginary parts of
+    centre, major axis, minor axis and delay, then the powers i of G and j of K in F. The order in which
+    expressions are built decides the last digits of every design: keep it.
+    """
     cascade = Cascade(sections, 1.0, 1.0)
-    x, angle, share = ca.SX.sym("x", cascade.parameters), ca.SX.sym("angle"), ca.SX.sym("share")
+    x = ca.SX.sym("x", cascade.parameters)
+    angle = ca.SX.sym("angle")
+    multiplier = ca.SX.sym("share")
     # p = jv as far and near: v and 1, both over the larger; 1e16 at Nyquist stays exact.
-    p, plant = ca.SX.sym("p", 2), ca.SX.sym("plant", 10)
-    far, near = p[0], p[1]
-    re, im = ca.SX(1.0), ca.SX(0.0)
-    for parts in cascade.split_with(x, ca.exp):
-        (n_re, n_im), (d_re, d_im) = (
-            (z * near, o * far) if not t else (z * near**2 - t[0] * far**2, o * near * far)
-            for *t, o, z in parts
-        )
+    p = ca.SX.sym("p", 2)
+    plant = ca.SX.sym("plant", 10)
+    far = p[0]
+    near = p[1]
+
+    # K, section by section: numerator times the conjugate of the denominator, over its square.
+    k_re = ca.SX(1.0)
+    k_im = ca.SX(0.0)
+    for numerator, denominator in cascade.split_with(x, ca.exp):
+        n_re, n_im = _polynomial(numerator, far, near)
+        d_re, d_im = _polynomial(denominator, far, near)
         square = d_re**2 + d_im**2
-        f_re, f_im = (n_re * d_re + n_im * d_im) / square, (n_im * d_re - n_re * d_im) / square
-        re, im = re * f_re - im * f_im, re * f_im + im * f_re
-    centre, major, minor, late = (plant[i : i + 2] for i in range(0, 8, 2))
-    k_re, k_im = re * late[0] - im * late[1], re * late[1] + im * late[0]
+        f_re = (n_re * d_re + n_im * d_im) / square
+        f_im = (n_im * d_re - n_re * d_im) / square
+        k_re, k_im = k_re * f_re - k_im * f_im, k_re * f_im + k_im * f_re
+
+    # psi = i log|G| + j log|K| - log|1 + G K z^-d|.
+    centre = plant[0:2]
+    major = plant[2:4]
+    minor = plant[4:6]
+    late = plant[6:8]
+    late_re = k_re * late[0] - k_im * late[1]
+    late_im = k_re * late[1] + k_im * late[0]
     g = centre + ca.cos(angle) * major + ca.sin(angle) * minor
-    back = ca.vertcat(1 + g[0] * k_re - g[1] * k_im, g[0] * k_im + g[1] * k_re)
-    squares = ca.sumsqr(g), re**2 + im**2, ca.sumsqr(back)
-    of_g, of_k, whole = (ca.log(square + np.finfo(np.float64).tiny) for square in squares)
-    value = 0.5 * (plant[8] * of_g + plant[9] * of_k - whole)
+    distance = ca.vertcat(1 + g[0] * late_re - g[1] * late_im, g[0] * late_im + g[1] * late_re)
+    tiny = np.finfo(np.float64).tiny
+    log_g = ca.log(ca.sumsqr(g) + tiny)
+    log_k = ca.log(k_re**2 + k_im**2 + tiny)
+    log_distance = ca.log(ca.sumsqr(distance) + tiny)
+    value = 0.5 * (plant[8] * log_g + plant[9] * log_k - log_distance)
+
+    # psi_xx - psi_xa psi_xa' / psi_aa where the angle is at a maximum, psi_aa < 0; elsewhere psi_xx.
     full = ca.hessian(value, ca.vertcat(x, angle))[0]
-    along, across = ca.fmin(full[-1, -1], -_NOTHING), full[:-1, -1]
-    bend = full[:-1, :-1] - ca.if_else(full[-1, -1] < -_NOTHING, 1 / along, 0) * across @ across.T
-    given = [x, angle, p, plant]
+    along = ca.fmin(full[-1, -1], -_NOTHING)
+    across = full[:-1, -1]
+    at_maximum = full[-1, -1] < -_NOTHING
+    bend = full[:-1, :-1] - ca.if_else(at_maximum, 1 / along, 0) * across @ across.T
+    arguments = [x, angle, p, plant]
     return (
-        ca.Function("response", [x, p], [re, im]),
-        ca.Function("slope", given, [ca.densify(ca.gradient(value, x))]),
-        ca.Function("bend", [*given, share], [ca.densify(share * bend)]),
+        ca.Function("response", [x, p], [k_re, k_im]),
+        ca.Function("slope", arguments, [ca.densify(ca.gradient(value, x))]),
+        ca.Function("bend", [*arguments, multiplier], [ca.densify(multiplier * bend)]),
     )
 
 
+def _polynomial(coefficients: list[Any], far: Any, near: Any) -> tuple[Any, Any]:
+    """Real and imaginary part of a section's polynomial in p = j far / near, times near^degree.
+
+    coefficients: two or three numbers or symbols, highest power first.
+    """
+    *highest, linear, constant = coefficients
+    if not highest:
+        return constant * near, linear * far
+    return constant * near**2 - highest[0] * far**2, linear * near * far
+
+
 class _Mapped:
-    """A function at n columns at once, between arrays of its own: no conversion takes longer than the
-    function. Inputs but the first have a row a column; summed: so has no output, they are added."""
+    """A CasADi function at n columns at once, between arrays of its own.
+
+    Converting arrays to CasADi's matrices would take longer than the function. All columns share the first
+    input; the others have a row a column in `inputs`. `outputs` have a row a column, too.
+
+    Parameters
+    ----------
+    function : casadi.Function
+    n : int
+        Columns of each call.
+    summed : bool
+        The outputs of all columns are added, into one row.
+    """
 
     def __init__(self, function: Any, n: int, *, summed: bool = False) -> None:
-        mapped = function.map(function.name(), "serial", n, [0], [0] if summed else [])
-        self.given = [np.zeros(mapped.size_in(i)[::-1]) for i in range(mapped.n_in())]
-        self.found = [np.zeros(mapped.size_out(i)[::-1]) for i in range(mapped.n_out())]
+        """Allocate the arrays that the function reads from and writes to."""
+        reduced_outputs = [0] if summed else []
+        mapped = function.map(function.name(), "serial", n, [0], reduced_outputs)
+        # CasADi's matrices are stored by columns: the transposed shape in numpy's order.
+        self.inputs = [np.zeros(mapped.size_in(i)[::-1]) for i in range(mapped.n_in())]
+        self.outputs = [np.zeros(mapped.size_out(i)[::-1]) for i in range(mapped.n_out())]
         self._buffer, self._run = mapped.buffer()
-        for number, array in enumerate(self.given):
+        for number, array in enumerate(self.inputs):
             self._buffer.set_arg(number, array.data)
-        for number, array in enumerate(self.found):
+        for number, array in enumerate(self.outputs):
             self._buffer.set_res(number, array.data)
 
-    def __call__(self, *given: Real) -> list[Real]:
-        """Outputs, as they are until the next call; inputs that are not given stay."""
-        for own, value in zip(self.given, given, strict=False):
-            own[...] = value
+    def __call__(self, *values: Real) -> list[Real]:
+        """Outputs for the first few inputs; the others stay. The next call writes over the outputs."""
+        for array, value in zip(self.inputs, values, strict=False):
+            array[...] = value
         self._run()
-        return self.found
+        return self.outputs
+
+
+class _EllipseArrays(NamedTuple):
+    """Ellipses of all plants, (F,) each: centre, direction of the major axis, and semi-axes."""
+
+    centre: Complex
+    direction: Complex
+    semi_major: Real
+    semi_minor: Real
+
+
+class _Point(NamedTuple):
+    """What was computed last: parameters x (n,), K with its delay (F,), worst angles and rows (R,)."""
+
+    x: Real
+    k: Complex
+    angles: Real
+    logs: Real
 
 
 class LoopRows:
-    """Rows of one cascade for all plants, on grids that stay."""
+    """Rows of one cascade for all plants, on grids that stay.
+
+    Parameters
+    ----------
+    cascade : Cascade
+    plants : sequence of Rows
+        All sampled as the cascade is.
+
+    Notes
+    -----
+    Several weights of one plant on the same closed-loop function make one row, of the largest. Rows are
+    ordered by function, then plant, then frequency; there is none where the weight is 0.
+    """
 
     def __init__(self, cascade: Cascade, plants: Sequence[Rows]) -> None:
-        every = [rows.ellipses for rows in plants]
-        names = "centre", "direction", "semi_major", "semi_minor"
-        self._ellipses = tuple(np.concatenate([getattr(e, name) for e in every]) for name in names)
+        """Put all frequencies into one array (F,), all rows into one (R,), and build their functions."""
+        ellipses = [rows.ellipses for rows in plants]
+        self._ellipses = _EllipseArrays(
+            np.concatenate([each.centre for each in ellipses]),
+            np.concatenate([each.direction for each in ellipses]),
+            np.concatenate([each.semi_major for each in ellipses]),
+            np.concatenate([each.semi_minor for each in ellipses]),
+        )
         self._delay = np.concatenate([rows.delay for rows in plants])
-        v = tustin_frequency(np.concatenate([e.omega_rad_s for e in every]), cascade.dt_s)
-        v, self._of_plant, parts = v / cascade.scale_rad_s, list[slice](), list[tuple[Any, ...]]()
+        omega = np.concatenate([each.omega_rad_s for each in ellipses])
+        v = tustin_frequency(omega, cascade.dt_s) / cascade.scale_rad_s
+
+        # For each closed-loop function: frequencies that have a row, log weights, and powers i, j of G and K.
+        self._of_plant: list[slice] = []
+        indices = []
+        log_weights = []
+        power_arrays = []
         start = 0
         for function in LoopFunction:
             sizes = []
             for rows in plants:
-                own = [size for of, size in rows.weights if of is function]
-                sizes.append(np.max(own, axis=0) if own else np.zeros(rows.delay.size))
+                of_function = [size for asked, size in rows.weights if asked is function]
+                sizes.append(np.max(of_function, axis=0) if of_function else np.zeros(rows.delay.size))
             weight = np.concatenate(sizes)
-            at = np.flatnonzero(weight > 0)
-            if at.size:
-                flags = np.tile([[float(function.of_plant)], [float(function.of_controller)]], at.size)
-                parts.append((at, np.log(weight[at]), flags))
-                self._of_plant += [slice(start, start + at.size)] if function.of_plant else []
-                start += at.size
-        self._index, self._weight, flags = (
-            np.concatenate(each, axis=-1) for each in zip(*parts, strict=True)
-        )
+            index = np.flatnonzero(weight > 0)
+            if not index.size:
+                continue
+            indices.append(index)
+            log_weights.append(np.log(weight[index]))
+            powers = [[float(function.of_plant)], [float(function.of_controller)]]
+            power_arrays.append(np.tile(powers, index.size))
+            if function.of_plant:
+                self._of_plant.append(slice(start, start + index.size))
+            start += index.size
+        self._index = np.concatenate(indices, axis=-1)
+        self._weight = np.concatenate(log_weights, axis=-1)
+        powers_of_rows = np.concatenate(power_arrays, axis=-1)
+        self._of_k = powers_of_rows[1] > 0
+
+        # What `row_functions` takes for p and plant, one line a row: it never changes.
         centre, direction, major, minor = self._ellipses
-        turned = centre, direction * major, 1j * direction * minor, self._delay
-        pairs = np.concatenate([[each.real, each.imag] for each in turned])
+        complex_values = (centre, direction * major, 1j * direction * minor, self._delay)
+        real_values = np.concatenate([[each.real, each.imag] for each in complex_values])
         p = np.stack([v, np.ones(v.size)], axis=1) / np.maximum(v, 1.0)[:, None]
-        self._of_k = flags[1] > 0
-        self._fixed = p[self._index], np.hstack([pairs.T[self._index], flags.T])
+        plant_of_rows = np.hstack([real_values.T[self._index], powers_of_rows.T])
+        self._fixed = (p[self._index], plant_of_rows)
         response, slope, bend = row_functions(cascade.sections)
-        self._response, self._slope = _Mapped(response, v.size), _Mapped(slope, self._index.size)
-        self._bend = _Mapped(bend, _AT_ONCE, summed=True)
-        self._response.given[1][...] = p
-        self._slope.given[2][...], self._slope.given[3][...] = self._fixed
-        self._last: tuple[Real, Complex, Real, Real] | None = None
+        self._response = _Mapped(response, v.size)
+        self._response.inputs[1][...] = p
+        self._slope = _Mapped(slope, self._index.size)
+        self._slope.inputs[2][...] = self._fixed[0]
+        self._slope.inputs[3][...] = self._fixed[1]
+        self._bend = _Mapped(bend, _ROWS_PER_CALL, summed=True)
+        self._latest: _Point | None = None
 
     def covers_minus_one(self, x: Real) -> bool:
-        """Whether some ellipse contains -1/K; its boundary alone would not show it."""
+        """Whether some ellipse contains -1/K under x (n,); the rows, of its boundary, would not show it."""
         centre, direction, semi_major, semi_minor = self._ellipses
-        k = self._at(x)[0]
+        k = self._at(x).k
+        # 1/K + centre in the ellipse's own axes, times |K|^2: no division by a K that vanishes.
         turned = (1.0 + k * centre) * np.conj(k * direction)
         size = np.abs(k) ** 2
-        major, minor = turned.real * semi_minor, turned.imag * semi_major
-        return bool(np.any(np.hypot(major, minor) < size * semi_major * semi_minor))
+        along_major = turned.real * semi_minor
+        along_minor = turned.imag * semi_major
+        inside = np.hypot(along_major, along_minor) < size * semi_major * semi_minor
+        return bool(np.any(inside))
 
     def rows(self, x: Real) -> Real:
-        """Logarithms (R,) of all weighted values."""
-        return self._at(x)[2]
+        """Logarithms (R,) of all weighted values under x (n,)."""
+        return self._at(x).logs
 
     def slopes(self, x: Real) -> Real:
-        """Their slopes (R, n)."""
-        (slope,) = self._slope(x, self._at(x)[1][:, None])
+        """Slopes (R, n) of the rows in the parameters x (n,)."""
+        angles = self._at(x).angles
+        (slope,) = self._slope(x, angles[:, None])
         return slope.reshape(-1, x.size).copy()
 
     def curvature(self, x: Real, multipliers: Real) -> Real:
-        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,)."""
-        angles, total = self._at(x)[1], np.zeros((x.size, x.size))
+        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,), at x (n,)."""
+        angles = self._at(x).angles
+        total = np.zeros((x.size, x.size))
         active = np.flatnonzero(multipliers > _NOTHING * np.max(multipliers))
-        for start in range(0, active.size, _AT_ONCE):
-            use = active[start : start + _AT_ONCE]
-            share = np.append(multipliers[use], np.zeros(_AT_ONCE - use.size))
-            use = np.append(use, np.repeat(use[:1], _AT_ONCE - use.size))
-            at = angles[use, None], *(each[use] for each in self._fixed), share[:, None]
-            total += self._bend(x, *at)[0]
+        for start in range(0, active.size, _ROWS_PER_CALL):
+            # The last call is filled up with a row of multiplier 0.
+            use = active[start : start + _ROWS_PER_CALL]
+            missing = _ROWS_PER_CALL - use.size
+            share = np.append(multipliers[use], np.zeros(missing))
+            use = np.append(use, np.repeat(use[:1], missing))
+            p, plant = self._fixed
+            (bend,) = self._bend(x, angles[use, None], p[use], plant[use], share[:, None])
+            total += bend
         return total
 
-    def _at(self, x: Real) -> tuple[Complex, Real, Real]:
-        """K with its delay (F,), angles (R,) of the worst members and the rows (R,)."""
-        if self._last is None or not np.array_equal(self._last[0], x):
+    def _at(self, x: Real) -> _Point:
+        """K, worst members and rows under x (n,); computed once for successive calls with the same x."""
+        if self._latest is None or not np.array_equal(self._latest.x, x):
             re, im = self._response(x)
             bare = (re + 1j * im)[:, 0]
             k = bare * self._delay
+            # Angles and values of |1/(1 + G K)| at all frequencies, dealt to the rows; of |G/(1 + G K)| where
+            # the row's function has G.
             worst = _worst_members(k, np.arange(k.size), *self._ellipses, False)[:, self._index]
             for rows in self._of_plant:
                 worst[:, rows] = _worst_members(k, self._index[rows], *self._ellipses, True)
-            sizes = worst[1] * np.where(self._of_k, np.abs(bare[self._index]), 1.0)
-            self._last = x.copy(), k, worst[0], self._weight + np.log(np.maximum(sizes, 1e-300))
-        return self._last[1:]
+            angles = worst[0]
+            controller_factor = np.where(self._of_k, np.abs(bare[self._index]), 1.0)
+            sizes = worst[1] * controller_factor
+            self._latest = _Point(x.copy(), k, angles, self._weight + np.log(np.maximum(sizes, _TINY)))
+        return self._latest
 
 
 @numba.njit(**COMPILED)
@@ -197,48 +338,64 @@ def _worst_members(
     semi_minor: Real,
     of_plant: bool,
 ) -> Real:
-    """Angles of the members with the largest |1/(1 + G K)|, or |G/(1 + G K)|, at some of the frequencies, and
-    that value, (2, D); k (F,).
+    """Angles (first row) and values (second row), (2, D), of the worst members at D of the frequencies.
 
-    Best boundary point, vertex of the parabola through it, Newton from there. A point that does not gain on
-    the boundary's best is not taken.
+    The worst member has the largest |1/(1 + G K)|, or |G/(1 + G K)| if of_plant; k (F,) is K with its delay,
+    index (D,) says which frequencies, and the ellipses are (F,) each. Best boundary point, vertex of the
+    parabola through it and its neighbours, Newton from there. A point that does not gain on the boundary's
+    best is not taken.
     """
     width = 2 * np.pi / _BOUNDARY
-    cos, sin = np.empty(_BOUNDARY), np.empty(_BOUNDARY)
+    cos = np.empty(_BOUNDARY)
+    sin = np.empty(_BOUNDARY)
     for j in range(_BOUNDARY):
-        cos[j], sin[j] = np.cos(j * width), np.sin(j * width)
-    found, values = np.empty((2, index.size)), np.empty(_BOUNDARY)
+        cos[j] = np.cos(j * width)
+        sin[j] = np.sin(j * width)
+    worst = np.empty((2, index.size))
+    values = np.empty(_BOUNDARY)
     for number in range(index.size):
         i = index[number]
-        major, minor = direction[i] * semi_major[i], 1j * direction[i] * semi_minor[i]
+        major = direction[i] * semi_major[i]
+        minor = 1j * direction[i] * semi_minor[i]
+
+        # Best point of the boundary; index -1 is the last one, which is a neighbour of the first.
         top = 0
         for j in range(_BOUNDARY):
             values[j] = _size(centre[i] + cos[j] * major + sin[j] * minor, k[i], of_plant)
             if values[j] > values[top]:
                 top = j
-        here, before, after = values[top], values[top - 1], values[(top + 1) % _BOUNDARY]
-        best = top * width
-        change = _vertex(0.5 * (after - before), before - 2 * here + after)
-        angle = best + width * min(max(change, -0.5), 0.5)
+        best_value = values[top]
+        before = values[top - 1]
+        after = values[(top + 1) % _BOUNDARY]
+        best_angle = top * width
+
+        # Vertex of the parabola through three points, at most half a step away.
+        change = _vertex(0.5 * (after - before), before - 2 * best_value + after)
+        angle = best_angle + width * min(max(change, -0.5), 0.5)
         for _ in range(_REFINEMENTS + 1):
+            # g1 and g2: first and second derivative of the member g in the angle.
             g1 = np.cos(angle) * minor - np.sin(angle) * major
             g2 = -np.cos(angle) * major - np.sin(angle) * minor
             g = centre[i] - g2
             value = _size(g, k[i], of_plant)
-            if value > here:
-                here, best = value, angle
+            if value > best_value:
+                best_value = value
+                best_angle = angle
             # Slope and bend of the logarithm along the boundary.
             back = 1.0 + g * k[i]
             if back == 0:
                 break
-            first, second = -g1 * k[i] / back, -g2 * k[i] / back
+            first = -g1 * k[i] / back
+            second = -g2 * k[i] / back
             second += first * first
             if of_plant and g != 0:
-                first, second = first + g1 / g, second + g2 / g - (g1 / g) ** 2
+                first = first + g1 / g
+                second = second + g2 / g - (g1 / g) ** 2
             change = _vertex(first.real, second.real)
             angle += min(max(change, -0.5 * width), 0.5 * width)
-        found[0, number], found[1, number] = best, here
-    return found
+        worst[0, number] = best_angle
+        worst[1, number] = best_value
+    return worst
 
 
 @numba.njit(**INSIDE)
@@ -246,10 +403,10 @@ def _size(g: complex, k: complex, of_plant: bool) -> Any:
     """|1/(1 + g k)|, or |g/(1 + g k)|; in squares, since a modulus costs more than all the rest."""
     back = 1.0 + g * k
     above = g.real * g.real + g.imag * g.imag if of_plant else 1.0
-    return np.sqrt(above / max(back.real * back.real + back.imag * back.imag, 1e-300))
+    return np.sqrt(above / max(back.real * back.real + back.imag * back.imag, _TINY))
 
 
 @numba.njit(**INSIDE)
 def _vertex(slope: float, bend: float) -> float:
-    """Step to the maximum of a parabola; 0 where it has none."""
+    """Step to the maximum of a parabola with this slope and second derivative; 0 where it has none."""
     return slope / -bend if bend < 0 else 0.0
