@@ -2,24 +2,87 @@
 
     K(s) = D + C_0 / s + sum_b C_b (s / w_b - M_b)^-1 B_b,   M_b = [[0, 1], [-1, -2 zeta_b]],
 
-two states per block, s of Tustin's rule. Parameters: log w_b, log zeta_b, then the free entries of C, B and
-D. A block belongs to the rows and columns of K that its masks name, so that zeros of K stay zeros.
+two states per block b, s of Tustin's rule. `ModalForm` knows which entries of K may differ from zero (its
+pattern), and writes K with the parameters log w_b, log zeta_b, then the free entries of C, B, D and C_0. A
+block belongs to the rows and columns of K that its masks name, so that zeros of K stay zeros.
+
+`response` and `slopes` evaluate many parameter vectors at many frequencies; `spread` and `realised` give
+parameters to begin with; `continuous` and `discrete` give the state space. In shapes: P parameter vectors of
+n parameters, R frequencies, m blocks, U actuators, Y outputs, i integrators.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from control_design.plants.ellipses import Boolean, Complex, Real
 
-_FASTEST = 60.0  # corner of a block, in units of the scale
-_MOST_DAMPED = 50.0  # two real poles (2 zeta)^2 = 10^4 apart: any pair of real poles, nearly
+# Highest corner of a block, in units of the scale; the scale is where the loop crosses, about.
+_FASTEST = 60.0
+# Highest damping ratio of a block: two real poles (2 zeta)^2 = 10^4 apart, nearly any pair of real poles.
+_MOST_DAMPED = 50.0
+# Least gains that natural units are stated for: D over nothing, B of a block, C over what the gain would be,
+# C_0 over gain times scale. Where an entry vanishes its unit would, too, and it could not move.
+_LEAST_GAIN = 1e-9
+_LEAST_B = 1e-3
+_LEAST_C_OF_GAIN = 0.05
+_LEAST_C_0_OF_GAIN = 0.01
+# Imaginary part, of the modulus, up to which a pole counts as real: rounding of an eigenvalue.
+_REAL = 1e-9
+# Coordinates of a block that are tried, evenly over half a turn; the best has the smallest norms of C and B.
+_TURNS = 24
+# Condition number of coordinates beyond which they are no basis: two poles coincide, or the angle is unlucky.
+_WORST_CONDITION = 1e9
+
+
+class ModalParts(NamedTuple):
+    """Parts of P parameter vectors, or of one without the first axis.
+
+    Attributes
+    ----------
+    log_w, log_zeta : ndarray, shape (P, m)
+        Logarithms of corner, rad/s, and damping ratio of each block.
+    C : ndarray, shape (P, m, U, 2)
+    B : ndarray, shape (P, m, 2, Y)
+    D : ndarray, shape (P, U, Y)
+    C_0 : ndarray, shape (P, U, i)
+        Gains of the integrators.
+    """
+
+    log_w: Real
+    log_zeta: Real
+    C: Real
+    B: Real
+    D: Real
+    C_0: Real
 
 
 class ModalForm:
-    """Structure of K (U, Y): pattern (U, Y) of entries, number of states, integrating outputs (Y,)."""
+    """Structure of K (U, Y), and the map between parameters and K.
+
+    Parameters
+    ----------
+    pattern : ndarray of bool, shape (U, Y)
+        Entries of K that may differ from zero.
+    order : int
+        Number of states: one for each integrator, two for each block.
+    integrates : ndarray of bool, shape (Y,)
+        Outputs that are integrated.
+    scale_rad_s : float
+        Frequency around which the controller acts.
+    slowest_rad_s : float
+        Lowest corner of a block.
+    dt_s : float
+    damping : float
+        Least damping ratio of a block.
+
+    Raises
+    ------
+    ValueError
+        The order is not one for each integrator and two for each block.
+    """
 
     def __init__(
         self,
@@ -31,193 +94,393 @@ class ModalForm:
         dt_s: float,
         damping: float,
     ) -> None:
-        self.pattern, self.scale, self.dt_s, self.damping = pattern, scale_rad_s, dt_s, damping
+        """Find the free entries of every part, and where each part stands in the parameter vector."""
+        self.pattern = pattern
+        self.scale = scale_rad_s
         self.slowest = slowest_rad_s
+        self.dt_s = dt_s
+        self.damping = damping
         self.inputs, self.outputs = pattern.shape
         self.integrates = np.flatnonzero(integrates)
-        left = order - self.integrates.size
-        if left < 0 or left % 2:
+        block_states = order - self.integrates.size
+        if block_states < 0 or block_states % 2:
             raise ValueError(
                 f"controller_order must be {self.integrates.size} (integrators) and two per modal block; "
                 f"got {order}"
             )
-        self.blocks, self.order = left // 2, order
-        row_mask, column_mask = (
-            np.zeros((self.blocks, self.inputs), bool),
-            np.zeros((self.blocks, self.outputs), bool),
-        )
-        for b, (rows, columns) in zip(range(self.blocks), _rectangles(pattern, self.blocks), strict=False):
-            row_mask[b], column_mask[b] = rows, columns
-        m = self.blocks
-        # Positions of free entries in C (m, U, 2), B (m, 2, Y), D (U, Y), C_0 (U, integrators).
+        self.order = order
+        self.blocks = block_states // 2
+
+        # Rows and columns of K that each block belongs to.
+        row_mask = np.zeros((self.blocks, self.inputs), bool)
+        column_mask = np.zeros((self.blocks, self.outputs), bool)
+        for block, (rows, columns) in enumerate(_rectangles(pattern, self.blocks)):
+            row_mask[block] = rows
+            column_mask[block] = columns
+
+        # Positions of free entries in C (m, U, 2), B (m, 2, Y), D (U, Y), C_0 (U, i).
         self._c = np.nonzero(np.repeat(row_mask[:, :, None], 2, axis=2))
         self._b = np.nonzero(np.repeat(column_mask[:, None, :], 2, axis=1))
         self._d = np.nonzero(pattern)
         self._i = np.nonzero(pattern[:, self.integrates])
-        self.ends = np.cumsum([m, m, self._c[0].size, self._b[0].size, self._d[0].size, self._i[0].size])
+        free_entries = [positions[0].size for positions in (self._c, self._b, self._d, self._i)]
+        self.ends = np.cumsum([self.blocks, self.blocks, *free_entries])
         self.parameters = int(self.ends[-1])
 
-    def split(self, x: Real) -> tuple[Real, Real, Real, Real, Real, Real]:
-        """log w (P, m), log zeta (P, m), C (P, m, U, 2), B (P, m, 2, Y), D (P, U, Y), C_0 (P, U, i) of
-        parameters (P, n)."""
-        count, m = x.shape[0], self.blocks
-        log_w, log_z, c, b, d, i, _ = np.split(x, self.ends, axis=1)
-        C, B = np.zeros((count, m, self.inputs, 2)), np.zeros((count, m, 2, self.outputs))
-        D, C_0 = (
-            np.zeros((count, self.inputs, self.outputs)),
-            np.zeros((count, self.inputs, self.integrates.size)),
-        )
+    # Parameter vectors and their parts
+
+    def split(self, x: Real) -> ModalParts:
+        """Parts of parameter vectors.
+
+        Parameters
+        ----------
+        x : ndarray, shape (P, n)
+
+        Returns
+        -------
+        ModalParts
+            Entries that the pattern forbids are zero.
+        """
+        count = x.shape[0]
+        log_w, log_zeta, c, b, d, c_0, _ = np.split(x, self.ends, axis=1)
+        C = np.zeros((count, self.blocks, self.inputs, 2))
+        B = np.zeros((count, self.blocks, 2, self.outputs))
+        D = np.zeros((count, self.inputs, self.outputs))
+        C_0 = np.zeros((count, self.inputs, self.integrates.size))
         every: Any = slice(None)
-        C[(every, *self._c)], B[(every, *self._b)] = c, b
-        D[(every, *self._d)], C_0[(every, *self._i)] = d, i
-        return log_w, log_z, C, B, D, C_0
+        C[(every, *self._c)] = c
+        B[(every, *self._b)] = b
+        D[(every, *self._d)] = d
+        C_0[(every, *self._i)] = c_0
+        return ModalParts(log_w, log_zeta, C, B, D, C_0)
+
+    def _split_one(self, x: Real) -> ModalParts:
+        """Parts, without the first axis, of one parameter vector (n,)."""
+        return ModalParts(*(part[0] for part in self.split(x[None])))
 
     def join(self, log_w: Real, log_z: Real, C: Real, B: Real, D: Real, C_0: Real) -> Real:
-        """Parameters (n,) of one controller; what the pattern forbids is left out."""
+        """Parameters of one controller from its parts.
+
+        Parameters
+        ----------
+        log_w, log_z, C, B, D, C_0 : ndarray
+            As in `ModalParts`, without the first axis.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            What the pattern forbids is left out.
+        """
         return np.concatenate([log_w, log_z, C[self._c], B[self._b], D[self._d], C_0[self._i]])
 
-    def spread(self, lowest: float, highest: float, zeta: float) -> tuple[Real, Real, Real, Real]:
-        """log w, log zeta, C, B of blocks from lowest to highest times the scale, one for each actuator at a
-        corner where they belong to one, that do nothing yet: C is zero."""
-        turns = 1 if self.pattern.all() else self.inputs
-        corners = np.geomspace(lowest, highest, max(-(-self.blocks // turns), 1)) * self.scale
-        B = np.zeros((self.blocks, 2, self.outputs))
-        for block, state in np.ndindex(self.blocks, 2):
-            if turns == 1:
-                B[block, state, (block + state) % self.outputs] = 1.0
-            elif state == 0:
-                B[block, state] = 1.0
-        log_w, log_z = np.log(np.repeat(corners, turns)[: self.blocks]), np.log(max(zeta, self.damping))
-        return log_w, np.full(self.blocks, log_z), np.zeros((self.blocks, self.inputs, 2)), B
-
     def bounds(self) -> tuple[Real, Real]:
-        low, high = np.full(self.parameters, -np.inf), np.full(self.parameters, np.inf)
+        """Least and largest value (n,) of every parameter; C, B, D and C_0 are free."""
+        low = np.full(self.parameters, -np.inf)
+        high = np.full(self.parameters, np.inf)
         m = self.blocks
-        low[:m], high[:m] = np.log(self.slowest), np.log(_FASTEST * self.scale)
-        low[m : 2 * m], high[m : 2 * m] = np.log(self.damping), np.log(_MOST_DAMPED)
+        low[:m] = np.log(self.slowest)
+        high[:m] = np.log(_FASTEST * self.scale)
+        low[m : 2 * m] = np.log(self.damping)
+        high[m : 2 * m] = np.log(_MOST_DAMPED)
         return low, high
 
     def units(self, x: Real) -> Real:
-        """A substantial change of each parameter (n,)."""
-        _, _, C, B, D, C_0 = (part[0] for part in self.split(x[None]))
-        gain = max(float(np.sqrt(np.mean(D[self.pattern] ** 2))), 1e-9)
-        in_b = np.maximum(np.sqrt(np.mean(B**2, axis=(1, 2))), 1e-3)
-        in_c = np.maximum(np.sqrt(np.mean(C**2, axis=(1, 2))), 0.05 * gain / in_b)
+        """A substantial change of each parameter.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            Where the change starts from.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            1 for logarithms; root mean squares of D, of each block's B and C, and of C_0, with a least value
+            that lets an idle block begin to move.
+        """
+        parts = self._split_one(x)
+        direct_gain = float(np.sqrt(np.mean(parts.D[self.pattern] ** 2)))
+        gain = max(direct_gain, _LEAST_GAIN)
+        size_of_b = np.sqrt(np.mean(parts.B**2, axis=(1, 2)))
+        of_b = np.maximum(size_of_b, _LEAST_B)
+        size_of_c = np.sqrt(np.mean(parts.C**2, axis=(1, 2)))
+        of_c = np.maximum(size_of_c, _LEAST_C_OF_GAIN * gain / of_b)
+        integral_gain = float(np.sqrt(np.mean(parts.C_0**2))) if parts.C_0.size else 0.0
+        of_c_0 = max(integral_gain, _LEAST_C_0_OF_GAIN * gain * self.scale)
+
+        # One unit for all entries of a part, in the shape of the part.
         ones = np.ones(self.blocks)
-        slow = max(float(np.sqrt(np.mean(C_0**2))) if C_0.size else 0.0, 0.01 * gain * self.scale)
-        return self.join(
-            ones, ones, in_c[:, None, None] * np.ones_like(C), in_b[:, None, None] * np.ones_like(B),
-            gain * np.ones_like(D), slow * np.ones_like(C_0),
-        )  # fmt: skip
+        C = of_c[:, None, None] * np.ones_like(parts.C)
+        B = of_b[:, None, None] * np.ones_like(parts.B)
+        D = gain * np.ones_like(parts.D)
+        C_0 = of_c_0 * np.ones_like(parts.C_0)
+        return self.join(ones, ones, C, B, D, C_0)
+
+    # Parameters to begin with
+
+    def spread(self, lowest: float, highest: float, zeta: float) -> tuple[Real, Real, Real, Real]:
+        """Blocks with corners spread over frequency that do nothing yet.
+
+        Parameters
+        ----------
+        lowest, highest : float
+            First and last corner, in units of the scale; logarithmic between them.
+        zeta : float
+            Damping ratio, if not less than the form's least.
+
+        Returns
+        -------
+        log_w, log_zeta : ndarray, shape (m,)
+        C : ndarray, shape (m, U, 2)
+            Zero.
+        B : ndarray, shape (m, 2, Y)
+
+        Notes
+        -----
+        Where blocks belong to one actuator each, every corner serves one block of each actuator, with all
+        outputs into the first state. Else the states take the outputs in turn.
+        """
+        blocks_per_corner = 1 if self.pattern.all() else self.inputs
+        # At least one corner, the number of blocks over that of a corner rounded up.
+        corner_count = max(-(-self.blocks // blocks_per_corner), 1)
+        corners = np.geomspace(lowest, highest, corner_count) * self.scale
+        B = np.zeros((self.blocks, 2, self.outputs))
+        for block, state in np.ndindex(self.blocks, 2):
+            if blocks_per_corner == 1:
+                B[block, state, (block + state) % self.outputs] = 1.0
+            elif state == 0:
+                B[block, state] = 1.0
+        log_w = np.log(np.repeat(corners, blocks_per_corner)[: self.blocks])
+        log_zeta = np.full(self.blocks, np.log(max(zeta, self.damping)))
+        return log_w, log_zeta, np.zeros((self.blocks, self.inputs, 2)), B
+
+    def realised(self, A: Real, B: Real, C: Real, D: Real) -> Real | None:
+        """Parameters of a full controller that is known as a continuous state space.
+
+        Parameters
+        ----------
+        A, B, C, D : ndarray
+            Of K(s), with as many states as the form.
+
+        Returns
+        -------
+        ndarray, shape (n,), or None
+            Unstable poles are mirrored, the slowest real ones become the integrators, and corners and
+            dampings are moved into their bounds. Every block has unit norm at its input. None where real
+            poles do not pair, or two poles of a pair are the same.
+
+        Notes
+        -----
+        A pair of poles is brought from diagonal form, a = diag(poles) / w = T M T^-1, to that of a block.
+        Every T = [v, -a v] does so, with v real, or of conjugates for a complex pair. v is determined up to
+        an angle; that one is taken at which the norms of B and C are smallest.
+        """
+        poles, axes = np.linalg.eig(A)
+        inverse = np.linalg.inv(axes)
+        is_real = np.abs(poles.imag) <= _REAL * np.abs(poles)
+        upper = np.flatnonzero(poles.imag > _REAL * np.abs(poles))
+        real = sorted(np.flatnonzero(is_real), key=lambda k: abs(poles[k]))
+        slow = real[: self.integrates.size]
+        real = real[self.integrates.size :]
+        if len(real) % 2 or len(slow) < self.integrates.size:
+            return None
+        poles = -np.abs(poles.real) + 1j * poles.imag
+
+        # Two poles for every block: a pole and its conjugate, or neighbours among the real ones.
+        pairs = []
+        for k in upper:
+            conjugate = np.argmin(np.abs(poles - np.conj(poles[k])))
+            pairs.append(np.array([k, conjugate]))
+        pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
+        log_w, log_zeta, C_blocks, B_blocks = self.spread(1.0, 1.0, 1.0)
+        for block, pair in enumerate(pairs):
+            geometric_mean = float(np.sqrt(np.prod(poles[pair]).real))
+            w = max(geometric_mean, np.finfo(float).tiny)
+            a = np.diag(poles[pair]) / w
+            candidates = []
+            for angle in np.linspace(0, np.pi, _TURNS, endpoint=False):
+                if block < upper.size:
+                    v = np.exp([1j * angle, -1j * angle])
+                else:
+                    v = np.array([np.cos(angle), np.sin(angle)])
+                T = np.column_stack([v, -a @ v])
+                if np.linalg.cond(T) < _WORST_CONDITION:
+                    into_block = np.linalg.solve(T, inverse[pair] @ B / w).real
+                    out_of_block = (C @ axes[:, pair] @ T).real
+                    norms = float(np.linalg.norm(into_block) * np.linalg.norm(out_of_block))
+                    candidates.append((norms, into_block, out_of_block))
+            if not candidates:
+                return None
+            _, b, c = min(candidates, key=lambda candidate: candidate[0])
+            size = float(np.linalg.norm(b)) or 1.0
+            log_w[block] = np.log(w)
+            log_zeta[block] = np.log(-np.sum(poles[pair]).real / (2 * w))
+            C_blocks[block] = c * size
+            B_blocks[block] = b / size
+        # Residues of the slowest poles are the integrators' gains.
+        residues = (C @ axes[:, slow] @ inverse[slow] @ B).real
+        C_0 = residues[:, self.integrates]
+        x = self.join(log_w, log_zeta, C_blocks, B_blocks, D, C_0)
+        return np.clip(x, *self.bounds())
+
+    # Values and slopes
 
     def _resolvent(self, log_w: Real, log_z: Real, s: Complex) -> tuple[Complex, Complex]:
-        """s / w (P, R, m) and (s / w - M)^-1 (P, R, m, 2, 2)."""
+        """s / w (P, R, m) and (s / w - M)^-1 (P, R, m, 2, 2) of blocks (P, m) at s (R,)."""
         ratio = s[None, :, None] / np.exp(log_w)[:, None, :]
         swing = ratio + 2 * np.exp(log_z)[:, None, :]
+        # Inverse of [[s/w, -1], [1, s/w + 2 zeta]] in closed form.
         E = np.empty((*ratio.shape, 2, 2), dtype=np.complex128)
-        E[..., 0, 0], E[..., 0, 1], E[..., 1, 0], E[..., 1, 1] = swing, 1.0, -1.0, ratio
+        E[..., 0, 0] = swing
+        E[..., 0, 1] = 1.0
+        E[..., 1, 0] = -1.0
+        E[..., 1, 1] = ratio
         E /= (ratio * swing + 1.0)[..., None, None]
         return ratio, E
 
     def response(self, x: Real, s: Complex) -> Complex:
-        """K (P, R, U, Y) for parameters (P, n) at s (R,)."""
-        log_w, log_z, C, B, D, C_0 = self.split(x)
-        _, E = self._resolvent(log_w, log_z, s)
-        K = np.sum(C[:, None] @ (E @ B[:, None]), axis=2) + D[:, None]
+        """Values of K.
+
+        Parameters
+        ----------
+        x : ndarray, shape (P, n)
+        s : ndarray, shape (R,)
+            Tustin's s.
+
+        Returns
+        -------
+        ndarray, shape (P, R, U, Y)
+        """
+        parts = self.split(x)
+        _, E = self._resolvent(parts.log_w, parts.log_zeta, s)
+        blocks = parts.C[:, None] @ (E @ parts.B[:, None])
+        K = np.sum(blocks, axis=2) + parts.D[:, None]
         if self.integrates.size:
-            K[..., self.integrates] += C_0[:, None] / s[None, :, None, None]
+            K[..., self.integrates] += parts.C_0[:, None] / s[None, :, None, None]
         return np.asarray(K)
 
     def slopes(self, x: Real, s: Complex, left: Complex, right: Complex) -> Complex:
-        """left^H dK right for every parameter, (P, R, n); left (P, R, U), right (P, R, Y)."""
+        """Slopes of left^H K right in every parameter.
+
+        Parameters
+        ----------
+        x : ndarray, shape (P, n)
+        s : ndarray, shape (R,)
+            Tustin's s.
+        left : ndarray, shape (P, R, U)
+        right : ndarray, shape (P, R, Y)
+
+        Returns
+        -------
+        ndarray, shape (P, R, n)
+        """
         log_w, log_z, C, B, _, _ = self.split(x)
         ratio, E = self._resolvent(log_w, log_z, s)
-        away = np.conj(left)[:, :, None, :, None]
-        g = E @ (B[:, None] @ right[:, :, None, :, None])  # (P, R, m, 2, 1)
-        h = np.swapaxes(E, -1, -2) @ (np.swapaxes(C, -1, -2)[:, None] @ away)  # conj: left^H C E
-        g, h = g[..., 0], h[..., 0]
+        left_conjugate = np.conj(left)
+        # Into a block, g = E B right, and back from it, h' = left^H C E; both (P, R, m, 2).
+        inputs = B[:, None] @ right[:, :, None, :, None]
+        g_columns = E @ inputs
+        C_transposed = np.swapaxes(C, -1, -2)[:, None]
+        outputs = C_transposed @ left_conjugate[:, :, None, :, None]
+        h_columns = np.swapaxes(E, -1, -2) @ outputs
+        g = g_columns[..., 0]
+        h = h_columns[..., 0]
+        # dE = -E d(s/w - M) E: by log w of s/w, by log zeta of the entry 2 zeta.
         in_w = ratio * np.sum(h * g, axis=-1)
-        in_z = -2 * np.exp(log_z)[:, None, :] * h[..., 1] * g[..., 1]
-        m, u, k = self._c
-        in_c = np.conj(left)[:, :, u] * g[:, :, m, k]
-        m, k, y = self._b
-        in_b = h[:, :, m, k] * right[:, :, y]
-        u, y = self._d
-        in_d = np.conj(left)[:, :, u] * right[:, :, y]
-        u, i = self._i
-        in_i = np.conj(left)[:, :, u] * right[:, :, self.integrates[i]] / s[None, :, None]
+        zeta = np.exp(log_z)[:, None, :]
+        in_z = -2 * zeta * h[..., 1] * g[..., 1]
+        # Free entries: what stands to the left of an entry times what stands to the right.
+        block, actuator, state = self._c
+        in_c = left_conjugate[:, :, actuator] * g[:, :, block, state]
+        block, state, output = self._b
+        in_b = h[:, :, block, state] * right[:, :, output]
+        actuator, output = self._d
+        in_d = left_conjugate[:, :, actuator] * right[:, :, output]
+        actuator, integrator = self._i
+        integrated = right[:, :, self.integrates[integrator]]
+        in_i = left_conjugate[:, :, actuator] * integrated / s[None, :, None]
         return np.concatenate([in_w, in_z, in_c, in_b, in_d, in_i], axis=2)
 
-    def continuous(self, x: Real) -> tuple[Real, Real, Real, Real]:
-        """A, B, C, D of K(s)."""
-        log_w, log_z, C, B, D, C_0 = (part[0].copy() for part in self.split(x[None]))
-        n, m, i = self.order, self.blocks, self.integrates.size
-        w, z = np.exp(log_w), np.exp(log_z)
-        A, inputs, outputs = np.zeros((n, n)), np.zeros((n, self.outputs)), np.zeros((self.inputs, n))
-        for b in range(m):
-            at = slice(i + 2 * b, i + 2 * b + 2)
-            A[at, at] = w[b] * np.array([[0, 1], [-1, -2 * z[b]]])
-            inputs[at], outputs[:, at] = w[b] * B[b], C[b]
-        inputs[np.arange(i), self.integrates] = 1.0
-        outputs[:, :i] = C_0
-        return A, inputs, outputs, D
+    # State space
 
-    def realised(self, A: Real, B: Real, C: Real, D: Real) -> Real | None:
-        """Parameters (n,) of a full controller of as many states, unstable poles mirrored and its slowest
-        real ones as the integrators; None where real ones do not pair or two poles are the same. Every block
-        has unit norm at its input."""
-        poles, axes = np.linalg.eig(A)
-        inverse = np.linalg.inv(axes)
-        paired = np.flatnonzero(poles.imag > 1e-9 * np.abs(poles))
-        real = sorted(np.flatnonzero(np.abs(poles.imag) <= 1e-9 * np.abs(poles)), key=lambda k: abs(poles[k]))
-        slow, real = real[: self.integrates.size], real[self.integrates.size :]
-        if len(real) % 2 or len(slow) < self.integrates.size:
-            return None
-        poles = -np.abs(poles.real) + 1j * poles.imag
-        pairs = [np.array([k, np.argmin(np.abs(poles - np.conj(poles[k])))]) for k in paired]
-        pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
-        log_w, log_z, C_b, B_b = self.spread(1.0, 1.0, 1.0)
-        for block, pair in enumerate(pairs):
-            w = max(float(np.sqrt(np.prod(poles[pair]).real)), np.finfo(float).tiny)
-            a = np.diag(poles[pair]) / w
-            found = []
-            for angle in np.linspace(0, np.pi, 24, endpoint=False):
-                # T M = a T for T = [v, -a v] with any v, real or of conjugates: what is small at both ends.
-                v = (
-                    np.exp([1j * angle, -1j * angle])
-                    if block < paired.size
-                    else np.array([np.cos(angle), np.sin(angle)])
-                )
-                T = np.column_stack([v, -a @ v])
-                if np.linalg.cond(T) < 1e9:
-                    found.append(
-                        (np.linalg.solve(T, inverse[pair] @ B / w).real, (C @ axes[:, pair] @ T).real)
-                    )
-            if not found:
-                return None
-            b, c = min(found, key=lambda each: float(np.linalg.norm(each[0]) * np.linalg.norm(each[1])))
-            size = float(np.linalg.norm(b)) or 1.0
-            log_w[block], log_z[block] = np.log(w), np.log(-np.sum(poles[pair]).real / (2 * w))
-            C_b[block], B_b[block] = c * size, b / size
-        C_0 = (C @ axes[:, slow] @ inverse[slow] @ B).real[:, self.integrates]
-        return np.clip(self.join(log_w, log_z, C_b, B_b, D, C_0), *self.bounds())
+    def continuous(self, x: Real) -> tuple[Real, Real, Real, Real]:
+        """Continuous state space of K(s).
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+
+        Returns
+        -------
+        A, B, C, D : ndarray, shapes (order, order), (order, Y), (U, order), (U, Y)
+            States: integrators, then two for each block.
+        """
+        parts = self._split_one(x)
+        n_integrators = self.integrates.size
+        w = np.exp(parts.log_w)
+        zeta = np.exp(parts.log_zeta)
+        A = np.zeros((self.order, self.order))
+        B = np.zeros((self.order, self.outputs))
+        C = np.zeros((self.inputs, self.order))
+        for block in range(self.blocks):
+            first = n_integrators + 2 * block
+            states = slice(first, first + 2)
+            A[states, states] = w[block] * np.array([[0, 1], [-1, -2 * zeta[block]]])
+            B[states] = w[block] * parts.B[block]
+            C[:, states] = parts.C[block]
+        B[np.arange(n_integrators), self.integrates] = 1.0
+        C[:, :n_integrators] = parts.C_0
+        return A, B, C, parts.D.copy()
 
     def discrete(self, x: Real) -> tuple[Real, Real, Real, Real]:
-        """A, B, C, D of K at the sampling time, by Tustin's rule: the same K at the same frequencies."""
+        """State space of K at the sampling time, by Tustin's rule: the values of K(s) at Tustin's s.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+
+        Returns
+        -------
+        A, B, C, D : ndarray, shapes (order, order), (order, Y), (U, order), (U, Y)
+        """
         return tustin(*self.continuous(x), self.dt_s)
 
 
 def tustin(A: Real, B: Real, C: Real, D: Real, dt_s: float) -> tuple[Real, Real, Real, Real]:
-    """Discrete state space with the values of the continuous one at s = (2/dt) (z - 1)/(z + 1)."""
+    """Discrete state space with the values of the continuous one at s = (2/dt) (z - 1)/(z + 1).
+
+    Parameters
+    ----------
+    A, B, C, D : ndarray
+        Continuous state space; no pole at s = 2/dt.
+    dt_s : float
+
+    Returns
+    -------
+    A, B, C, D : ndarray
+        Of the same shapes.
+    """
     eye = np.eye(A.shape[0])
-    inverse = np.linalg.inv(eye - A * dt_s / 2)
-    return inverse @ (eye + A * dt_s / 2), inverse @ B * dt_s, C @ inverse, D + C @ inverse @ B * dt_s / 2
+    half_step = A * dt_s / 2
+    inverse = np.linalg.inv(eye - half_step)
+    A_z = inverse @ (eye + half_step)
+    B_z = inverse @ B * dt_s
+    C_z = C @ inverse
+    D_z = D + C @ inverse @ B * dt_s / 2
+    return A_z, B_z, C_z, D_z
 
 
 def _rectangles(pattern: Boolean, count: int) -> list[tuple[Boolean, Boolean]]:
-    """Rows and columns of K for each block: all of it if full, else one actuator at a time, in turn."""
+    """Rows (U,) and columns (Y,) of K that each of `count` blocks belongs to, as masks.
+
+    All of a full pattern (U, Y); else one actuator at a time, in turn, with the outputs that it may use.
+    """
     inputs, outputs = pattern.shape
     if pattern.all():
         return [(np.ones(inputs, bool), np.ones(outputs, bool))] * count
-    rows = [u for u in range(inputs) if pattern[u].any()]
-    return [(np.arange(inputs) == rows[b % len(rows)], pattern[rows[b % len(rows)]]) for b in range(count)]
+    used_rows = [row for row in range(inputs) if pattern[row].any()]
+    rectangles = []
+    for block in range(count):
+        row = used_rows[block % len(used_rows)]
+        rectangles.append((np.arange(inputs) == row, pattern[row]))
+    return rectangles

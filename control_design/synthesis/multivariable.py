@@ -1,8 +1,13 @@
 """Synthesis of one controller for plants with several inputs and outputs: fixed order and structure.
 
-A start is a reduced H-infinity controller (`riccati_starts`), or a stable static gain with modal blocks that
-are spread over frequency and do nothing yet. It is taken down to a local minimum of the worst case
-(`MatrixDescent`), with the frequencies that a dense check finds violated added as it goes. Nothing is random.
+`synthesise_multivariable` is the entry. A start is a reduced H-infinity controller (`riccati_starts`), or a
+stable static gain with modal blocks that are spread over frequency and do nothing yet (`Programme.starts`).
+It is taken down to a local minimum of the worst case (`MatrixDescent`), with the frequencies that a dense
+check finds violated added as it goes (`Programme.improved`). Nothing is random.
+
+The controller is u = -K y in real modal form (`ModalForm`), n parameters x; plants have U inputs and Y
+outputs. The worst case is gamma: the largest singular value of each weighted function by itself, over every
+ball and block of the plants, at every frequency of a grid (`scaled_bound`).
 """
 
 from __future__ import annotations
@@ -31,21 +36,69 @@ from control_design.synthesis.synthesis_options import MultivariableOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
 from ident.data.shown import Shown
 
-_LIGHT = 0.3  # poles of loop and controller damped less have frequencies of their own in every check
-_AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])  # in half-widths of such a pole
-_EXCESS = 5e-4  # accepted of the dense check over the programme
-_AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)  # of the scale: where a static gain inverts the plant
-_SAME = 1e-3  # relative difference of worst cases below which two static gains count as one
-_SCALINGS = (0.03, 0.1, 0.3, 1.0)  # what the ball puts in, over the references
-_SPREAD = 0.1, 30.0, 0.7  # of blocks that do nothing yet: corners over the scale, damping ratio
-_MOST = 15  # violated frequencies added in a round
+# Damping ratio below which poles of loop and controller have frequencies of their own in every check.
+_LIGHT = 0.3
+# Where they have them, in half-widths (damping ratio times frequency) from the pole.
+_AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])
+# Least damping ratio that such a half-width is made of.
+_LEAST_DAMPING = 1e-5
+# Damping ratio of a plant's mode that its grid is made for, at least: narrower ones have no points inside.
+_LEAST_MODE_DAMPING = 1e-4
+# Highest frequency of a grid over Nyquist, where Tustin's s is infinite.
+_BELOW_NYQUIST = 0.9999
+# Relative excess of the dense check over the lean grid that is accepted, as of one joint
+# (EXCHANGE_TOLERANCE).
+_EXCESS = 5e-4
+# Relative accuracy of gamma in every check.
+_ACCURACY = 1e-6
+# Lowest frequency of the grids over the slowest corner of a weight.
+_BELOW_CORNERS = 0.1
+# Scale over Nyquist, where no joint has a bandwidth or a tracking weight.
+_SCALE_OF_NYQUIST = 0.1
+# Unit of the form's corners over the scale.
+_FORM_SCALE = 2
+# Lowest corner of a block over the lowest frequency of the grids, which has to see the corner.
+_SLOWEST_CORNER = 2
+# Frequencies over the scale at which a static gain inverts the plant.
+_INVERTED_AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)
+# Lags, in half turns, by which the plant is turned before: plants that integrate lag by a half of one.
+_LAGS = (0.0, 0.25, 0.5)
+# Gains over the inverse that are tried, the largest first: 16 down to 2^-13.
+_GAINS = 2.0 ** np.arange(4.0, -14.0, -1.0)
+# Corner of integral action over the frequency of inversion.
+_INTEGRAL_CORNER = 0.1
+# Relative difference of worst cases below which two static gains count as one.
+_SAME = 1e-3
+# What the ball puts in, over the references, in the weighted plant of an H-infinity start.
+_SCALINGS = (0.03, 0.1, 0.3, 1.0)
+# Blocks that do nothing yet: lowest and highest corner over the scale, and damping ratio.
+_LOWEST_IDLE_CORNER = 0.1
+_HIGHEST_IDLE_CORNER = 30.0
+_IDLE_DAMPING = 0.7
+# Violated frequencies that are added in a round, of each plant.
+_MOST_ADDED = 15
+# Points around a mode in the dense grid over those in the lean one.
+_DENSE_OVER_LEAN = 5
 
 
 @dataclass(frozen=True, repr=False)
 class MultivariableResult(Shown):
-    """gamma: largest worst case over plants, requirements and the dense grid (at most 1: met). worst: by
-    name of the requirement. blocking: where gamma is reached, worst first. steps of the descents in all.
-    Certify with `certify_multivariable` before use."""
+    """Controller of several joints, and how good it is. Certify it with `certify_multivariable` before use.
+
+    Attributes
+    ----------
+    outcome : Outcome
+    controller : Controller
+        u = -K y.
+    gamma : float
+        Largest worst case over plants, requirements and the dense grid; at most 1: met.
+    worst : dict of str to float
+        Worst case of each requirement, by name.
+    blocking : tuple of BlockingPoint
+        Where each requirement is worst, the largest first.
+    steps : int
+        Of all descents.
+    """
 
     outcome: Outcome
     controller: Controller
@@ -62,27 +115,50 @@ def synthesise_multivariable(
     *,
     progress: Callable[[float, str], None] | None = None,
 ) -> MultivariableResult:
-    """One controller u = -K y of fixed order and structure with the smallest worst case over the plants'
-    uncertainty; all plants (operating points) share dt, U and Y.
+    """One controller u = -K y of fixed order and structure with the smallest worst case.
 
+    Parameters
+    ----------
+    plants : MultivariablePlant or sequence of MultivariablePlant
+        Operating points; all share dt, U and Y.
+    specification : MultivariableSpecification
+        What is asked of each joint, order and structure of K.
+    options : MultivariableOptions, optional
+        Effort of the search.
+    progress : callable, optional
+        Called with (fraction, message).
+
+    Returns
+    -------
+    MultivariableResult
+        A local minimum, the best of `options.starts`; the same every time.
+
+    Raises
+    ------
+    SpecificationError
+        The plants do not fit one another or the structure, or no static gain of the structure stabilises
+        them.
+    ValueError
+        The order is not one for each integrator and two for each modal block.
+
+    Notes
+    -----
     The worst case is the largest singular value of each weighted function by itself, over every ball and
-    block of the plants, at every frequency of a grid: `scaled_bound`. A local minimum is found, the best of
-    `options.starts`, the same every time. Neglected: scheduling over operating points; one controller serves
-    all.
-
-    Raises SpecificationError if the plants do not fit one another or the structure, or no static gain of the
-    structure stabilises them.
+    block of the plants, at every frequency of a grid: `scaled_bound`. Neglected: scheduling over operating
+    points; one controller serves all.
     """
     options = options or MultivariableOptions()
     listed = (plants,) if isinstance(plants, MultivariablePlant) else tuple(plants)
     programme = Programme(listed, specification, options)
     tell = progress or (lambda fraction, message: None)
-    gamma, best = np.inf, np.zeros(0)
+    gamma = np.inf
+    best = np.zeros(0)
     starts = programme.starts()[: options.starts]
     for number, start in enumerate(starts):
         x, reached = programme.improved(start, part_of(tell, number, len(starts)))
         if reached < gamma or not best.size:
-            gamma, best = reached, x
+            gamma = reached
+            best = x
         if gamma <= options.sufficient_gamma:
             break
     tell(1.0, "synthesis")
@@ -90,7 +166,21 @@ def synthesise_multivariable(
 
 
 class Programme:
-    """Plants and specification on a lean grid to begin with and on a dense one."""
+    """Plants and specification on two grids: a lean one to begin with, and a dense one for checks.
+
+    Parameters
+    ----------
+    plants : tuple of MultivariablePlant
+    specification : MultivariableSpecification
+    options : MultivariableOptions
+
+    Raises
+    ------
+    SpecificationError
+        Two plants differ in dt, U or Y, or the joints do not fit them.
+    ValueError
+        The order is not one for each integrator and two for each modal block.
+    """
 
     def __init__(
         self,
@@ -98,29 +188,36 @@ class Programme:
         specification: MultivariableSpecification,
         options: MultivariableOptions,
     ) -> None:
+        """Build grids, nominal loops, the rows of the dense check, and the form of the controller."""
         first = plants[0]
         for plant in plants[1:]:
             if (plant.inputs, plant.outputs, plant.dt_s) != (first.inputs, first.outputs, first.dt_s):
                 raise SpecificationError(
                     f"plants {first.name!r} and {plant.name!r} differ in dt, inputs or outputs"
                 )
-        self.plants, self.spec, self.options, self.dt_s = plants, specification, options, first.dt_s
+        self.plants = plants
+        self.spec = specification
+        self.options = options
+        self.dt_s = first.dt_s
+        self.nyquist_rad_s = np.pi / self.dt_s
         self.pattern = specification.pattern(first.inputs, first.outputs)
-        self.names = tuple(specification.weights(first.inputs, first.outputs))
-        corners = [
-            abs(root)
-            for _, weights in specification.weights(first.inputs, first.outputs).values()
-            for weight in weights
-            if weight is not None
-            for root in np.roots(weight.denominator)
-            if root
-        ]
-        slow = 0.1 * min(corners, default=np.inf)
-        self.lowest_rad_s = min(slow, *(lowest_rad_s(self.dt_s, plant.poles) for plant in plants))
+        requirements = specification.weights(first.inputs, first.outputs)
+        self.names = tuple(requirements)
+
+        # The grids begin below the slowest corner of a weight and below what the plants need.
+        corners: list[float] = []
+        for _, weights in requirements.values():
+            for weight in weights:
+                if weight is not None:
+                    corners += [abs(root) for root in np.roots(weight.denominator) if root]
+        below_corners = _BELOW_CORNERS * min(corners, default=np.inf)
+        self.lowest_rad_s = min(below_corners, *(lowest_rad_s(self.dt_s, plant.poles) for plant in plants))
+
         delay = specification.computational_delay_samples
         self.loops = [NominalLoop(plant, delay) for plant in plants]
         self.lean = [self._grid(plant, options.grid_points, options.mode_points) for plant in plants]
-        dense = [self._grid(plant, options.dense_points, 5 * options.mode_points) for plant in plants]
+        dense_mode_points = _DENSE_OVER_LEAN * options.mode_points
+        dense = [self._grid(plant, options.dense_points, dense_mode_points) for plant in plants]
         self.dense = stacked_rows(plants, specification, dense)
         self.scale_rad_s = self._scale()
         self.steps = 0
@@ -128,138 +225,246 @@ class Programme:
         self.form = self._form(specification.controller_order)
 
     def _grid(self, plant: MultivariablePlant, points: int, around: int) -> Real:
+        """Frequencies (F,) of one plant, rad/s: so many logarithmic points, and so many around each mode.
+
+        Zeros count as modes: a controller may cancel them. Of a plant that is known on its own frequencies
+        only, those.
+        """
         if plant.own_grid is not None:
-            return plant.own_grid[plant.own_grid < np.pi / self.dt_s]
-        modes = [*plant.modes, *modes_of(plant.zeros, self.dt_s)]
-        modes = [
-            Mode(m.omega_rad_s, max(abs(m.zeta), 1e-4)) for m in modes if m.omega_rad_s < np.pi / self.dt_s
-        ]
-        low, top = self.lowest_rad_s, 0.9999 * np.pi / self.dt_s
-        return frequency_grid(top, modes, omega_min_rad_s=low, n_log=points, n_mode=around * len(modes))
+            below_nyquist = plant.own_grid < self.nyquist_rad_s
+            return plant.own_grid[below_nyquist]
+        modes = []
+        for mode in [*plant.modes, *modes_of(plant.zeros, self.dt_s)]:
+            if mode.omega_rad_s < self.nyquist_rad_s:
+                modes.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), _LEAST_MODE_DAMPING)))
+        return frequency_grid(
+            _BELOW_NYQUIST * np.pi / self.dt_s,
+            modes,
+            omega_min_rad_s=self.lowest_rad_s,
+            n_log=points,
+            n_mode=around * len(modes),
+        )
 
     def _scale(self) -> float:
-        """Around which frequency the controller has to act: the geometric mean of the bandwidths, or where
-        the tracking weights fall to one."""
-        found = [joint.bandwidth_rad_s for joint in self.spec.joints if joint.bandwidth_rad_s is not None]
+        """Frequency, rad/s, around which the controller has to act.
+
+        The geometric mean of the joints' bandwidths and of where their tracking weights fall to one.
+        """
+        bandwidths = [joint.bandwidth_rad_s for joint in self.spec.joints]
+        frequencies = [bandwidth for bandwidth in bandwidths if bandwidth is not None]
         omega = np.geomspace(1e-5, 0.99, 400) * np.pi / self.dt_s
         for joint in self.spec.joints:
             weight = joint.sensitivity_weight
-            if weight is not None and np.any(above := np.abs(weight.at(tustin_s(omega, self.dt_s))) > 1.0):
-                found.append(float(omega[above][-1]))
-        return float(np.exp(np.mean(np.log(found)))) if found else 0.1 * float(np.pi / self.dt_s)
+            if weight is None:
+                continue
+            tracked = np.abs(weight.at(tustin_s(omega, self.dt_s))) > 1.0
+            if np.any(tracked):
+                frequencies.append(float(omega[tracked][-1]))
+        if not frequencies:
+            return _SCALE_OF_NYQUIST * float(self.nyquist_rad_s)
+        return float(np.exp(np.mean(np.log(frequencies))))
 
     def _form(self, order: int) -> ModalForm:
-        """Parameters of a controller with so many states."""
-        integrates = np.array([joint.integrator for joint in self.spec.joints[: self.plants[0].outputs]])
+        """Map between parameters and a controller with so many states."""
+        joints = self.spec.joints[: self.plants[0].outputs]
         return ModalForm(
-            self.pattern, order, integrates, 2 * self.scale_rad_s, 2 * self.lowest_rad_s, self.dt_s,
-            self.spec.controller_damping,
-        )  # fmt: skip
+            self.pattern,
+            order,
+            integrates=np.array([joint.integrator for joint in joints]),
+            scale_rad_s=_FORM_SCALE * self.scale_rad_s,
+            slowest_rad_s=_SLOWEST_CORNER * self.lowest_rad_s,
+            dt_s=self.dt_s,
+            damping=self.spec.controller_damping,
+        )
 
     def starts(self) -> list[Real]:
-        """Parameters to begin with, those of the lowest worst case first: static gains with blocks that do
-        nothing yet, and reduced H-infinity controllers of the first plant: not for a structure, nor where
-        channels have errors of their own, which `weighted_plant` neglects."""
-        found: list[tuple[float, Real]] = []
-        if self.pattern.all() and not any(each.input_error or each.output_error for each in self.plants):
-            plant, slowest = self.plants[0], self.lowest_rad_s
-            with suppress(np.linalg.LinAlgError):  # a pole at z = -1, or a problem that rounding spoils
-                plain = weighted_plant(replace(plant, ball=None), self.spec, 1.0, self.scale_rad_s, slowest)
+        """Parameters (n,) to begin with, those of the lowest worst case on the dense grid first.
+
+        Returns
+        -------
+        list of ndarray, shape (n,)
+            Reduced H-infinity controllers of the first plant, and static gains with blocks that do nothing
+            yet. The former not for a structure with zeros, nor where channels have errors of their own, which
+            `weighted_plant` neglects.
+
+        Raises
+        ------
+        SpecificationError
+            There is no H-infinity start, and no static gain of the structure stabilises the plants.
+        """
+        starts: list[tuple[float, Real]] = []
+        has_channel_errors = any(plant.input_error or plant.output_error for plant in self.plants)
+        if self.pattern.all() and not has_channel_errors:
+            plant = self.plants[0]
+            slowest = self.lowest_rad_s
+            # LinAlgError: a pole at z = -1, or a problem that rounding spoils.
+            with suppress(np.linalg.LinAlgError):
+                # Reduction counts errors in the requirements, and not in what the ball sees.
+                without_ball = replace(plant, ball=None)
+                plain = weighted_plant(without_ball, self.spec, 1.0, self.scale_rad_s, slowest)
                 for scaling in _SCALINGS:
                     P = weighted_plant(plant, self.spec, scaling, self.scale_rad_s, slowest)
-                    if (K := central_controller(P)) is not None and K[0].shape[0] >= self.form.order:
-                        K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
-                        found += [(self.worst(x), x) for x in (self.form.realised(*K),) if x is not None]
-        found = [each for each in found if np.isfinite(each[0])]
-        with suppress(*([SpecificationError] if found else [])):
-            found += [(self.worst(x), x) for _, x in self.static()]
-        return [x for _, x in sorted(found, key=lambda each: each[0])]
+                    K = central_controller(P)
+                    if K is None or K.A.shape[0] < self.form.order:
+                        continue
+                    K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
+                    x = self.form.realised(*K)
+                    if x is not None:
+                        starts.append((self.worst(x), x))
+        starts = [start for start in starts if np.isfinite(start[0])]
+        try:
+            starts += [(self.worst(x), x) for _, x in self.static()]
+        except SpecificationError:
+            if not starts:
+                raise
+        return [x for _, x in sorted(starts, key=lambda start: start[0])]
 
     def static(self) -> list[tuple[float, Real]]:
-        """Worst cases and parameters of static gains, best first: the real part of a pseudo-inverse of the
-        plant at a frequency around the scale, with the best factor that is stable."""
-        form, blocks = self.form, self.form.spread(*_SPREAD)
+        """Static gains with idle blocks, as (worst case on the lean grid, parameters (n,)), the best first.
+
+        Returns
+        -------
+        list of (float, ndarray of shape (n,))
+
+        Raises
+        ------
+        SpecificationError
+            None is robustly stable.
+
+        Notes
+        -----
+        A gain is the real part of a pseudo-inverse of the first plant at a frequency around the scale,
+        turned by a lag, with zeros where the structure has them. Of its factors the largest ones are mostly
+        unstable: going down, the worst case falls from the first stable one, and the search ends where it
+        rises again.
+        """
+        form = self.form
+        idle_blocks = form.spread(_LOWEST_IDLE_CORNER, _HIGHEST_IDLE_CORNER, _IDLE_DAMPING)
         descent = MatrixDescent(form, stacked_rows(self.plants, self.spec, self.lean), self.loops)
-        found: list[tuple[float, Real]] = []
-        for omega in self.scale_rad_s * np.array(_AT):
+        gains: list[tuple[float, Real]] = []
+        for omega in self.scale_rad_s * np.array(_INVERTED_AT):
             G = matrix_response(self.plants[0].nominal, np.array([omega]))[0]
-            for lag in (0.0, 0.25, 0.5):  # in half turns: plants that integrate are turned by a half of one
-                D = np.where(self.pattern, np.linalg.pinv(G * np.exp(1j * np.pi * lag)).real, 0.0)
-                D = D / (np.linalg.norm(G @ D, 2) or 1.0)
+            for lag in _LAGS:
+                inverse = np.linalg.pinv(G * np.exp(1j * np.pi * lag)).real
+                D = np.where(self.pattern, inverse, 0.0)
+                # Loop gain of one at this frequency.
+                loop_gain = np.linalg.norm(G @ D, 2)
+                if loop_gain > 0:
+                    D = D / loop_gain
                 best: tuple[float, Real] | None = None
-                for gain in 2.0 ** np.arange(4.0, -14.0, -1.0):
-                    x = form.join(*blocks, gain * D, 0.1 * omega * gain * D[:, form.integrates])
+                for gain in _GAINS:
+                    C_0 = _INTEGRAL_CORNER * omega * gain * D[:, form.integrates]
+                    x = form.join(*idle_blocks, gain * D, C_0)
                     bound = descent.bound(x, None)
                     if bound is None and best is None:
                         continue
                     gamma = np.inf if bound is None else float(np.max(bound.gamma))
                     if best is not None and gamma > best[0]:
                         break
-                    best = gamma, x
-                found += [best] if best is not None else []
-        if not found:
+                    best = (gamma, x)
+                if best is not None:
+                    gains.append(best)
+        if not gains:
             raise SpecificationError(
                 "no static gain of this structure stabilises the plant robustly; allow more entries of K "
                 "(structure), or close a stabilising loop first and design around it"
             )
-        found.sort(key=lambda each: each[0])
-        before = [0.0, *(gamma for gamma, _ in found)]  # one gain may be found at several frequencies
-        return [each for each, last in zip(found, before, strict=False) if each[0] > (1 + _SAME) * last]
+        # One gain may be found at several frequencies.
+        gains.sort(key=lambda gain: gain[0])
+        previous = [0.0, *(gamma for gamma, _ in gains)]
+        pairs = zip(gains, previous, strict=False)
+        return [gain for gain, gamma_before in pairs if gain[0] > (1 + _SAME) * gamma_before]
 
     def improved(
         self, x: Real, tell: Callable[[float, str], None] = lambda fraction, message: None
     ) -> tuple[Real, float]:
-        """Descents in rounds, with violated frequencies added: best parameters and their worst case on the
-        dense grid."""
+        """Local minimum of the worst case, by rounds of descent with violated frequencies added.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            Where to begin.
+        tell : callable
+            Called with (fraction, message) at every round.
+
+        Returns
+        -------
+        best : ndarray, shape (n,)
+        gamma : float
+            Its worst case on the dense grid; inf: nothing robustly stable was found.
+
+        Notes
+        -----
+        Ends where the dense check exceeds the lean grid by no more than `_EXCESS` and the descent has come to
+        its end. Frequencies of an end that is not robustly stable join `lean` for later starts as well.
+        """
         grids = list(self.lean)
-        best, least = x, self.worst(x)
+        best = x
+        least = self.worst(x)
         for number in range(self.options.rounds):
-            tell(
-                number / self.options.rounds,
-                f"worst case {least:.3g}" if np.isfinite(least) else "looking for robust stability",
-            )
+            message = f"worst case {least:.3g}" if np.isfinite(least) else "looking for robust stability"
+            tell(number / self.options.rounds, message)
             grids = [np.union1d(grid, light) for grid, light in zip(grids, self._light(x), strict=True)]
             descent = MatrixDescent(self.form, stacked_rows(self.plants, self.spec, grids), self.loops)
             end, reached, steps = descent.run(x, self.options.steps)
             self.steps += steps
             if not np.isfinite(reached):
                 break
+
             checked = self.check(end)
             worst = max(float(np.max(value)) for _, value in checked)
             gain = least / worst - 1.0 if np.isfinite(least) else np.inf
             if worst < least:
-                best, least = end, worst
+                best = end
+                least = worst
             if np.isfinite(worst):
-                x = end  # else once more from the same point, with the frequencies that were missing
-            done = worst <= reached * (1 + _EXCESS) and (steps < self.options.steps or gain < _EXCESS / 2)
-            if done or least <= self.options.sufficient_gamma:
+                # Else once more from the same point, with the frequencies that were missing.
+                x = end
+            grids_agree = worst <= reached * (1 + _EXCESS)
+            has_ended = steps < self.options.steps or gain < _EXCESS / 2
+            if (grids_agree and has_ended) or least <= self.options.sufficient_gamma:
                 break
+
             limit = reached * (1 + 0.5 * _EXCESS)
             for i, (omega, value) in enumerate(checked):
-                violated = omega[[k for k in local_maxima(value) if value[k] > limit][:_MOST]]
+                maxima = [k for k in local_maxima(value) if value[k] > limit]
+                violated = omega[maxima[:_MOST_ADDED]]
                 grids[i] = np.union1d(grids[i], violated)
                 if not np.isfinite(worst):
                     self.lean[i] = np.union1d(self.lean[i], violated)
         return best, least
 
     def worst(self, x: Real) -> float:
-        """Worst case on the dense grid; inf for an unstable nominal loop."""
+        """Worst case of parameters x (n,) on the dense grid; inf for an unstable nominal loop."""
         a, b, c, d = self.form.discrete(x)
         if not all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops):
             return float("inf")
         return max(float(np.max(value)) for _, value in self.check(x))
 
     def check(self, x: Real) -> list[tuple[Real, Real]]:
-        """Of every plant: frequencies (F,) of the dense check and of light poles, worst case (F,) there."""
+        """Worst case over all requirements by frequency, for each plant.
+
+        Parameters
+        ----------
+        x : ndarray, shape (n,)
+            With stable nominal loops.
+
+        Returns
+        -------
+        list of (omega (F,), gamma (F,))
+            Frequencies of the dense check and around light poles, ascending, rad/s; gamma is inf where no
+            robust stability is shown.
+        """
         light = self._light(x)
-        found = [(self.dense, self._gamma(x, self.dense))]
-        if any(each.size for each in light):
-            more = stacked_rows(self.plants, self.spec, light)
-            found.append((more, self._gamma(x, more)))
+        stacks = [(self.dense, self._gamma(x, self.dense))]
+        if any(omega.size for omega in light):
+            light_rows = stacked_rows(self.plants, self.spec, light)
+            stacks.append((light_rows, self._gamma(x, light_rows)))
         checked = []
         for number in range(len(self.plants)):
-            omega = np.concatenate([stack.omega_rad_s[stack.plant == number] for stack, _ in found])
-            gamma = np.concatenate([value[stack.plant == number] for stack, value in found])
+            of_plant = [stack.plant == number for stack, _ in stacks]
+            omega = np.concatenate([stacks[k][0].omega_rad_s[mask] for k, mask in enumerate(of_plant)])
+            gamma = np.concatenate([stacks[k][1][mask] for k, mask in enumerate(of_plant)])
             unique, inverse = np.unique(omega, return_inverse=True)
             worst = np.zeros(unique.size)
             np.maximum.at(worst, inverse, gamma)
@@ -267,46 +472,84 @@ class Programme:
         return checked
 
     def _gamma(self, x: Real, stack: StackedRows) -> Real:
-        return scaled_bound(stack.rows, self.form.response(x[None], stack.s)[0], accuracy=1e-6).gamma
+        """Worst case (R,) of every row of a stack under parameters x (n,)."""
+        K = self.form.response(x[None], stack.s)[0]
+        return scaled_bound(stack.rows, K, accuracy=_ACCURACY).gamma
 
     def _light(self, x: Real) -> list[Real]:
-        """Frequencies around lightly damped poles of every loop and of the controller."""
+        """Frequencies (F,), rad/s, around lightly damped poles of each plant's loop and of the controller.
+
+        None for plants that are known on their own frequencies only.
+        """
         abcd = self.form.discrete(x)
-        own = np.linalg.eigvals(abcd[0])
-        found = []
+        controller_poles = np.linalg.eigvals(abcd[0])
+        frequencies = []
         for plant, loop in zip(self.plants, self.loops, strict=True):
-            modes = modes_of(np.concatenate([own, loop.poles(*abcd)]), self.dt_s, zeta_below=_LIGHT)
-            points = [m.omega_rad_s * (1 + max(abs(m.zeta), 1e-5) * _AROUND) for m in modes]
-            omega = np.unique(np.concatenate([np.zeros(0), *points]))
-            inside = (omega > 0) & (omega < 0.9999 * np.pi / self.dt_s) & (plant.own_grid is None)
-            found.append(omega[inside])
-        return found
+            poles = np.concatenate([controller_poles, loop.poles(*abcd)])
+            points = [np.zeros(0)]
+            for mode in modes_of(poles, self.dt_s, zeta_below=_LIGHT):
+                half_width = max(abs(mode.zeta), _LEAST_DAMPING)
+                points.append(mode.omega_rad_s * (1 + half_width * _AROUND))
+            omega = np.unique(np.concatenate(points))
+            if plant.own_grid is not None:
+                omega = omega[:0]
+            below_nyquist = omega < _BELOW_NYQUIST * np.pi / self.dt_s
+            positive = omega > 0
+            frequencies.append(omega[positive & below_nyquist])
+        return frequencies
 
     def result(self, gamma: float, x: Real) -> MultivariableResult:
-        """The controller and what is known of it."""
-        stack, K = self.dense, self.form.response(x[None], self.dense.s)[0]
-        found = scaled_bound(stack.rows, K, accuracy=1e-6)
-        value, joint = found.gamma, largest_channel(stack.rows, K, found.right)
-        worst, blocking = {}, []
+        """The controller of parameters x and what is known of it.
+
+        Parameters
+        ----------
+        gamma : float
+            Worst case on the dense grid; inf: the controller means nothing.
+        x : ndarray, shape (n,)
+
+        Returns
+        -------
+        MultivariableResult
+        """
+        stack = self.dense
+        K = self.form.response(x[None], stack.s)[0]
+        bound = scaled_bound(stack.rows, K, accuracy=_ACCURACY)
+        value = bound.gamma
+        joint = largest_channel(stack.rows, K, bound.right)
+
+        # Where each requirement is worst.
+        worst: dict[str, float] = {}
+        blocking: list[BlockingPoint] = []
         for which, name in enumerate(self.names):
             rows = np.flatnonzero(stack.requirement == which)
-            if rows.size:
-                at = rows[np.argmax(value[rows])]
-                worst[name] = float(value[at])
-                plant = self.plants[int(stack.plant[at])].name
-                omega = float(stack.omega_rad_s[at])
-                blocking.append(BlockingPoint(plant, name, omega, float(value[at]), int(joint[at])))
-        limits, rates = self.spec.limits(self.form.inputs)
+            if not rows.size:
+                continue
+            at = rows[np.argmax(value[rows])]
+            worst[name] = float(value[at])
+            plant_name = self.plants[int(stack.plant[at])].name
+            omega = float(stack.omega_rad_s[at])
+            blocking.append(BlockingPoint(plant_name, name, omega, worst[name], int(joint[at])))
+        blocking.sort(key=lambda point: -point.value)
+
+        input_limits, rate_limits = self.spec.limits(self.form.inputs)
         a, b, c, d = self.form.discrete(x)
         controller = Controller(
-            a, b, c, d, self.dt_s,
+            a,
+            b,
+            c,
+            d,
+            self.dt_s,
             computational_delay_samples=self.spec.computational_delay_samples,
-            input_limit=None if not any(limits) else limits, rate_limit=None if not any(rates) else rates,
-        )  # fmt: skip
+            input_limit=input_limits if any(input_limits) else None,
+            rate_limit=rate_limits if any(rate_limits) else None,
+        )
         controller = with_safe_limits(
             controller, lambda law: [limited_joints(law, plant) for plant in self.plants]
         )
-        outcome = Outcome.NOT_CONVERGED if not np.isfinite(gamma) else Outcome.NOT_MET
-        outcome = Outcome.MET_ON_GRID if gamma <= 1.0 else outcome
-        blocking.sort(key=lambda point: -point.value)
+        if gamma <= 1.0:
+            outcome = Outcome.MET_ON_GRID
+        elif np.isfinite(gamma):
+            outcome = Outcome.NOT_MET
+        else:
+            outcome = Outcome.NOT_CONVERGED
         return MultivariableResult(outcome, controller, gamma, worst, tuple(blocking), self.steps)

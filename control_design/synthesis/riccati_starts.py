@@ -1,10 +1,14 @@
-"""Starts for several joints: central H-infinity controllers of the weighted plant, reduced.
+"""Starts for several joints: central H-infinity controllers of the weighted plant, reduced to a given order.
 
-d = (references, what the ball puts in) is carried to z = (weighted outputs, weighted actuators, what the ball
-sees). One constant scaling stands for those of all frequencies, and one gain for requirements that count by
-themselves: a start, no worst case. Central controller: Glover and Doyle, Systems & Control Letters 11 (1988).
-Reduction: balanced, weighted as the error of K moves z (Enns, CDC 1984), Gramians by quadrature. All of it in
-Tustin's s.
+`weighted_plant` writes plant and requirements as one system from d = (references, what the ball puts in) to
+z = (weighted outputs, weighted actuators, what the ball sees). `central_controller` finds a controller with
+nearly the smallest H-infinity norm from d to z (Glover and Doyle, Systems & Control Letters 11, 1988),
+which has as many states as the weighted plant. `reduced` truncates it to the order that is asked: balanced,
+weighted as the error of K moves z (Enns, Conference on Decision and Control 1984), Gramians by quadrature.
+
+One constant scaling stands for those of all frequencies, and one gain for requirements that count by
+themselves: a start, no worst case. All systems are continuous in Tustin's s = (2/dt) (z - 1)/(z + 1), where
+frequency responses are those of the discrete ones; `continuous` maps a discrete system there.
 """
 
 from __future__ import annotations
@@ -24,16 +28,35 @@ from control_design.specification.multivariable import MultivariableSpecificatio
 if TYPE_CHECKING:
     import control
 
-System = tuple[Real, Real, Real, Real]  # A, B, C, D, continuous
-_CLOSE = 1.02  # of gamma, above the smallest
-_GAMMA = 1e-2, 1e3  # where the smallest norm is looked for
-_CHEAP = 0.03  # weight where none is asked, on an actuator over the plant's smallest gain at the scale
-_NONE = 1e-9  # of the largest entry, below zero: a Riccati solution that is semidefinite but for rounding
-_POINTS = 600  # of the quadrature
+# Norm of the closed loop over the smallest one, at which the search for it ends. Nearer to the smallest,
+# the controller has faster and faster poles.
+_CLOSE = 1.02
+# Where the smallest norm is looked for. Weights are about one where they matter, so norms are, too.
+_LOWEST_GAMMA = 1e-2
+_HIGHEST_GAMMA = 1e3
+# Weight where none is asked: on an output, and on an actuator over the plant's smallest gain at the scale.
+# The theorem needs every actuator in z; this one is too cheap to decide anything.
+_CHEAP = 0.03
+# How far below zero, of the largest entry, an eigenvalue of a Riccati solution counts as zero: rounding.
+_NEARLY_ZERO = 1e-9
+# Frequencies of the quadrature of the Gramians, logarithmic: of seven decades, some eighty a decade.
+_QUADRATURE_POINTS = 600
+
+
+class System(NamedTuple):
+    """Continuous state space: x' = A x + B u, y = C x + D u."""
+
+    A: Real
+    B: Real
+    C: Real
+    D: Real
 
 
 class WeightedPlant(NamedTuple):
-    """x' = A x + B1 d + B2 u, z = C1 x + D11 d + D12 u, e = C2 x + D21 d + D22 u, to be closed by u = K e."""
+    """System from (d, u) to (z, e), to be closed by u = K e.
+
+    x' = A x + B1 d + B2 u,   z = C1 x + D11 d + D12 u,   e = C2 x + D21 d + D22 u.
+    """
 
     A: Real
     B1: Real
@@ -53,166 +76,338 @@ def weighted_plant(
     scale_rad_s: float,
     slowest_rad_s: float,
 ) -> WeightedPlant:
-    """Of a plant and its requirements, e = -y; scaling: of what the ball puts in, over the references.
+    """Weighted plant of an H-infinity problem that stands for the requirements, with e = -y.
 
-    A strong weight on tracking replaces the constant one on the modulus. Poles lie slowest_rad_s further to
-    the left than they do, so that none is on the axis. Neglected: a ball that is known on its own frequencies
-    only, errors of channels.
+    Parameters
+    ----------
+    plant : MultivariablePlant
+        Nominal plant (Y outputs, U inputs) and its ball.
+    specification : MultivariableSpecification
+        A strong weight on tracking replaces the constant one on the modulus.
+    scaling : float
+        Of what the ball puts in, over the references.
+    scale_rad_s : float
+        Frequency around which the controller acts, where actuators without a weight get one.
+    slowest_rad_s : float
+        Poles lie this much further to the left than they do, so that none is on the axis.
+
+    Returns
+    -------
+    WeightedPlant
+        States: plant with its computational delay, weights on the outputs, weights on the actuators and the
+        ball's own. z: outputs, actuators, what the ball sees.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The plant has a pole at z = -1.
+
+    Notes
+    -----
+    Neglected: a ball that is known on its own frequencies only, and errors of channels.
     """
     A, B, C, D = continuous(plant.delayed(specification.computational_delay_samples))
-    there = C @ np.linalg.solve(1j * scale_rad_s * np.eye(A.shape[0]) - A, B) + D
+    states_at_scale = np.linalg.solve(1j * scale_rad_s * np.eye(A.shape[0]) - A, B)
+    gains_at_scale = np.linalg.svd(C @ states_at_scale + D, compute_uv=False)
+    smallest_gain = float(gains_at_scale[-1])
+
+    # One weight for every output and actuator.
     asked = specification.weights(plant.inputs, plant.outputs)
-    none = ("", (None,) * max(plant.inputs, plant.outputs))
-    tracking, modulus, effort = (asked.get(name, none)[1] for name in ("tracking", "modulus", "effort"))
-    of_y, of_u = (
-        RationalWeight(numerator=(_CHEAP * size,), denominator=(1.0,))
-        for size in (1.0, float(np.linalg.svd(there, compute_uv=False)[-1]))
-    )
-    on_y = [tracking[i] or modulus[i] or of_y for i in range(plant.outputs)]
-    on_u = [effort[i] or of_u for i in range(plant.inputs)]
-    put, wy, wu = np.eye(plant.outputs), _diagonal(on_y), _diagonal(on_u)
+    not_asked = ("", (None,) * max(plant.inputs, plant.outputs))
+    tracking = asked.get("tracking", not_asked)[1]
+    modulus = asked.get("modulus", not_asked)[1]
+    effort = asked.get("effort", not_asked)[1]
+    cheap_on_y = RationalWeight(numerator=(_CHEAP * 1.0,), denominator=(1.0,))
+    cheap_on_u = RationalWeight(numerator=(_CHEAP * smallest_gain,), denominator=(1.0,))
+    on_y = _diagonal([tracking[i] or modulus[i] or cheap_on_y for i in range(plant.outputs)])
+    on_u = _diagonal([effort[i] or cheap_on_u for i in range(plant.inputs)])
+
+    # The ball enters at the outputs through Lo, and sees the actuators through Li.
+    entering = np.eye(plant.outputs)
     if plant.ball is not None and plant.ball.omega_rad_s is None:
-        size, (a, b, c, d) = plant.ball.radius / scaling, continuous(plant.ball.Li)
-        put = np.hstack([put, scaling * plant.ball.Lo])
-        wu = (
-            scipy.linalg.block_diag(wu[0], a),
-            np.vstack([wu[1], b]),
-            scipy.linalg.block_diag(wu[2], size * c),
-            np.vstack([wu[3], size * d]),
+        size = plant.ball.radius / scaling
+        a, b, c, d = continuous(plant.ball.Li)
+        entering = np.hstack([entering, scaling * plant.ball.Lo])
+        on_u = System(
+            scipy.linalg.block_diag(on_u.A, a),
+            np.vstack([on_u.B, b]),
+            scipy.linalg.block_diag(on_u.C, size * c),
+            np.vstack([on_u.D, size * d]),
         )
-    n, m, k = A.shape[0], wy[0].shape[0], wu[0].shape[0]
+
+    # Plant, weights on outputs and weights on actuators as one system; zeros by their shapes.
+    n = A.shape[0]
+    m = on_y.A.shape[0]
+    k = on_u.A.shape[0]
+    n_d = entering.shape[1]
+    z_y = on_y.C.shape[0]
+    z_u = on_u.C.shape[0]
     zero = np.zeros
-    all_a = np.block([[A, zero((n, m + k))], [wy[1] @ C, wy[0], zero((m, k))], [zero((k, n + m)), wu[0]]])
+    plant_row = [A, zero((n, m + k))]
+    y_row = [on_y.B @ C, on_y.A, zero((m, k))]
+    u_row = [zero((k, n + m)), on_u.A]
+    dynamics = np.block([plant_row, y_row, u_row])
+    z_y_row = [on_y.D @ C, on_y.C, zero((z_y, k))]
+    z_u_row = [zero((z_u, n + m)), on_u.C]
+    d_to_y = on_y.B @ entering
+    d_to_z_y = on_y.D @ entering
     return WeightedPlant(
-        all_a - slowest_rad_s * np.eye(n + m + k),
-        np.vstack([zero((n, put.shape[1])), wy[1] @ put, zero((k, put.shape[1]))]),
-        np.vstack([B, wy[1] @ D, wu[1]]),
-        np.block([[wy[3] @ C, wy[2], zero((wy[3].shape[0], k))], [zero((wu[3].shape[0], n + m)), wu[2]]]),
-        np.hstack([-C, zero((plant.outputs, m + k))]),
-        np.vstack([wy[3] @ put, zero((wu[3].shape[0], put.shape[1]))]),
-        np.vstack([wy[3] @ D, wu[3]]),
-        -put,
-        -D,
+        A=dynamics - slowest_rad_s * np.eye(n + m + k),
+        B1=np.vstack([zero((n, n_d)), d_to_y, zero((k, n_d))]),
+        B2=np.vstack([B, on_y.B @ D, on_u.B]),
+        C1=np.block([z_y_row, z_u_row]),
+        C2=np.hstack([-C, zero((plant.outputs, m + k))]),
+        D11=np.vstack([d_to_z_y, zero((z_u, n_d))]),
+        D12=np.vstack([on_y.D @ D, on_u.D]),
+        D21=-entering,
+        D22=-D,
     )
 
 
 def central_controller(P: WeightedPlant) -> System | None:
-    """K with a closed loop of nearly the smallest H-infinity norm, as many states as P; None where it has
-    none that can be told from rounding."""
-    low, high, found = *_GAMMA, None
+    """Controller u = K e with a closed loop of nearly the smallest H-infinity norm.
+
+    Parameters
+    ----------
+    P : WeightedPlant
+
+    Returns
+    -------
+    System or None
+        As many states as P. None where no norm up to 1000 is reached, or none that can be told from rounding.
+
+    Notes
+    -----
+    Bisection of the norm on a logarithmic scale. Each trial neglects D22, which a loop around the controller
+    that was found puts back.
+    """
+    low = _LOWEST_GAMMA
+    high = _HIGHEST_GAMMA
+    controller: System | None = None
     while high > _CLOSE * low:
         middle = float(np.sqrt(low * high))
-        tried = _central(P, middle)
-        low, high, found = (middle, high, found) if tried is None else (low, middle, tried)
-    if found is None:
+        trial = controller_below(P, middle)
+        if trial is None:
+            low = middle
+        else:
+            high = middle
+            controller = trial
+    if controller is None:
         return None
-    A, B, C, D = found
-    inverse = np.linalg.inv(np.eye(D.shape[0]) - D @ P.D22)  # e carries D22 u already
-    C, D_e = inverse @ C, inverse @ D
-    return A + B @ P.D22 @ C, B @ (np.eye(D.shape[1]) + P.D22 @ D_e), C, D_e
+    A, B, C, D = controller
+    # e carries D22 u already.
+    inverse = np.linalg.inv(np.eye(D.shape[0]) - D @ P.D22)
+    C_e = inverse @ C
+    D_e = inverse @ D
+    A_e = A + B @ P.D22 @ C_e
+    B_e = B @ (np.eye(D.shape[1]) + P.D22 @ D_e)
+    return System(A_e, B_e, C_e, D_e)
 
 
-def _central(P: WeightedPlant, gamma: float) -> System | None:
-    """The central controller for D22 = 0 with a closed-loop norm below gamma, None without one: theorem of
-    Glover and Doyle, in coordinates with D12 = [0; I], D21 = [0 I]."""
-    n_z, n_u, n_e, n_d = *P.D12.shape, *P.D21.shape
+def controller_below(P: WeightedPlant, gamma: float) -> System | None:
+    """Central controller for D22 = 0 with a closed-loop norm below gamma.
+
+    Parameters
+    ----------
+    P : WeightedPlant
+    gamma : float
+
+    Returns
+    -------
+    System or None
+        None without one: a direct term, a Riccati equation or their coupling forbids it.
+
+    Notes
+    -----
+    The theorem of Glover and Doyle (1988), in coordinates with D12 = [0; I], D21 = [0 I]; the names of
+    matrices are theirs. X and Y solve the Riccati equations of state feedback and of estimation, F and L are
+    their gains, and the spectral radius of X Y has to stay below gamma^2.
+    """
+    n_z, n_u = P.D12.shape
+    n_e, n_d = P.D21.shape
+    # Rotations of z and d, and changes of u and e, to D12 = [0; I] and D21 = [0 I].
     q, r = np.linalg.qr(P.D12, mode="complete")
     p, t = np.linalg.qr(P.D21.T, mode="complete")
-    turn_z, turn_d = np.roll(q, -n_u, axis=1), np.roll(p, -n_e, axis=1)
-    of_u, of_e = np.linalg.inv(r[:n_u]), np.linalg.inv(t[:n_e].T)
+    turn_z = np.roll(q, -n_u, axis=1)
+    turn_d = np.roll(p, -n_e, axis=1)
+    of_u = np.linalg.inv(r[:n_u])
+    of_e = np.linalg.inv(t[:n_e].T)
     B = np.hstack([P.B1 @ turn_d, P.B2 @ of_u])
     C = np.vstack([turn_z.T @ P.C1, of_e @ P.C2])
     D = turn_z.T @ P.D11 @ turn_d
-    i, j = n_z - n_u, n_d - n_e
-    D11, D12, D21, D22 = D[:i, :j], D[:i, j:], D[i:, :j], D[i:, j:]
-    if max(np.linalg.norm(D[:i], 2) if i else 0.0, np.linalg.norm(D[:, :j], 2) if j else 0.0) >= gamma:
+    # Blocks of D: i rows of z that no u reaches, j columns of d that no e shows.
+    i = n_z - n_u
+    j = n_d - n_e
+    D11 = D[:i, :j]
+    D12 = D[:i, j:]
+    D21 = D[i:, :j]
+    D22 = D[i:, j:]
+
+    # No controller lowers the direct term that it does not touch.
+    unreached = np.linalg.norm(D[:i], 2) if i else 0.0
+    unseen = np.linalg.norm(D[:, :j], 2) if j else 0.0
+    if max(unreached, unseen) >= gamma:
         return None
-    row = np.hstack([D, np.vstack([np.zeros((i, n_u)), np.eye(n_u)])])
-    column = np.vstack([D, np.hstack([np.zeros((n_e, j)), np.eye(n_e)])])
-    R, T = row.T @ row, column @ column.T
+
+    # Riccati equations of state feedback (R, X) and of estimation (T, Y).
+    u_columns = np.vstack([np.zeros((i, n_u)), np.eye(n_u)])
+    row = np.hstack([D, u_columns])
+    e_rows = np.hstack([np.zeros((n_e, j)), np.eye(n_e)])
+    column = np.vstack([D, e_rows])
+    R = row.T @ row
+    T = column @ column.T
     R[:n_d, :n_d] -= gamma**2 * np.eye(n_d)
     T[:n_z, :n_z] -= gamma**2 * np.eye(n_z)
-    C1, B1 = C[:n_z], B[:, :n_d]
+    C1 = C[:n_z]
+    B1 = B[:, :n_d]
     X = _stabilising(P.A, B, C1.T @ C1, R, C1.T @ row)
     Y = _stabilising(P.A.T, C.T, B1 @ B1.T, T, B1 @ column.T)
-    if X is None or Y is None or np.max(np.abs(np.linalg.eigvals(X @ Y))) >= gamma**2:
+    if X is None or Y is None:
+        return None
+    coupling = np.max(np.abs(np.linalg.eigvals(X @ Y)))
+    if coupling >= gamma**2:
         return None
     F = -np.linalg.solve(R, row.T @ C1 + B.T @ X)
     L = -np.linalg.solve(T, column @ B1.T + C @ Y).T
-    left, right = (
-        np.linalg.inv(gamma**2 * np.eye(size) - product)
-        for size, product in ((i, D11 @ D11.T), (j, D11.T @ D11))
-    )
+
+    # The central controller: its direct term K11, and square roots K12, K21 of what freedom is left.
+    left = np.linalg.inv(gamma**2 * np.eye(i) - D11 @ D11.T)
+    right = np.linalg.inv(gamma**2 * np.eye(j) - D11.T @ D11)
     K11 = -D21 @ D11.T @ left @ D12 - D22
     K12 = np.linalg.cholesky(np.eye(n_u) - D21 @ right @ D21.T)
     K21 = np.linalg.cholesky(np.eye(n_e) - D12.T @ left @ D12).T
     Z = np.linalg.inv(np.eye(P.A.shape[0]) - Y @ X / gamma**2)
     B2 = Z @ (B[:, n_d:] + L[:, i:n_z]) @ K12
     C2 = -K21 @ (C[n_z:] + F[j:n_d])
+    C2_over_K21 = np.linalg.solve(K21, C2)
     BK = -Z @ L[:, n_z:] + B2 @ np.linalg.solve(K12, K11)
-    CK = F[n_d:] + K11 @ np.linalg.solve(K21, C2)
-    return P.A + B @ F + BK @ np.linalg.solve(K21, C2), BK @ of_e, of_u @ CK, of_u @ K11 @ of_e
+    CK = F[n_d:] + K11 @ C2_over_K21
+    AK = P.A + B @ F + BK @ C2_over_K21
+    return System(AK, BK @ of_e, of_u @ CK, of_u @ K11 @ of_e)
 
 
 def _stabilising(A: Real, B: Real, Q: Real, R: Real, S: Real) -> Real | None:
-    """Semidefinite X with A'X + XA - (XB + S) R^-1 (B'X + S') + Q = 0 and a stable loop, R indefinite; None
-    without one. From the Hamiltonian's stable subspace: scipy's solver rejects X = 0."""
+    """Semidefinite X (n, n) with A'X + XA - (XB + S) R^-1 (B'X + S') + Q = 0 and a stable loop; None without.
+
+    A (n, n), B and S (n, m), Q (n, n), R (m, m) indefinite. From the stable subspace of the Hamiltonian
+    matrix: scipy's solver rejects X = 0.
+    """
     n = A.shape[0]
     a = A - B @ np.linalg.solve(R, S.T)
-    whole = np.block([[a, -B @ np.linalg.solve(R, B.T)], [-Q + S @ np.linalg.solve(R, S.T), -a.T]])
-    _, basis, stable = scipy.linalg.schur(whole, sort="lhp")
-    if stable != n or np.linalg.cond(basis[:n, :n]) > 1 / np.finfo(float).eps:
+    upper_right = -B @ np.linalg.solve(R, B.T)
+    lower_left = -Q + S @ np.linalg.solve(R, S.T)
+    hamiltonian = np.block([[a, upper_right], [lower_left, -a.T]])
+    _, basis, stable = scipy.linalg.schur(hamiltonian, sort="lhp")
+    upper = basis[:n, :n]
+    if stable != n or np.linalg.cond(upper) > 1 / np.finfo(float).eps:
         return None
-    X = np.linalg.solve(basis[:n, :n].T, basis[n:, :n].T)
+    X = np.linalg.solve(upper.T, basis[n:, :n].T)
     X = 0.5 * (X + X.T)
-    return X if np.linalg.eigvalsh(X)[0] > -_NONE * (1.0 + np.max(np.abs(X))) else None
+    is_semidefinite = np.linalg.eigvalsh(X)[0] > -_NEARLY_ZERO * (1.0 + np.max(np.abs(X)))
+    return X if is_semidefinite else None
 
 
 def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_s: float) -> System:
-    """K truncated to so many states, balanced by how an error of K moves z of the closed loop, low to high.
+    """Controller truncated to a number of states, balanced by how its error moves z of the closed loop.
 
-    To first order dz = Tzu dK Ted d."""
+    Parameters
+    ----------
+    K : System
+        Stabilises P; at least `order` states.
+    P : WeightedPlant
+    order : int
+        States that stay.
+    low_rad_s, high_rad_s : float
+        Between which the error counts, with equal weight per rad/s.
+
+    Returns
+    -------
+    System
+        Stability of the closed loop is not ensured.
+
+    Notes
+    -----
+    To first order dz = Tzu dK Ted d: a state counts by how strongly d reaches it through Ted, and by how
+    strongly it reaches z through Tzu. The two Gramians are made alike, and the smallest Hankel singular
+    values dropped.
+    """
     A, B, C, D = K
-    omega = np.geomspace(low_rad_s, high_rad_s, _POINTS)
+    omega = np.geomspace(low_rad_s, high_rad_s, _QUADRATURE_POINTS)
     width = np.gradient(omega)
     s = np.asarray(1j * omega, dtype=np.complex128)
-    states = _resolvent(P.A, np.hstack([P.B1, P.B2]), s)
+
+    # Open-loop responses, frequency first: of P from (d, u) to e and from u to z, of K's states and of K.
+    plant_states = _resolvent(P.A, np.hstack([P.B1, P.B2]), s)
     n_d = P.B1.shape[1]
-    to_e = P.C2 @ states + np.hstack([P.D21, P.D22])
-    from_u = P.C1 @ states[:, :, n_d:] + P.D12
-    own, observed = _resolvent(A, B, s), np.swapaxes(_resolvent(A.T, C.T, s), 1, 2)
-    value = C @ own + D
-    loop = np.linalg.inv(np.eye(D.shape[1]) - to_e[:, :, n_d:] @ value)
-    into = own @ loop @ to_e[:, :, :n_d]
-    out = from_u @ (np.eye(D.shape[0]) + value @ loop @ to_e[:, :, n_d:]) @ observed
-    P_root = _root(np.einsum("f,fij->ij", width, (into @ conjugate(into)).real))
-    Q_root = _root(np.einsum("f,fij->ij", width, (conjugate(out) @ out).real))
-    left, sizes, right = np.linalg.svd(Q_root.T @ P_root)
+    to_e = P.C2 @ plant_states + np.hstack([P.D21, P.D22])
+    e_of_u = to_e[:, :, n_d:]
+    z_of_u = P.C1 @ plant_states[:, :, n_d:] + P.D12
+    reached = _resolvent(A, B, s)
+    observed = np.swapaxes(_resolvent(A.T, C.T, s), 1, 2)
+    value = C @ reached + D
+
+    # Closed: from d to the states, and from the states to z.
+    loop = np.linalg.inv(np.eye(D.shape[1]) - e_of_u @ value)
+    around_loop = np.eye(D.shape[0]) + value @ loop @ e_of_u
+    states_of_d = reached @ loop @ to_e[:, :, :n_d]
+    z_of_states = z_of_u @ around_loop @ observed
+    reach_power = (states_of_d @ conjugate(states_of_d)).real
+    view_power = (conjugate(z_of_states) @ z_of_states).real
+
+    # Balanced truncation by the square-root method.
+    reach_root = _root(np.einsum("f,fij->ij", width, reach_power))
+    view_root = _root(np.einsum("f,fij->ij", width, view_power))
+    left, sizes, right = np.linalg.svd(view_root.T @ reach_root)
     scale = np.sqrt(np.maximum(sizes[:order], np.finfo(float).tiny))
-    T, inverse = P_root @ right[:order].T / scale, (Q_root @ left[:, :order] / scale).T
-    return inverse @ A @ T, inverse @ B, C @ T, D
+    to_all = reach_root @ right[:order].T / scale
+    from_all = (view_root @ left[:, :order] / scale).T
+    return System(from_all @ A @ to_all, from_all @ B, C @ to_all, D)
 
 
 def continuous(system: control.StateSpace) -> System:
-    """In Tustin's s, of a discrete system without a pole at z = -1."""
-    A, B, C, D = (np.asarray(getattr(system, each), dtype=np.float64) for each in "ABCD")
-    inverse, eye = np.linalg.inv(A + np.eye(A.shape[0])), np.eye(A.shape[0])
+    """Continuous system in Tustin's s with the frequency response of a discrete one.
+
+    Parameters
+    ----------
+    system : control.StateSpace
+        Discrete, dt in seconds.
+
+    Returns
+    -------
+    System
+        s = (2/dt) (z - 1)/(z + 1).
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A pole at z = -1, where s is infinite.
+    """
+    A, B, C, D = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
+    eye = np.eye(A.shape[0])
+    inverse = np.linalg.inv(A + eye)
+    # Balanced: the same factor on B and C.
     root = 2.0 / np.sqrt(system.dt)
-    return 2.0 / system.dt * (A - eye) @ inverse, root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
+    A_s = 2.0 / system.dt * (A - eye) @ inverse
+    B_s = root * inverse @ B
+    C_s = root * C @ inverse
+    return System(A_s, B_s, C_s, D - C @ inverse @ B)
 
 
 def _resolvent(A: Real, B: Real, s: Complex) -> Complex:
+    """(s I - A)^-1 B (F, n, m) at s (F,), for A (n, n) and B (n, m)."""
     return np.asarray(np.linalg.solve(s[:, None, None] * np.eye(A.shape[0]) - A, B + 0j))
 
 
 def _root(gramian: Real) -> Real:
+    """Square root R (n, n) with R R' = gramian (n, n), which is semidefinite but for rounding."""
     sizes, axes = np.linalg.eigh(gramian)
     return np.asarray(axes * np.sqrt(np.maximum(sizes, 0.0)))
 
 
 def _diagonal(weights: Sequence[RationalWeight]) -> System:
+    """Weights of one channel each, side by side: a system of as many inputs and outputs."""
     import control  # here, because it brings a plotting library with it
 
-    parts = [control.ss(control.tf(list(w.numerator), list(w.denominator))) for w in weights]
+    parts = [control.ss(control.tf(list(weight.numerator), list(weight.denominator))) for weight in weights]
     whole = control.append(*parts)
-    return whole.A, whole.B, whole.C, whole.D
+    return System(whole.A, whole.B, whole.C, whole.D)

@@ -101,7 +101,7 @@ def test_central_controllers_reach_their_norm_and_no_smaller_one_is_found(scalin
     assert np.max(loop.poles().real) < 0
     omega = np.geomspace(1e-4, 1e5, 2000)
     reached = np.max(np.linalg.norm(np.moveaxis(loop(1j * omega), 2, 0), 2, axis=(1, 2)))
-    smaller = next(g for g in np.geomspace(10, 0.01, 700) if riccati_starts._central(P, g) is None)
+    smaller = next(g for g in np.geomspace(10, 0.01, 700) if riccati_starts.controller_below(P, g) is None)
     assert 0.9 * smaller < reached < 1.05 * smaller
     same = control.ss(*reduced((A, B, C, D), P, A.shape[0], 1e-4, 1e5)) - control.ss(A, B, C, D)
     assert np.max(np.abs(same(1j * np.geomspace(0.1, 100, 9)))) < 1e-3 * np.max(np.abs(D))
