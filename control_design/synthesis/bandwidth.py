@@ -1,4 +1,9 @@
-"""The bandwidth of a specification that leaves it open down to `lowest_bandwidth_rad_s`."""
+"""Synthesis for the highest bandwidth that is met, where a specification leaves it open.
+
+A specification with `lowest_bandwidth_rad_s` asks for `bandwidth_rad_s` where it can be met, and for as
+much as can be met down to the lowest one. `synthesise_widest` tries bandwidths of a geometric series by
+bisection, with short searches, and designs for the widest that promises to be met with a whole one.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +19,9 @@ from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
 
-# A trial, without the search from many starts, ends with a design this much clear of the specification.
+# Worst case at which a trial ends: so much clear of the specification that the whole design meets it, too.
 _CLEAR = 0.95
-_QUICK = {"sufficient_gamma": _CLEAR}
-# Bandwidths that are tried lie this ratio apart, about: the full search closes a part of it again.
+# Ratio of neighbouring bandwidths, about: the full search closes a part of it again, by a lower gamma.
 _RATIO = 1.3
 
 
@@ -29,59 +33,116 @@ def synthesise_widest(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> tuple[Specification, SynthesisResult]:
-    """`synthesise` for the highest bandwidth that is met, from bandwidth_rad_s down to
-    lowest_bandwidth_rad_s; and the specification with that bandwidth. Where none is met, for the lowest.
+    """Design for the highest bandwidth that is met.
 
-    Trials look for it by bisection: a wider bandwidth is taken to ask for more. They start from controllers
-    of the Youla bound only; what they miss and many starts would meet is not found. Raises SpecificationError
-    as `synthesise`.
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+    specification : Specification
+        From `bandwidth_rad_s` down to `lowest_bandwidth_rad_s`; without both, one design as `synthesise`.
+    options : SynthesisOptions, optional
+    rng : numpy.random.Generator
+        Every bandwidth is tried with the same starts.
+    progress : callable, optional
+        Called with (fraction, message).
+
+    Returns
+    -------
+    specification : Specification
+        With the bandwidth that was designed for, and the order where "auto" was asked. Where no bandwidth is
+        met, with the lowest one.
+    result : SynthesisResult
+
+    Raises
+    ------
+    SpecificationError
+        Specification and plants contradict each other, at the bandwidth of the last design.
+
+    Notes
+    -----
+    Bisection: a wider bandwidth is taken to ask for more. Trials start from controllers of the Youla bound
+    only; what they miss and many starts would meet is not found.
     """
-    options, tell = options or SynthesisOptions(), progress or (lambda fraction, message: None)
-    top, lowest = specification.bandwidth_rad_s, specification.lowest_bandwidth_rad_s
+    options = options or SynthesisOptions()
+    tell = progress or (lambda fraction, message: None)
+    top = specification.bandwidth_rad_s
+    lowest = specification.lowest_bandwidth_rad_s
     if top is None or lowest is None:
-        found = synthesise(plants, specification, options, rng=rng, progress=progress)
-        return with_order(specification, found), found
+        result = synthesise(plants, specification, options, rng=rng, progress=progress)
+        return with_order(specification, result), result
+
     count = 1 + int(np.ceil(np.log(top / lowest) / np.log(_RATIO)))
-    tried = [stated(specification, value) for value in np.geomspace(top, lowest, max(count, 2)).tolist()]
+    bandwidths = np.geomspace(top, lowest, max(count, 2)).tolist()
+    trials = [stated(specification, bandwidth) for bandwidth in bandwidths]
     # A trial ends before it can mend a pole that is slower than the plant's grids; a whole design does.
     low_rad_s = options.omega_min_rad_s or min(lowest_rad_s(plant.dt_s, plant.poles) for plant in plants)
-    root, quick = int(rng.integers(2**63)), options.model_copy(update=_QUICK | {"omega_min_rad_s": low_rad_s})
+    seed = int(rng.integers(2**63))
+    quick = options.model_copy(update={"sufficient_gamma": _CLEAR, "omega_min_rad_s": low_rad_s})
+    many_starts_may_help = True
 
-    searches = [False, True]  # where no fit is stable, the bandwidth may still be met
-
-    def gamma(one: Specification) -> float:
-        tell(0.0, f"bandwidth {one.bandwidth_rad_s:.3g} rad/s")
-        for thorough in tuple(searches):
+    def gamma(trial: Specification) -> float:
+        """Worst case of a quick design; inf: refused, or nothing stable."""
+        nonlocal many_starts_may_help
+        tell(0.0, f"bandwidth {trial.bandwidth_rad_s:.3g} rad/s")
+        # Where no fit is stable, the bandwidth may still be met: by many starts.
+        for thorough in (False, True) if many_starts_may_help else (False,):
             try:
-                found = synthesise(plants, one, quick, rng=np.random.default_rng(root), thorough=thorough)
+                rng_of_trial = np.random.default_rng(seed)
+                result = synthesise(plants, trial, quick, rng=rng_of_trial, thorough=thorough)
             except SpecificationError:
                 return np.inf
-            if np.isfinite(found.gamma):
-                return found.gamma
+            if np.isfinite(result.gamma):
+                return result.gamma
         # What nothing stabilises, nothing stabilises at another bandwidth: the last design looks once more.
-        searches[1:] = []
+        many_starts_may_help = False
         return np.inf
 
-    low, high = 0, len(tried) - 1  # all from `high` on are met, or nothing is known of the last
+    # All from `high` on are met, or nothing is known of the last.
+    low = 0
+    high = len(trials) - 1
     while low < high:
         middle = (low + high) // 2
-        low, high = (low, middle) if gamma(tried[middle]) <= _CLEAR else (middle + 1, high)
-    for one in tried[high:]:
-        found = synthesise(plants, one, options, rng=np.random.default_rng(root), progress=progress)
-        if found.gamma <= 1.0:
+        if gamma(trials[middle]) <= _CLEAR:
+            high = middle
+        else:
+            low = middle + 1
+    for trial in trials[high:]:
+        rng_of_design = np.random.default_rng(seed)
+        result = synthesise(plants, trial, options, rng=rng_of_design, progress=progress)
+        if result.gamma <= 1.0:
             break
-    return with_order(one, found), found
+    return with_order(trial, result), result
 
 
-def with_order(specification: Specification, found: SynthesisResult) -> Specification:
-    """The specification with the order that was chosen where "auto" was asked and a design found."""
-    if specification.controller_order != "auto" or not found.controller.order:
+def with_order(specification: Specification, result: SynthesisResult) -> Specification:
+    """Specification with the order that was chosen, where "auto" was asked and a design was made.
+
+    Parameters
+    ----------
+    specification : Specification
+    result : SynthesisResult
+        A controller without states counts as no design.
+
+    Returns
+    -------
+    Specification
+    """
+    if specification.controller_order != "auto" or not result.controller.order:
         return specification
-    return specification.model_copy(update={"controller_order": found.controller.order})
+    return specification.model_copy(update={"controller_order": result.controller.order})
 
 
 def stated(specification: Specification, bandwidth_rad_s: float) -> Specification:
-    """The specification with this bandwidth and no other."""
-    return specification.model_copy(
-        update={"bandwidth_rad_s": float(f"{bandwidth_rad_s:.3g}"), "lowest_bandwidth_rad_s": None}
-    )
+    """Specification with one bandwidth, rounded to three digits, and none that it may fall to.
+
+    Parameters
+    ----------
+    specification : Specification
+    bandwidth_rad_s : float
+
+    Returns
+    -------
+    Specification
+    """
+    rounded = float(f"{bandwidth_rad_s:.3g}")
+    return specification.model_copy(update={"bandwidth_rad_s": rounded, "lowest_bandwidth_rad_s": None})

@@ -1,10 +1,9 @@
-"""Synthesis where a joint coverage is asked: design, draw posterior samples, guard against unstable ones,
-again.
+"""Synthesis where a joint coverage is asked: design, draw samples, guard against unstable ones, again.
 
-The weighted worst case is that of the ellipses at their level (say 95 %); stability is asked of nearly all
-draws (99.9 %), also of those that the first-order ellipses do not describe. The two are different statements
-and are kept apart: a draw that is unstable becomes a guard, which the next design has to keep stable without
-meeting any weight for it.
+The weighted worst case is that of the ellipses at their level (say 95 %), frequency by frequency. Stability
+is asked of nearly all sampled responses (say 99.9 %), also of those that the first-order ellipses do not
+describe. The two are different statements and are kept apart: a sample that is unstable becomes a guard,
+which the next design has to keep stable without meeting any weight for it.
 """
 
 from __future__ import annotations
@@ -24,16 +23,29 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.data.shown import Shown
 
-_MOST_GUARDS = 6  # of each plant and round: each is one more set of rows
+# Guards that are added for each plant in a round, from far apart: each is one more set of rows in every
+# descent.
+_MOST_GUARDS = 6
+# Standard deviations of the count of unstable draws that are added before it counts as few enough: fresh
+# draws shall confirm the share. Two are a one-sided level of 98 %.
+_DEVIATIONS = 2.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JointDesign(Shown):
-    """A design whose sampled responses are stable as often as asked, or the best found.
+    """A design whose sampled responses are stable as often as asked, or the best one of the search.
 
-    guards: responses it had to keep stable. unstable: unstable draws of `draws` for the first design and each
-    better one, the last for `result`. reached: that count, and two standard deviations of it more, are within
-    the share that may be unstable.
+    Attributes
+    ----------
+    result : SynthesisResult
+    guards : tuple of Guard
+        Responses that the design had to keep stable.
+    draws : int
+        Responses that were drawn after each design.
+    unstable : tuple of int
+        Unstable ones among them, for the first design and each better one; the last is that of `result`.
+    reached : bool
+        That count, and two standard deviations of it more, are within the share that may be unstable.
     """
 
     result: SynthesisResult
@@ -55,16 +67,40 @@ def synthesise_jointly(
     first: SynthesisResult | None = None,
     progress: Progress | None = None,
 ) -> JointDesign:
-    """`synthesise`, and again with guards until the share of stable draws is what is asked.
+    """Design, and design again with guards, until the share of stable draws is what is asked.
 
-    stable_share : of sampled responses that must be stable.
-    draws : responses drawn after every design, fresh ones each time.
-    rounds : designs with guards at most.
-    first : the design without guards, where it is known already.
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+        With uncertainties that can be drawn from.
+    specification : Specification
+    options : SynthesisOptions, optional
+        Of every design (`synthesise`).
+    rng : numpy.random.Generator
+        Draws starts and responses.
+    stable_share : float
+        Of the sampled responses that must be stable.
+    draws : int
+        Responses drawn after every design, fresh ones each time.
+    rounds : int
+        Designs with guards, at most.
+    first : SynthesisResult, optional
+        The design without guards, where it is known already.
+    progress : callable, optional
+        Called with (fraction, message).
 
-    Raises SpecificationError if specification and plants contradict each other (before optimising).
-    Raises ValueError if the share lies outside (0, 1), the draws are too few to show it, or an uncertainty
-    cannot be drawn from.
+    Returns
+    -------
+    JointDesign
+        The design with the fewest unstable draws.
+
+    Raises
+    ------
+    SpecificationError
+        Specification and plants contradict each other (before optimising).
+    ValueError
+        The share lies outside (0, 1), the draws are too few to show it, or an uncertainty cannot be drawn
+        from.
     """
     if not 0 < stable_share < 1:
         raise ValueError(f"stable_share must lie in (0, 1); got {stable_share}")
@@ -79,22 +115,25 @@ def synthesise_jointly(
     best: JointDesign | None = None
     for number in range(rounds + 1):
         part = part_of(tell, number, rounds + 1)
-        result = first if first is not None and number == 0 else None
-        result = result or synthesise(plants, specification, options, rng=rng, progress=part, guards=guards)
+        if number == 0 and first is not None:
+            result = first
+        else:
+            result = synthesise(plants, specification, options, rng=rng, progress=part, guards=guards)
         if result.outcome is Outcome.NOT_CONVERGED:
+            # Nothing keeps all guards stable: the design before is the best, if there is one.
             best = best or JointDesign(result, tuple(guards), draws, (), False)
             break
-        count, found = unstable_draws(
+        count, new_guards = unstable_draws(
             result.controller, plants, specification, rng=rng, draws=draws, most=_MOST_GUARDS
         )
         if best is None or count < best.unstable[-1]:
-            # Two standard deviations of the count: fresh draws shall confirm the share.
-            reached = bool(count + 2.0 * np.sqrt(count) <= allowed)
+            # The count is Poisson distributed: its standard deviation is its root.
+            reached = bool(count + _DEVIATIONS * np.sqrt(count) <= allowed)
             earlier = () if best is None else best.unstable
             best = JointDesign(result, tuple(guards), draws, (*earlier, count), reached)
         if best.reached:
             break
-        guards += found
+        guards += new_guards
     assert best is not None
     tell(1.0, f"gamma {best.result.gamma:.4g}")
     return best

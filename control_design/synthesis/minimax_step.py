@@ -124,33 +124,39 @@ def minimax_step(
     """
     n = slope.shape[1]
     rows = value.size
-    bounds = 2 * n
-    constraints = rows + bounds + a.shape[0]
+    constraints = rows + 2 * n + a.shape[0]
 
     # All inequalities as matrix v <= limit for v = (d, s): rows, upper and lower bounds, side conditions.
+    of_rows = slice(0, rows)
+    of_high = slice(rows, rows + n)
+    of_low = slice(rows + n, rows + 2 * n)
+    of_sides = slice(rows + 2 * n, constraints)
     matrix = np.zeros((constraints, n + 1))
-    matrix[:rows, :n] = slope
-    matrix[:rows, n] = -1.0
-    matrix[rows : rows + n, :n] = np.eye(n)
-    matrix[rows + n : rows + bounds, :n] = -np.eye(n)
-    matrix[rows + bounds :, :n] = a
+    matrix[of_rows, :n] = slope
+    matrix[of_rows, n] = -1.0
+    matrix[of_high, :n] = np.eye(n)
+    matrix[of_low, :n] = -np.eye(n)
+    matrix[of_sides, :n] = a
     limit = np.empty(constraints)
-    limit[:rows] = -value
-    limit[rows : rows + n] = np.maximum(high, _LEAST_ROOM)
-    limit[rows + n : rows + bounds] = np.maximum(-low, _LEAST_ROOM)
-    limit[rows + bounds :] = b + _LEAST_ROOM
+    limit[of_rows] = -value
+    limit[of_high] = np.maximum(high, _LEAST_ROOM)
+    limit[of_low] = np.maximum(-low, _LEAST_ROOM)
+    limit[of_sides] = b + _LEAST_ROOM
     hessian = np.zeros((n + 1, n + 1))
     hessian[:n, :n] = curvature
 
-    v = np.append(np.zeros(n), float(np.max(value)) + _FIRST_SLACK)
+    first_level = float(np.max(value)) + _FIRST_SLACK
+    v = np.append(np.zeros(n), first_level)
     z, gap = _interior_point(matrix, limit, hessian, v, rows)
     d = v[:n]
     solved = gap < _USABLE_GAP and np.all(np.isfinite(v))
-    inside = np.all(d <= high + _ROUNDING) and np.all(d >= low - _ROUNDING)
-    if not (solved and inside):
+    not_above = np.all(d <= high + _ROUNDING)
+    not_below = np.all(d >= low - _ROUNDING)
+    if not (solved and not_above and not_below):
         return None
     level = float(np.max(value + slope @ d))
-    return MinimaxStep(np.clip(d, low, high), level, z[:rows] / np.sum(z[:rows]))
+    multipliers = z[:rows] / np.sum(z[:rows])
+    return MinimaxStep(np.clip(d, low, high), level, multipliers)
 
 
 @numba.njit(**COMPILED)

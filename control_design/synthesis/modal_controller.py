@@ -119,8 +119,10 @@ class ModalForm:
             column_mask[block] = columns
 
         # Positions of free entries in C (m, U, 2), B (m, 2, Y), D (U, Y), C_0 (U, i).
-        self._c = np.nonzero(np.repeat(row_mask[:, :, None], 2, axis=2))
-        self._b = np.nonzero(np.repeat(column_mask[:, None, :], 2, axis=1))
+        free_in_c = np.repeat(row_mask[:, :, None], 2, axis=2)
+        free_in_b = np.repeat(column_mask[:, None, :], 2, axis=1)
+        self._c = np.nonzero(free_in_c)
+        self._b = np.nonzero(free_in_b)
         self._d = np.nonzero(pattern)
         self._i = np.nonzero(pattern[:, self.integrates])
         free_entries = [positions[0].size for positions in (self._c, self._b, self._d, self._i)]
@@ -148,6 +150,7 @@ class ModalForm:
         D = np.zeros((count, self.inputs, self.outputs))
         C_0 = np.zeros((count, self.inputs, self.integrates.size))
         every: Any = slice(None)
+        # A vector's numbers stand in the order of the free entries.
         C[(every, *self._c)] = c
         B[(every, *self._b)] = b
         D[(every, *self._d)] = d
@@ -289,14 +292,18 @@ class ModalForm:
         # Two poles for every block: a pole and its conjugate, or neighbours among the real ones.
         pairs = []
         for k in upper:
-            conjugate = np.argmin(np.abs(poles - np.conj(poles[k])))
-            pairs.append(np.array([k, conjugate]))
+            distances = np.abs(poles - np.conj(poles[k]))
+            pairs.append(np.array([k, np.argmin(distances)]))
         pairs += [np.array(real[k : k + 2]) for k in range(0, len(real), 2)]
         log_w, log_zeta, C_blocks, B_blocks = self.spread(1.0, 1.0, 1.0)
         for block, pair in enumerate(pairs):
-            geometric_mean = float(np.sqrt(np.prod(poles[pair]).real))
+            both_poles = poles[pair]
+            geometric_mean = float(np.sqrt(np.prod(both_poles).real))
             w = max(geometric_mean, np.finfo(float).tiny)
-            a = np.diag(poles[pair]) / w
+            a = np.diag(both_poles) / w
+            # What goes into the two diagonal states, and what comes out of them.
+            into_pair = inverse[pair] @ B / w
+            out_of_pair = C @ axes[:, pair]
             candidates = []
             for angle in np.linspace(0, np.pi, _TURNS, endpoint=False):
                 if block < upper.size:
@@ -305,8 +312,8 @@ class ModalForm:
                     v = np.array([np.cos(angle), np.sin(angle)])
                 T = np.column_stack([v, -a @ v])
                 if np.linalg.cond(T) < _WORST_CONDITION:
-                    into_block = np.linalg.solve(T, inverse[pair] @ B / w).real
-                    out_of_block = (C @ axes[:, pair] @ T).real
+                    into_block = np.linalg.solve(T, into_pair).real
+                    out_of_block = (out_of_pair @ T).real
                     norms = float(np.linalg.norm(into_block) * np.linalg.norm(out_of_block))
                     candidates.append((norms, into_block, out_of_block))
             if not candidates:
@@ -314,7 +321,7 @@ class ModalForm:
             _, b, c = min(candidates, key=lambda candidate: candidate[0])
             size = float(np.linalg.norm(b)) or 1.0
             log_w[block] = np.log(w)
-            log_zeta[block] = np.log(-np.sum(poles[pair]).real / (2 * w))
+            log_zeta[block] = np.log(-np.sum(both_poles).real / (2 * w))
             C_blocks[block] = c * size
             B_blocks[block] = b / size
         # Residues of the slowest poles are the integrators' gains.
@@ -327,15 +334,18 @@ class ModalForm:
 
     def _resolvent(self, log_w: Real, log_z: Real, s: Complex) -> tuple[Complex, Complex]:
         """s / w (P, R, m) and (s / w - M)^-1 (P, R, m, 2, 2) of blocks (P, m) at s (R,)."""
-        ratio = s[None, :, None] / np.exp(log_w)[:, None, :]
-        swing = ratio + 2 * np.exp(log_z)[:, None, :]
+        w = np.exp(log_w)
+        zeta = np.exp(log_z)
+        ratio = s[None, :, None] / w[:, None, :]
+        swing = ratio + 2 * zeta[:, None, :]
         # Inverse of [[s/w, -1], [1, s/w + 2 zeta]] in closed form.
         E = np.empty((*ratio.shape, 2, 2), dtype=np.complex128)
         E[..., 0, 0] = swing
         E[..., 0, 1] = 1.0
         E[..., 1, 0] = -1.0
         E[..., 1, 1] = ratio
-        E /= (ratio * swing + 1.0)[..., None, None]
+        determinant = ratio * swing + 1.0
+        E /= determinant[..., None, None]
         return ratio, E
 
     def response(self, x: Real, s: Complex) -> Complex:
@@ -425,7 +435,8 @@ class ModalForm:
         for block in range(self.blocks):
             first = n_integrators + 2 * block
             states = slice(first, first + 2)
-            A[states, states] = w[block] * np.array([[0, 1], [-1, -2 * zeta[block]]])
+            M = np.array([[0, 1], [-1, -2 * zeta[block]]])
+            A[states, states] = w[block] * M
             B[states] = w[block] * parts.B[block]
             C[:, states] = parts.C[block]
         B[np.arange(n_integrators), self.integrates] = 1.0

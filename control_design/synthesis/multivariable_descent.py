@@ -158,8 +158,8 @@ def stacked_rows(
             plant_number = np.full(omega.size, number)
             requirement_number = np.full(omega.size, which)
             every = (G, seen, entering, on_y, on_u, s, omega, plant_number, requirement_number)
-            parts.append(_RowArrays(*(array[use] for array in every)))
-    joined = _RowArrays(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+            parts.append(_RowArrays._make(array[use] for array in every))
+    joined = _RowArrays._make(np.concatenate(arrays) for arrays in zip(*parts, strict=True))
     rows = BoundRows(joined.G, joined.seen, joined.entering, joined.V_y, joined.V_u, together)
     return StackedRows(rows, joined.s, joined.omega_rad_s, joined.plant, joined.requirement)
 
@@ -355,15 +355,19 @@ class MatrixDescent:
             return np.asarray(by_parameter[0])
 
         # d log H = dH / top at the largest eigenvalue; the others are expanded alike, about log top.
-        slope = [2 * slopes(i, i).real for i in range(width)]
+        slope_entries = [2 * slopes(i, i).real for i in range(width)]
         for i, j in combinations(range(width), 2):
             entry = slopes(i, j) + np.conj(slopes(j, i))
-            slope += [entry.real, entry.imag]
+            slope_entries += [entry.real, entry.imag]
+        slope = np.stack(slope_entries, axis=1) / top[:, None, None]
         turned = conjugate(basis)[:, None] @ first_order.in_t @ basis[:, None]
-        in_t = np.moveaxis(_entries(turned / top[:, None, None, None]), 1, 2)
+        relative_turned = turned / top[:, None, None, None]
+        in_t = np.moveaxis(_entries(relative_turned), 1, 2)
+        log_of_rows = log[index]
+        relative_sizes = sizes / top[:, None]
         value = np.zeros((index.size, width**2))
-        value[:, :width] = log[index][:, None] + sizes / top[:, None] - 1.0
-        return _NearWorst(index, value, np.stack(slope, axis=1) / top[:, None, None], in_t, basis, top)
+        value[:, :width] = log_of_rows[:, None] + relative_sizes - 1.0
+        return _NearWorst(index, value, slope, in_t, basis, top)
 
     def _bent(self, local: _NearWorst, change: Real, after: Bound, box: float) -> _NearWorst:
         """Model of the rows with what it missed at x + change (n,) added to its values.
@@ -371,7 +375,8 @@ class MatrixDescent:
         A second-order correction: the next step from the same point follows a curved edge between rows.
         """
         width = local.basis.shape[2]
-        predicted, _ = _lowered(local.value + local.slope @ change, local.in_t, _SCALING_BOX * box, width)
+        at_change = local.value + local.slope @ change
+        predicted, _ = _lowered(at_change, local.in_t, _SCALING_BOX * box, width)
         missed = 2 * np.log(after.gamma[local.index]) - predicted
         value = local.value.copy()
         value[:, :width] += missed[:, None]
@@ -395,7 +400,8 @@ class MatrixDescent:
         s = self.stack.s[index]
         # With W = sum_k w_k w_k^H a row's share is tr(W dH) = 2 Re sum_k (left w_k)^H dK (right w_k).
         weights, axes = np.linalg.eigh(multipliers[index])
-        roots = np.sqrt(np.maximum(weights, 0.0) / local.top[use][:, None])
+        top = local.top[use]
+        roots = np.sqrt(np.maximum(weights, 0.0) / top[:, None])
         factors = axes * roots[:, None, :]
 
         def gradient(points: Real) -> Real:
@@ -411,14 +417,17 @@ class MatrixDescent:
             for k in range(factors.shape[2]):
                 left_k = left[:, :, k].reshape(count, index.size, -1)
                 right_k = right[:, :, k].reshape(count, index.size, -1)
-                total += 2 * np.sum(self.form.slopes(points, s, left_k, right_k).real, axis=1)
+                slopes = self.form.slopes(points, s, left_k, right_k)
+                total += 2 * np.sum(slopes.real, axis=1)
             return total
 
         points = np.vstack([x[None], x + _SHIFT * np.diag(unit)])
         gradients = gradient(points)
         change = (gradients[1:] - gradients[0]) * unit / _SHIFT
-        curvatures, directions = np.linalg.eigh(0.5 * (change + change.T))
-        return np.asarray((directions * np.maximum(curvatures, 0.0)) @ directions.T)
+        symmetric = 0.5 * (change + change.T)
+        curvatures, directions = np.linalg.eigh(symmetric)
+        scaled_directions = directions * np.maximum(curvatures, 0.0)
+        return np.asarray(scaled_directions @ directions.T)
 
     def _step(self, x: Real, local: _NearWorst, curvature: Real, unit: Real, box: float) -> _Move | None:
         """Step from x (n,) within a box, with the smallest largest row of the model; None where it fails.
@@ -434,16 +443,21 @@ class MatrixDescent:
 
         # First directions: the largest eigenvector of every row that may become the worst ..
         reach = _REACH * box * np.sum(np.abs(change), axis=2)
-        near = np.flatnonzero(value[:, 0] + reach[:, 0] > best - box)
-        first_axis = np.eye(width, dtype=np.complex128)[np.zeros(near.size, dtype=int)]
+        highest = value[:, 0] + reach[:, 0]
+        near = np.flatnonzero(highest > best - box)
+        axes = np.eye(width, dtype=np.complex128)
+        first_axis = axes[np.zeros(near.size, dtype=int)]
         rows = [near]
         directions = [first_axis]
         # .. and four directions between two eigenvectors, where the second may become the worst.
         for number, (i, j) in enumerate(combinations(range(width), 2)):
-            off_diagonal = change[:, width + 2 * number : width + 2 * number + 2]
-            size = np.hypot(off_diagonal[:, 0], off_diagonal[:, 1])
+            first = width + 2 * number
+            real_part = change[:, first]
+            imaginary_part = change[:, first + 1]
+            size = np.hypot(real_part, imaginary_part)
             off_reach = 2 * _REACH * box * np.sum(size, axis=1)
-            may_meet = value[:, j] + reach[:, j] + off_reach > best - box
+            highest = value[:, j] + reach[:, j] + off_reach
+            may_meet = highest > best - box
             meeting = near[may_meet[near]]
             for factor in (1.0, -1.0, 1j, -1j):
                 between = np.zeros(width, dtype=np.complex128)
@@ -534,7 +548,8 @@ def _matrix(entries: Real, width: int) -> Complex:
     for i in range(width):
         matrix[..., i, i] = entries[..., i]
     for number, (i, j) in enumerate(combinations(range(width), 2)):
-        entry = entries[..., width + 2 * number] + 1j * entries[..., width + 2 * number + 1]
+        first = width + 2 * number
+        entry = entries[..., first] + 1j * entries[..., first + 1]
         matrix[..., i, j] = entry
         matrix[..., j, i] = np.conj(entry)
     return matrix
@@ -554,8 +569,11 @@ def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Co
         at = value + np.einsum("rin,rn->ri", fall, by)
         if width == 2:
             # In closed form: a fraction of the time of a general solver.
-            apart = np.hypot(at[:, 0] - at[:, 1], 2 * np.hypot(at[:, 2], at[:, 3]))
-            return np.asarray(0.5 * (at[:, 0] + at[:, 1] + apart))
+            first = at[:, 0]
+            second = at[:, 1]
+            off_diagonal = np.hypot(at[:, 2], at[:, 3])
+            apart = np.hypot(first - second, 2 * off_diagonal)
+            return np.asarray(0.5 * (first + second + apart))
         return np.asarray(np.linalg.eigvalsh(_matrix(at, width))[:, -1])
 
     scalings = list(range(shift.shape[1]))
@@ -573,6 +591,6 @@ def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Co
             low = np.where(smaller, low, left[:, i])
             high = np.where(smaller, right[:, i], high)
         shift[:, i] = 0.5 * (low + high)
-    lowered = _matrix(value + np.einsum("rin,rn->ri", fall, shift), width)
-    sizes, axes = np.linalg.eigh(lowered)
+    lowered = value + np.einsum("rin,rn->ri", fall, shift)
+    sizes, axes = np.linalg.eigh(_matrix(lowered, width))
     return sizes[:, -1], axes[:, :, -1]

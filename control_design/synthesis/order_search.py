@@ -266,7 +266,9 @@ class OrderSearch:
 
     def _fits(self, free: FreeControllers, *, weighted: bool) -> list[Real]:
         """Parameters (n,) of a stable fit of each free controller that has one; weighted: at random."""
-        damping = max(1.01 * (self.spec.controller_damping or 0.0), _NO_RESONANCE)
+        # Clear of the bound on the controller's damping by 1 %.
+        asked_damping = self.spec.controller_damping or 0.0
+        damping = max(1.01 * asked_damping, _NO_RESONANCE)
         rng = self.rng if weighted else None
         fits = [fitted(self.cascade, each, least_damping=damping, rng=rng) for each in free.each]
         worst_case = self._descent().value

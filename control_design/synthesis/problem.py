@@ -1,4 +1,13 @@
-"""What a controller of any order is judged by: stable loops, rows of the optimisers, dense check."""
+"""What a controller of any order is judged by: stable loops, rows of the optimisers, dense check.
+
+A `Problem` is made once for each synthesis of one loop. Its plants stand on two grids: a lean one
+(`grids`), on which descents see the worst case (`rows`) and which grows by exchange (`add_violated`), and a
+dense one, on which the worst case gamma counts (`gamma`, `checks`). Controllers are a `Cascade` with a
+parameter vector x (n,).
+
+Stability is asked of every nominal loop by its poles, and of guards, single sampled responses, by how often
+1 + G K winds around 0 (`stable`, `guarded`).
+"""
 
 from __future__ import annotations
 
@@ -20,13 +29,38 @@ from control_design.specification.requirement import LoopFunction
 from control_design.synthesis.rows import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
-_LIGHT = 0.05  # damping ratio; wider resonances do not fit between the points of a dense grid
-_PER_DECADE = 10  # of points below the grids, where nothing but slow real poles and zeros is
-_DELAY_COPY_MODULUS = 0.1  # distance from -1 asked of the delayed copies: stability with something to spare
+# Damping ratio below which a pole or zero gets points of its own in the dense check; wider resonances do not
+# fit between the points of a dense grid.
+_LIGHT = 0.05
+# Points around such a pole or zero.
+_POINTS_OF_MODE = 25
+# Points a decade below the grids, where nothing but slow real poles and zeros is.
+_PER_DECADE = 10
+# Distance from -1 asked of delayed copies: stability with something to spare.
+_DELAY_COPY_MODULUS = 0.1
+# Violated frequencies that one controller puts on the grid of one plant.
+_MOST_ADDED = 12
+# No division by zero where 1 + G K vanishes.
+_TINY = 1e-300
 
 
 class Problem(Grids):
-    """What does not depend on the controller's order; the lean grids grow by exchange, the rest is fixed."""
+    """Plants, specification and grids of one synthesis, for controllers of any order.
+
+    Parameters
+    ----------
+    plants : tuple of UncertainPlant
+        At least one; all of one sampling time.
+    specification : Specification
+    options : SynthesisOptions
+        Sizes of the grids.
+    guards : tuple of Guard
+        Responses (F,) of a plant that have to be stable beside its ellipses.
+
+    Notes
+    -----
+    The lean grids `grids` grow by exchange; the rest is fixed.
+    """
 
     def __init__(
         self,
@@ -35,23 +69,40 @@ class Problem(Grids):
         options: SynthesisOptions,
         guards: tuple[Guard, ...] = (),
     ) -> None:
+        """Build grids and nominal loops, the computational delay at the input of each plant."""
         super().__init__(plants, specification, options)
-        self.options, self.guards = options, guards
-        self._guarded = sorted_by_plant(guards)
+        self.options = options
+        self.guards = guards
+        self._guards_by_plant = sorted_by_plant(guards)
         self.dt_s = plants[0].dt_s
         self._loops = [NominalLoop(plant, specification.computational_delay_samples) for plant in plants]
 
     @property
     def integrators(self) -> int:
         """Integrators of the loop: the controller's and the most of any plant."""
-        return max(plant.n_integrators for plant in self.plants) + int(self.spec.integrator)
+        most_of_plants = max(plant.n_integrators for plant in self.plants)
+        return most_of_plants + int(self.spec.integrator)
 
     @property
     def asks_tracking(self) -> bool:
+        """Whether the specification weighs S at low frequency, by a bandwidth or a weight of its own."""
         return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
 
+    # What the optimisers see
+
     def rows(self, grids: Sequence[Real] | None = None) -> list[Rows]:
-        """Rows of the optimisers on the lean grids, as they are now or as given."""
+        """Rows of the optimisers.
+
+        Parameters
+        ----------
+        grids : sequence of ndarray, shape (F,), optional
+            Of each plant; by default the lean grids as they are now.
+
+        Returns
+        -------
+        list of Rows
+            For each plant, for its copy behind the delay margin where one is asked, and for each guard.
+        """
         rows: list[Rows] = []
         for data in self.lean(grids):
             ellipses = data.ellipses
@@ -59,14 +110,80 @@ class Problem(Grids):
             if self.spec.delay_margin_s is not None:
                 late = data.delay * np.exp(-1j * ellipses.omega_rad_s * self.spec.delay_margin_s)
                 rows.append(Rows(ellipses, late, _modulus(_DELAY_COPY_MODULUS, ellipses)))
+        grids_of_plants = self.grids if grids is None else grids
         for guard in self.guards:
-            points = guard.ellipses((self.grids if grids is None else grids)[guard.plant])
+            points = guard.ellipses(grids_of_plants[guard.plant])
             rows.append(Rows(points, self.delay(points.omega_rad_s), _modulus(GUARD_MODULUS, points)))
         return rows
 
+    def add_violated(
+        self, cascade: Cascade, parameters: Real, gamma_grid: float, most: int = _MOST_ADDED
+    ) -> int:
+        """Put frequencies on the lean grids at which the dense check exceeds the lean grids' worst case.
+
+        Parameters
+        ----------
+        cascade : Cascade
+        parameters : ndarray, shape (n,)
+            Of the controller that is checked.
+        gamma_grid : float
+            Its worst case on the lean grids.
+        most : int
+            Local maxima that are added at most, of each check.
+
+        Returns
+        -------
+        int
+            Frequencies that were new.
+        """
+        limit = gamma_grid * (1.0 + EXCHANGE_TOLERANCE)
+        added = 0
+        for position, data in self.checks(cascade, parameters):
+            omega = data.ellipses.omega_rad_s
+            k = cascade.response(parameters, omega)
+            worst = worst_of(data.weighted(k))
+            covered = ~np.isfinite(worst)
+            if np.any(covered):
+                # Ellipses over -1 have no worst case: a value above all others, the deepest the largest.
+                scale = scale_to_minus_one(k * data.delay, data.ellipses)[covered]
+                depth = 2.0 - np.minimum(scale, 1.0)
+                largest_finite = np.max(worst[~covered], initial=limit)
+                worst[covered] = depth * 2.0 * largest_finite
+            added += self._add(position, omega, worst, limit, most)
+        for guard in self.guards:
+            omega = guard.omega_rad_s
+            k = self.delayed_response(cascade, parameters, omega)
+            distance = np.abs(1.0 + guard.response * k)
+            near = GUARD_MODULUS / np.maximum(distance, _TINY)
+            added += self._add(guard.plant, omega, near, limit, most)
+        return added
+
+    def _add(self, position: int, omega: Real, value: Real, limit: float, most: int) -> int:
+        """Put the largest local maxima of value (F,) above the limit on the lean grid of one plant.
+
+        Returns how many were new. position: number of the plant; omega (F,), rad/s.
+        """
+        before = self.grids[position]
+        after = with_violations(before, omega, value, limit, most)
+        self.grids[position] = after
+        return after.size - before.size
+
+    # The dense check
+
     def gamma(self, cascade: Cascade, parameters: Real) -> float:
-        """Weighted worst case on the dense grids; inf if some nominal loop is unstable, an ellipse
-        reaches -1 or the controller rings by itself more than it may."""
+        """Weighted worst case of a controller on the dense grids.
+
+        Parameters
+        ----------
+        cascade : Cascade
+        parameters : ndarray, shape (n,)
+
+        Returns
+        -------
+        float
+            inf if some nominal loop is unstable, an ellipse reaches -1, or the controller rings by itself
+            more than it may.
+        """
         asked = self.spec.controller_damping
         if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
             return float("inf")
@@ -75,58 +192,95 @@ class Problem(Grids):
         worst = 0.0
         for _, data in self.checks(cascade, parameters):
             values = data.weighted(cascade.response(parameters, data.ellipses.omega_rad_s))
-            names = [each.requirement.name for each in data.weightings]
-            worst = max(worst, float(np.max([np.max(values[name]) for name in names])))
+            maxima = [np.max(values[each.requirement.name]) for each in data.weightings]
+            worst = max(worst, float(np.max(maxima)))
         return worst
 
     def checks(self, cascade: Cascade, parameters: Real) -> list[tuple[int, PlantData]]:
-        """(number of the plant, data) of the dense check of one controller: the dense grids, and points
-        around lightly damped poles and zeros of the controller and poles of its loops, and below the grids
-        where one of them is slower.
+        """Frequencies at which one controller is checked.
 
+        Parameters
+        ----------
+        cascade : Cascade
+        parameters : ndarray, shape (n,)
+
+        Returns
+        -------
+        list of (int, PlantData)
+            Number of the plant, and its ellipses and weights on a grid: the dense grids first; then, for
+            plants that need them, points around lightly damped poles and zeros of the controller and poles
+            of its loops, and below the grid where one of them is slower.
+
+        Notes
+        -----
         A controller may hide a resonance between the points of any grid that does not know it, or a step
         below them, and an optimiser finds that out.
         """
-        found = list(enumerate(self.dense))
+        checks = list(enumerate(self.dense))
         roots = cascade.roots(parameters)
-        for number, (plant, poles) in enumerate(
-            zip(self.plants, self.closed_loop_poles(cascade, parameters), strict=True)
-        ):
-            own = np.concatenate([roots, poles])
-            light = modes_of(own, self.dt_s, zeta_below=_LIGHT)
-            low = self.options.omega_min_rad_s or lowest_rad_s(plant.dt_s, plant.poles)
-            begin = min(low, self.options.omega_min_rad_s or lowest_rad_s(plant.dt_s, own))
-            if plant.own_grid is not None or not (light or begin < low):
+        poles_of_loops = self.closed_loop_poles(cascade, parameters)
+        for number, (plant, poles) in enumerate(zip(self.plants, poles_of_loops, strict=True)):
+            controller_and_loop = np.concatenate([roots, poles])
+            light = modes_of(controller_and_loop, self.dt_s, zeta_below=_LIGHT)
+            asked_lowest = self.options.omega_min_rad_s
+            grid_begins = asked_lowest or lowest_rad_s(plant.dt_s, plant.poles)
+            slowest = asked_lowest or lowest_rad_s(plant.dt_s, controller_and_loop)
+            begin = min(grid_begins, slowest)
+            needs_points = bool(light) or begin < grid_begins
+            if plant.own_grid is not None or not needs_points:
                 continue
-            below = np.geomspace(
-                begin, low, int(np.ceil(_PER_DECADE * np.log10(low / begin))), endpoint=False
-            )
+            count_below = int(np.ceil(_PER_DECADE * np.log10(grid_begins / begin)))
+            below = np.geomspace(begin, grid_begins, count_below, endpoint=False)
             # A pole or zero of either side of the circle.
-            modes = (Mode(mode.omega_rad_s, abs(mode.zeta)) for mode in light)
-            points = np.unique(np.concatenate([below, *(mode_points(mode, 25) for mode in modes)]))
-            points = points[(points >= begin) & (points < plant.nyquist_rad_s)]
+            modes = [Mode(mode.omega_rad_s, abs(mode.zeta)) for mode in light]
+            around = [mode_points(mode, _POINTS_OF_MODE) for mode in modes]
+            points = np.unique(np.concatenate([below, *around]))
+            not_slower = points >= begin
+            below_nyquist = points < plant.nyquist_rad_s
+            points = points[not_slower & below_nyquist]
             if points.size:
-                found.append((number, PlantData.build(plant, self.spec, points)))
-        return found
+                checks.append((number, PlantData.build(plant, self.spec, points)))
+        return checks
+
+    # Stability
+
+    def usable(self, cascade: Cascade, parameters: Real) -> bool:
+        """Whether the controller (parameters (n,)) can be built and every nominal loop and guard is stable.
+
+        False also where no anti-windup gain exists, which a numerically degenerate controller shows.
+        """
+        try:
+            self.controller(cascade, parameters)
+        except ValueError:
+            return False
+        return self.stable(cascade, parameters)
 
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
-        """Whether every nominal loop is (poles of the full state space, strictly inside the circle), and
-        every guard's."""
-        poles = self.closed_loop_poles(cascade, parameters)
-        return all(np.all(np.abs(each) < 1.0) for each in poles) and self.guarded(cascade, parameters)
+        """Whether every nominal loop and every guard is stable under parameters (n,).
 
-    def delay(self, omega_rad_s: Real) -> Complex:
-        """The computational delay at omega (F,)."""
-        samples = self.spec.computational_delay_samples
-        return np.asarray(np.exp(-1j * omega_rad_s * self.dt_s * samples), dtype=np.complex128)
-
-    def delayed_response(self, cascade: Cascade, parameters: Real, omega_rad_s: Real) -> Complex:
-        """K with its delay at omega (F,)."""
-        return cascade.response(parameters, omega_rad_s) * self.delay(omega_rad_s)
+        Poles of the full state space have to lie strictly inside the circle.
+        """
+        poles_of_loops = self.closed_loop_poles(cascade, parameters)
+        loops_are_stable = all(np.all(np.abs(poles) < 1.0) for poles in poles_of_loops)
+        return loops_are_stable and self.guarded(cascade, parameters)
 
     def guarded(self, cascade: Cascade, parameters: Real, guards: Sequence[Guard] | None = None) -> bool:
-        """Whether 1 + K G winds as it has to for every guard, or for those given."""
-        for number, omega, responses in self._guarded if guards is None else sorted_by_plant(guards):
+        """Whether guards are stable.
+
+        Parameters
+        ----------
+        cascade : Cascade
+        parameters : ndarray, shape (n,)
+        guards : sequence of Guard, optional
+            By default those of the problem.
+
+        Returns
+        -------
+        bool
+            1 + K G winds as often as the integrators and unstable poles of the plant ask, for every guard.
+        """
+        guards_by_plant = self._guards_by_plant if guards is None else sorted_by_plant(guards)
+        for number, omega, responses in guards_by_plant:
             plant = self.plants[number]
             k = self.delayed_response(cascade, parameters, omega)
             stable, wide = winds(
@@ -134,26 +288,26 @@ class Problem(Grids):
                 integrators=plant.n_integrators + int(self.spec.integrator),
                 unstable_poles=plant.unstable_poles,
             )
-            if not np.all(stable & ~wide):  # a wide step is a pole next to the circle, on either side
+            # A wide step is a pole next to the circle, on either side.
+            if not np.all(stable & ~wide):
                 return False
         return True
 
     def closed_loop_poles(self, cascade: Cascade, parameters: Real) -> list[Complex]:
-        """Poles (n,) of every nominal loop; one infinite pole for an algebraic loop."""
+        """Poles (m,) in z of every nominal loop; one infinite pole for an algebraic loop."""
         a, b, c, d = cascade.state_space(parameters)
         return [loop.poles(a, b, c, d) for loop in self._loops]
 
-    def usable(self, cascade: Cascade, parameters: Real) -> bool:
-        """Whether it can be built and every nominal loop and guard is stable; false also where no anti-windup
-        gain exists, which a numerically degenerate controller shows."""
-        try:
-            self.controller(cascade, parameters)
-        except ValueError:
-            return False
-        return self.stable(cascade, parameters)
+    # The controller
 
     def controller(self, cascade: Cascade, parameters: Real) -> Controller:
-        """The controller of a parameter vector."""
+        """Controller of a parameter vector (n,), with the delay and limits of the specification.
+
+        Raises
+        ------
+        ValueError
+            No anti-windup gain exists.
+        """
         a, b, c, d = cascade.state_space(parameters)
         return Controller(
             a,
@@ -166,33 +320,16 @@ class Problem(Grids):
             rate_limit=self.spec.rate_limit,
         )
 
-    def add_violated(self, cascade: Cascade, parameters: Real, gamma_grid: float, most: int = 12) -> int:
-        """Put maxima of the dense check that exceed the grid's gamma on the grids; how many were new."""
-        limit = gamma_grid * (1.0 + EXCHANGE_TOLERANCE)
-        added = 0
-        for position, data in self.checks(cascade, parameters):
-            omega = data.ellipses.omega_rad_s
-            k = cascade.response(parameters, omega)
-            worst = worst_of(data.weighted(k))
-            covered = ~np.isfinite(worst)
-            if np.any(covered):  # those deepest over -1 first
-                depth = 2.0 - np.minimum(scale_to_minus_one(k * data.delay, data.ellipses)[covered], 1.0)
-                worst[covered] = depth * 2.0 * np.max(worst[~covered], initial=limit)
-            added += self._add(position, omega, worst, limit, most)
-        for guard in self.guards:
-            omega = guard.omega_rad_s
-            k = self.delayed_response(cascade, parameters, omega)
-            near = GUARD_MODULUS / np.maximum(np.abs(1.0 + guard.response * k), 1e-300)
-            added += self._add(guard.plant, omega, near, limit, most)
-        return added
+    def delay(self, omega_rad_s: Real) -> Complex:
+        """Computational delay e^{-j omega T n} (F,) at omega (F,), rad/s, of n samples of T."""
+        samples = self.spec.computational_delay_samples
+        return np.asarray(np.exp(-1j * omega_rad_s * self.dt_s * samples), dtype=np.complex128)
 
-    def _add(self, position: int, omega: Real, value: Real, limit: float, most: int) -> int:
-        """Put the largest local maxima above the limit on the grid of one plant; how many were new."""
-        before, after = self.grids[position], with_violations(self.grids[position], omega, value, limit, most)
-        self.grids[position] = after
-        return after.size - before.size
+    def delayed_response(self, cascade: Cascade, parameters: Real, omega_rad_s: Real) -> Complex:
+        """K with its computational delay (F,) at omega (F,), rad/s."""
+        return cascade.response(parameters, omega_rad_s) * self.delay(omega_rad_s)
 
 
 def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real], ...]:
-    """Nothing but a distance from -1 asked for."""
+    """Weights of `Rows` that ask for nothing but a distance of at least `value` from -1: |S| <= 1 / value."""
     return ((LoopFunction.SENSITIVITY, np.full(ellipses.omega_rad_s.size, value)),)

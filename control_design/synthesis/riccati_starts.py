@@ -129,36 +129,36 @@ def weighted_plant(
         a, b, c, d = continuous(plant.ball.Li)
         entering = np.hstack([entering, scaling * plant.ball.Lo])
         on_u = System(
-            scipy.linalg.block_diag(on_u.A, a),
-            np.vstack([on_u.B, b]),
-            scipy.linalg.block_diag(on_u.C, size * c),
-            np.vstack([on_u.D, size * d]),
+            A=scipy.linalg.block_diag(on_u.A, a),
+            B=np.vstack([on_u.B, b]),
+            C=scipy.linalg.block_diag(on_u.C, size * c),
+            D=np.vstack([on_u.D, size * d]),
         )
 
     # Plant, weights on outputs and weights on actuators as one system; zeros by their shapes.
+    A_y, B_y, C_y, D_y = on_y
+    A_u, B_u, C_u, D_u = on_u
     n = A.shape[0]
-    m = on_y.A.shape[0]
-    k = on_u.A.shape[0]
+    m = A_y.shape[0]
+    k = A_u.shape[0]
     n_d = entering.shape[1]
-    z_y = on_y.C.shape[0]
-    z_u = on_u.C.shape[0]
+    z_y = C_y.shape[0]
+    z_u = C_u.shape[0]
     zero = np.zeros
     plant_row = [A, zero((n, m + k))]
-    y_row = [on_y.B @ C, on_y.A, zero((m, k))]
-    u_row = [zero((k, n + m)), on_u.A]
+    y_row = [B_y @ C, A_y, zero((m, k))]
+    u_row = [zero((k, n + m)), A_u]
     dynamics = np.block([plant_row, y_row, u_row])
-    z_y_row = [on_y.D @ C, on_y.C, zero((z_y, k))]
-    z_u_row = [zero((z_u, n + m)), on_u.C]
-    d_to_y = on_y.B @ entering
-    d_to_z_y = on_y.D @ entering
+    z_y_row = [D_y @ C, C_y, zero((z_y, k))]
+    z_u_row = [zero((z_u, n + m)), C_u]
     return WeightedPlant(
         A=dynamics - slowest_rad_s * np.eye(n + m + k),
-        B1=np.vstack([zero((n, n_d)), d_to_y, zero((k, n_d))]),
-        B2=np.vstack([B, on_y.B @ D, on_u.B]),
+        B1=np.vstack([zero((n, n_d)), B_y @ entering, zero((k, n_d))]),
+        B2=np.vstack([B, B_y @ D, B_u]),
         C1=np.block([z_y_row, z_u_row]),
         C2=np.hstack([-C, zero((plant.outputs, m + k))]),
-        D11=np.vstack([d_to_z_y, zero((z_u, n_d))]),
-        D12=np.vstack([on_y.D @ D, on_u.D]),
+        D11=np.vstack([D_y @ entering, zero((z_u, n_d))]),
+        D12=np.vstack([D_y @ D, D_u]),
         D21=-entering,
         D22=-D,
     )
@@ -227,10 +227,10 @@ def controller_below(P: WeightedPlant, gamma: float) -> System | None:
     n_e, n_d = P.D21.shape
     # Rotations of z and d, and changes of u and e, to D12 = [0; I] and D21 = [0 I].
     q, r = np.linalg.qr(P.D12, mode="complete")
-    p, t = np.linalg.qr(P.D21.T, mode="complete")
     turn_z = np.roll(q, -n_u, axis=1)
-    turn_d = np.roll(p, -n_e, axis=1)
     of_u = np.linalg.inv(r[:n_u])
+    p, t = np.linalg.qr(P.D21.T, mode="complete")
+    turn_d = np.roll(p, -n_e, axis=1)
     of_e = np.linalg.inv(t[:n_e].T)
     B = np.hstack([P.B1 @ turn_d, P.B2 @ of_u])
     C = np.vstack([turn_z.T @ P.C1, of_e @ P.C2])
@@ -255,8 +255,8 @@ def controller_below(P: WeightedPlant, gamma: float) -> System | None:
     e_rows = np.hstack([np.zeros((n_e, j)), np.eye(n_e)])
     column = np.vstack([D, e_rows])
     R = row.T @ row
-    T = column @ column.T
     R[:n_d, :n_d] -= gamma**2 * np.eye(n_d)
+    T = column @ column.T
     T[:n_z, :n_z] -= gamma**2 * np.eye(n_z)
     C1 = C[:n_z]
     B1 = B[:, :n_d]
@@ -277,11 +277,15 @@ def controller_below(P: WeightedPlant, gamma: float) -> System | None:
     K12 = np.linalg.cholesky(np.eye(n_u) - D21 @ right @ D21.T)
     K21 = np.linalg.cholesky(np.eye(n_e) - D12.T @ left @ D12).T
     Z = np.linalg.inv(np.eye(P.A.shape[0]) - Y @ X / gamma**2)
-    B2 = Z @ (B[:, n_d:] + L[:, i:n_z]) @ K12
-    C2 = -K21 @ (C[n_z:] + F[j:n_d])
+    L_12 = L[:, i:n_z]
+    L_2 = L[:, n_z:]
+    F_12 = F[j:n_d]
+    F_2 = F[n_d:]
+    B2 = Z @ (B[:, n_d:] + L_12) @ K12
+    C2 = -K21 @ (C[n_z:] + F_12)
     C2_over_K21 = np.linalg.solve(K21, C2)
-    BK = -Z @ L[:, n_z:] + B2 @ np.linalg.solve(K12, K11)
-    CK = F[n_d:] + K11 @ C2_over_K21
+    BK = -Z @ L_2 + B2 @ np.linalg.solve(K12, K11)
+    CK = F_2 + K11 @ C2_over_K21
     AK = P.A + B @ F + BK @ C2_over_K21
     return System(AK, BK @ of_e, of_u @ CK, of_u @ K11 @ of_e)
 
@@ -301,9 +305,11 @@ def _stabilising(A: Real, B: Real, Q: Real, R: Real, S: Real) -> Real | None:
     upper = basis[:n, :n]
     if stable != n or np.linalg.cond(upper) > 1 / np.finfo(float).eps:
         return None
-    X = np.linalg.solve(upper.T, basis[n:, :n].T)
-    X = 0.5 * (X + X.T)
-    is_semidefinite = np.linalg.eigvalsh(X)[0] > -_NEARLY_ZERO * (1.0 + np.max(np.abs(X)))
+    unsymmetric = np.linalg.solve(upper.T, basis[n:, :n].T)
+    X = 0.5 * (unsymmetric + unsymmetric.T)
+    largest_entry = np.max(np.abs(X))
+    smallest_eigenvalue = np.linalg.eigvalsh(X)[0]
+    is_semidefinite = smallest_eigenvalue > -_NEARLY_ZERO * (1.0 + largest_entry)
     return X if is_semidefinite else None
 
 
@@ -337,9 +343,12 @@ def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_
     s = np.asarray(1j * omega, dtype=np.complex128)
 
     # Open-loop responses, frequency first: of P from (d, u) to e and from u to z, of K's states and of K.
-    plant_states = _resolvent(P.A, np.hstack([P.B1, P.B2]), s)
     n_d = P.B1.shape[1]
-    to_e = P.C2 @ plant_states + np.hstack([P.D21, P.D22])
+    B_of_both = np.hstack([P.B1, P.B2])
+    D_of_both = np.hstack([P.D21, P.D22])
+    plant_states = _resolvent(P.A, B_of_both, s)
+    to_e = P.C2 @ plant_states + D_of_both
+    e_of_d = to_e[:, :, :n_d]
     e_of_u = to_e[:, :, n_d:]
     z_of_u = P.C1 @ plant_states[:, :, n_d:] + P.D12
     reached = _resolvent(A, B, s)
@@ -349,7 +358,7 @@ def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_
     # Closed: from d to the states, and from the states to z.
     loop = np.linalg.inv(np.eye(D.shape[1]) - e_of_u @ value)
     around_loop = np.eye(D.shape[0]) + value @ loop @ e_of_u
-    states_of_d = reached @ loop @ to_e[:, :, :n_d]
+    states_of_d = reached @ loop @ e_of_d
     z_of_states = z_of_u @ around_loop @ observed
     reach_power = (states_of_d @ conjugate(states_of_d)).real
     view_power = (conjugate(z_of_states) @ z_of_states).real
@@ -358,10 +367,11 @@ def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_
     reach_root = _root(np.einsum("f,fij->ij", width, reach_power))
     view_root = _root(np.einsum("f,fij->ij", width, view_power))
     left, sizes, right = np.linalg.svd(view_root.T @ reach_root)
-    scale = np.sqrt(np.maximum(sizes[:order], np.finfo(float).tiny))
+    largest = np.maximum(sizes[:order], np.finfo(float).tiny)
+    scale = np.sqrt(largest)
     to_all = reach_root @ right[:order].T / scale
     from_all = (view_root @ left[:, :order] / scale).T
-    return System(from_all @ A @ to_all, from_all @ B, C @ to_all, D)
+    return System(A=from_all @ A @ to_all, B=from_all @ B, C=C @ to_all, D=D)
 
 
 def continuous(system: control.StateSpace) -> System:
@@ -382,7 +392,10 @@ def continuous(system: control.StateSpace) -> System:
     numpy.linalg.LinAlgError
         A pole at z = -1, where s is infinite.
     """
-    A, B, C, D = (np.asarray(getattr(system, name), dtype=np.float64) for name in "ABCD")
+    A = np.asarray(system.A, dtype=np.float64)
+    B = np.asarray(system.B, dtype=np.float64)
+    C = np.asarray(system.C, dtype=np.float64)
+    D = np.asarray(system.D, dtype=np.float64)
     eye = np.eye(A.shape[0])
     inverse = np.linalg.inv(A + eye)
     # Balanced: the same factor on B and C.

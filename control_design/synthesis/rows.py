@@ -103,9 +103,14 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
         n_re, n_im = _polynomial(numerator, far, near)
         d_re, d_im = _polynomial(denominator, far, near)
         square = d_re**2 + d_im**2
-        f_re = (n_re * d_re + n_im * d_im) / square
-        f_im = (n_im * d_re - n_re * d_im) / square
-        k_re, k_im = k_re * f_re - k_im * f_im, k_re * f_im + k_im * f_re
+        product_re = n_re * d_re + n_im * d_im
+        f_re = product_re / square
+        product_im = n_im * d_re - n_re * d_im
+        f_im = product_im / square
+        new_re = k_re * f_re - k_im * f_im
+        new_im = k_re * f_im + k_im * f_re
+        k_re = new_re
+        k_im = new_im
 
     # psi = i log|G| + j log|K| - log|1 + G K z^-d|.
     centre = plant[0:2]
@@ -115,7 +120,9 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
     late_re = k_re * late[0] - k_im * late[1]
     late_im = k_re * late[1] + k_im * late[0]
     g = centre + ca.cos(angle) * major + ca.sin(angle) * minor
-    distance = ca.vertcat(1 + g[0] * late_re - g[1] * late_im, g[0] * late_im + g[1] * late_re)
+    back_re = 1 + g[0] * late_re - g[1] * late_im
+    back_im = g[0] * late_im + g[1] * late_re
+    distance = ca.vertcat(back_re, back_im)
     tiny = np.finfo(np.float64).tiny
     log_g = ca.log(ca.sumsqr(g) + tiny)
     log_k = ca.log(k_re**2 + k_im**2 + tiny)
@@ -124,16 +131,18 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
 
     # psi_xx - psi_xa psi_xa' / psi_aa where the angle is at a maximum, psi_aa < 0; elsewhere psi_xx.
     full = ca.hessian(value, ca.vertcat(x, angle))[0]
-    along = ca.fmin(full[-1, -1], -_NOTHING)
+    psi_aa = full[-1, -1]
+    along = ca.fmin(psi_aa, -_NOTHING)
     across = full[:-1, -1]
-    at_maximum = full[-1, -1] < -_NOTHING
-    bend = full[:-1, :-1] - ca.if_else(at_maximum, 1 / along, 0) * across @ across.T
+    at_maximum = psi_aa < -_NOTHING
+    weight = ca.if_else(at_maximum, 1 / along, 0)
+    bend = full[:-1, :-1] - weight * across @ across.T
+    response = ca.Function("response", [x, p], [k_re, k_im])
     arguments = [x, angle, p, plant]
-    return (
-        ca.Function("response", [x, p], [k_re, k_im]),
-        ca.Function("slope", arguments, [ca.densify(ca.gradient(value, x))]),
-        ca.Function("bend", [*arguments, multiplier], [ca.densify(multiplier * bend)]),
-    )
+    dense_slope = ca.densify(ca.gradient(value, x))
+    slope = ca.Function("slope", arguments, [dense_slope])
+    dense_bend = ca.densify(multiplier * bend)
+    return response, slope, ca.Function("bend", [*arguments, multiplier], [dense_bend])
 
 
 def _polynomial(coefficients: list[Any], far: Any, near: Any) -> tuple[Any, Any]:
@@ -220,10 +229,10 @@ class LoopRows:
         """Put all frequencies into one array (F,), all rows into one (R,), and build their functions."""
         ellipses = [rows.ellipses for rows in plants]
         self._ellipses = _EllipseArrays(
-            np.concatenate([each.centre for each in ellipses]),
-            np.concatenate([each.direction for each in ellipses]),
-            np.concatenate([each.semi_major for each in ellipses]),
-            np.concatenate([each.semi_minor for each in ellipses]),
+            centre=np.concatenate([each.centre for each in ellipses]),
+            direction=np.concatenate([each.direction for each in ellipses]),
+            semi_major=np.concatenate([each.semi_major for each in ellipses]),
+            semi_minor=np.concatenate([each.semi_minor for each in ellipses]),
         )
         self._delay = np.concatenate([rows.delay for rows in plants])
         omega = np.concatenate([each.omega_rad_s for each in ellipses])
@@ -260,7 +269,9 @@ class LoopRows:
         centre, direction, major, minor = self._ellipses
         complex_values = (centre, direction * major, 1j * direction * minor, self._delay)
         real_values = np.concatenate([[each.real, each.imag] for each in complex_values])
-        p = np.stack([v, np.ones(v.size)], axis=1) / np.maximum(v, 1.0)[:, None]
+        far_and_near = np.stack([v, np.ones(v.size)], axis=1)
+        larger = np.maximum(v, 1.0)
+        p = far_and_near / larger[:, None]
         plant_of_rows = np.hstack([real_values.T[self._index], powers_of_rows.T])
         self._fixed = (p[self._index], plant_of_rows)
         response, slope, bend = row_functions(cascade.sections)
@@ -322,9 +333,10 @@ class LoopRows:
             for rows in self._of_plant:
                 worst[:, rows] = _worst_members(k, self._index[rows], *self._ellipses, True)
             angles = worst[0]
-            controller_factor = np.where(self._of_k, np.abs(bare[self._index]), 1.0)
-            sizes = worst[1] * controller_factor
-            self._latest = _Point(x.copy(), k, angles, self._weight + np.log(np.maximum(sizes, _TINY)))
+            k_sizes = np.abs(bare[self._index])
+            sizes = worst[1] * np.where(self._of_k, k_sizes, 1.0)
+            logs = self._weight + np.log(np.maximum(sizes, _TINY))
+            self._latest = _Point(x.copy(), k, angles, logs)
         return self._latest
 
 
@@ -361,7 +373,8 @@ def _worst_members(
         # Best point of the boundary; index -1 is the last one, which is a neighbour of the first.
         top = 0
         for j in range(_BOUNDARY):
-            values[j] = _size(centre[i] + cos[j] * major + sin[j] * minor, k[i], of_plant)
+            member = centre[i] + cos[j] * major + sin[j] * minor
+            values[j] = _size(member, k[i], of_plant)
             if values[j] > values[top]:
                 top = j
         best_value = values[top]

@@ -1,10 +1,20 @@
-"""Structured robust synthesis: from controllers of the Youla bound, else from many starts, the orders below
-the asked one first; and why a controller is no design at all."""
+"""Structured robust synthesis of one loop: the smallest worst case over ellipses, or why there is no design.
+
+`synthesise` searches for one controller of a given order and structure for all plants. It begins at
+controllers of the Youla bound, fitted by the structure (`OrderSearch.quick`); where these do not settle it,
+it begins at many starts, with the orders below the asked one first, because every controller of order n - 2
+is one of order n with a section whose zeros cancel its poles (`_climbed`). For the order "auto"
+`_of_lowest_order` chooses the order first. `synthesise_near` begins at one known controller only.
+
+gamma is the weighted worst case on the dense grid: at most 1 where every requirement is met. `_result`
+writes what was found as a `SynthesisResult`; without a stable design `what_destabilises` names the pole,
+ellipse, guard or resonance on which the nearest controller fails.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -24,22 +34,38 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
-_STILL_BLOCKING = 0.98  # a weighted maximum within 2 % of the worst one blocks the specification too
-_MEANINGLESS = 1e4  # a weighted worst case above it is a loop on the edge of stability, whatever its digits
-_MOST_DAMPING = 0.3  # asked of the controller where data are sparse: wider than that is no resonance
-_EMBEDDINGS = 3  # ways to add a cancelling section to the result of the order below
-_LOWEST_ORDER, _LOWEST_TRACKING = 2, 3  # first rung of the ladder; two states rarely track and damp
+# Share of the worst case from which a weighted maximum blocks the specification, too.
+_STILL_BLOCKING = 0.98
+# Weighted worst case above which a loop stands on the edge of stability: its digits mean nothing.
+_MEANINGLESS = 1e4
+# Largest damping ratio that is asked of the controller where data are sparse: wider than that is no
+# resonance.
+_MOST_DAMPING = 0.3
+# Ways in which a cancelling section is added to the result of the order below: they differ in its corner.
+_EMBEDDINGS = 3
+# Damping ratio of such a section: no resonance.
+_EMBEDDED_DAMPING = 0.8
+# Lowest order of the ladder up to the asked one; with tracking, as two states rarely track and damp.
+_LOWEST_ORDER = 2
+_LOWEST_TRACKING_ORDER = 3
+# Worst case over the Youla bound that the order "auto" may leave.
+_WITHIN = 1.02
+# Two more states that leave more than this share of gamma end the search for "auto".
+_GAINS = 0.99
+# Orders that "auto" tries: the first, and the highest.
+_FIRST_AUTO_ORDER = 5
+_HIGHEST_AUTO_ORDER = 12
+# Frequencies of each plant that are named where an ellipse lies over -1.
+_MOST_PLACES = 5
+# Maxima of one requirement that may block, of each plant.
+_MOST_MAXIMA = 10
+
+# What a controller without a weighted worst case fails on: `BlockingPoint.weight`.
 NOMINAL = "stability of the nominal loop"
 ROBUST = "stability over the ellipse"
 DELAYED = "stability with the extra delay"
 GUARDED = "stability of a sampled response"
 DAMPING = "damping of the controller's own poles"
-
-_WITHIN = 1.02  # of the Youla bound: what the order "auto" may leave
-_GAINS = 0.99  # two more states that leave more than this of gamma end the search for "auto"
-_MIDDLE, _HIGHEST = 5, 12  # orders that "auto" tries: the first, and the last
-
-_PLACES = 5  # named of each plant
 
 
 def synthesise(
@@ -54,102 +80,163 @@ def synthesise(
 ) -> SynthesisResult:
     """Design one controller for all plants: smallest gamma over every ellipse.
 
-    plants : at least one; several loads, operating points or identified models at once.
-    rng : the starts are drawn from it; same generator state, same result.
-    progress : called with (fraction, message).
-    guards : single responses that must be stable as well, whatever the weights say of them.
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+        At least one; several loads, operating points or identified models at once.
+    specification : Specification
+        What is asked, with order and structure of the controller.
+    options : SynthesisOptions, optional
+        Effort of the search.
+    rng : numpy.random.Generator
+        The starts are drawn from it; same generator state, same result.
+    progress : callable, optional
+        Called with (fraction, message).
+    guards : sequence of Guard
+        Single responses that must be stable as well, whatever the weights say of them.
+    thorough : bool
+        Search from many starts where those from the Youla bound do not settle it.
 
-    thorough : search from many starts where those from the Youla bound do not settle it.
+    Returns
+    -------
+    SynthesisResult
+        The better of both searches. Its outcome says whether the specification is met, and whether anything
+        stable was found.
 
-    Raises SpecificationError if specification and plants contradict each other (before optimising), and for
-    the order "auto" where no bound is known. "auto": see `_of_lowest_order`.
+    Raises
+    ------
+    SpecificationError
+        Specification and plants contradict each other (before optimising), or the order is "auto" and no
+        Youla bound is known.
 
+    Notes
+    -----
     Controllers of the Youla bound, fitted by ones of the asked order, are improved first. They mostly end
-    near the bound, or agree: see `OrderSearch.quick`. Otherwise many starts follow. Every controller of order
-    n - 2 is one of order n with a section whose zeros cancel its poles, so these solve the orders n - 2, n -
-    4, ... first, each with its own generator derived from `rng`, and hand their results upwards. The better
-    of both is returned.
+    near the bound, or agree: see `OrderSearch.quick`. Otherwise many starts follow. Orders n - 2, n - 4, ...
+    are solved first, each with its own generator derived from `rng`, and hand their results upwards.
     """
     options = options or SynthesisOptions()
     specification.check_against(plants)
-    asked, specification = specification, _seen_by_the_data(specification, plants)
+    asked = specification
+    specification = _seen_by_the_data(specification, plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
+    seed = int(rng.integers(2**63))
     if specification.controller_order == "auto":
-        found = _of_lowest_order(problem, int(rng.integers(2**63)), tell, thorough=thorough)
-        return replace(found, plants=problem.plants, specification=asked)
-    root = int(rng.integers(2**63))
+        result = _of_lowest_order(problem, seed, tell, thorough=thorough)
+        return replace(result, plants=problem.plants, specification=asked)
+
+    # First search: fits of the Youla bound's controllers.
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
-    ladder = _ladder(specification.sections(), _LOWEST_TRACKING if problem.asks_tracking else _LOWEST_ORDER)
-    reports: list[StartReport] = []
-    grids = list(problem.grids)
-    search = OrderSearch(problem, cascade, np.random.default_rng([root, 0]), part_of(tell, 0, 2))
-    result, settled = search.quick(free_controllers(problem.plants, specification))
-    reports += search.reports
+    first_grids = list(problem.grids)
+    search = OrderSearch(problem, cascade, np.random.default_rng([seed, 0]), part_of(tell, 0, 2))
+    order_result, settled = search.quick(free_controllers(problem.plants, specification))
+    reports = list(search.reports)
+
+    # Second search: many starts, from the lowest order upwards.
     if thorough and not settled:
-        problem.grids[:] = grids  # what the fits violated may be of no concern to other starts
-        climbed = _climbed(problem, ladder, root, result.best, part_of(tell, 1, 2), reports)
-        worse = result.best is None or (climbed.best and climbed.best.gamma <= result.best.gamma)
-        result = climbed if worse else result
-    found = _told(problem, cascade, result, tuple(reports), tell)
-    return replace(found, plants=problem.plants, specification=asked)
+        # What the fits violated may be of no concern to other starts.
+        problem.grids[:] = first_grids
+        lowest = _LOWEST_TRACKING_ORDER if problem.asks_tracking else _LOWEST_ORDER
+        ladder = _ladder(specification.sections(), lowest)
+        climbed = _climbed(problem, ladder, seed, order_result.best, part_of(tell, 1, 2), reports)
+        if _is_better(climbed.best, order_result.best):
+            order_result = climbed
+    result = _result(problem, cascade, order_result, tuple(reports), tell)
+    return replace(result, plants=problem.plants, specification=asked)
+
+
+def _is_better(new: TriedController | None, old: TriedController | None) -> bool:
+    """Whether a new best controller replaces an old one; where there is no old one it does, even by None."""
+    if old is None:
+        return True
+    return new is not None and new.gamma <= old.gamma
+
+
+@dataclass(frozen=True, eq=False)
+class _TriedOrder:
+    """What the fits of one order led to: gamma (inf: nothing stable), the result and its search."""
+
+    gamma: float
+    result: OrderResult
+    search: OrderSearch
 
 
 def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: bool) -> SynthesisResult:
-    """The lowest order within `_WITHIN` of the Youla bound, as far as fits of the bound's controllers tell.
+    """Design of the lowest order within `_WITHIN` of the Youla bound, as far as fits of its controllers tell.
 
-    Orders are tried from a middle one upwards, or downwards where that is enough, each from these fits and
-    from the result of two states fewer: a longer search may reach the bound with one state less. States are
-    added as long as two of them gain, or while a specification is missed that the bound meets. Where none
-    reaches the bound, the lowest order nearly as good as the best one tried. Several plants may have bounds
-    that no common controller reaches; a damping asked of the controller is not part of the bound.
+    root: seed; each order has its own generator. Orders are tried from a middle one upwards, or downwards
+    where that is enough, each from these fits and from the result of two states fewer: a longer search may
+    reach the bound with one state less. States are added as long as two of them gain, or (thorough) while a
+    specification is missed that the bound meets. Where no order reaches the bound, the lowest one nearly as
+    good as the best that was tried. Several plants may have bounds that no common controller reaches; a
+    damping asked of the controller is not part of the bound. Raises SpecificationError where no bound is
+    known.
     """
-    specification, limit = problem.spec, problem.options.sufficient_gamma
+    specification = problem.spec
     tell(0.0, "bound for any order")
     free = free_controllers(problem.plants, specification, YoulaOptions())
     if not free.each:
         raise SpecificationError(
             "controller_order = 'auto' needs the Youla bound, which this plant has not; give a number"
         )
-    enough = max(_WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0, limit)
-    reports = list[StartReport]()
-    found: dict[int, tuple[float, OrderResult, OrderSearch]] = {}
+    near_bound = _WITHIN * free.gamma if np.isfinite(free.gamma) else 0.0
+    enough = max(near_bound, problem.options.sufficient_gamma)
+    reports: list[StartReport] = []
+    tried_orders: dict[int, _TriedOrder] = {}
 
     def gamma(order: int) -> float:
+        """Worst case that fits of one order lead to; the order joins those tried."""
         sections = specification.model_copy(update={"controller_order": order}).sections()
-        cascade, given = Cascade(sections, problem.dt_s, problem.scale_rad_s), list[Real]()
-        part = part_of(tell, len(found), _HIGHEST, f"order {order}: ")
+        cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
+        part = part_of(tell, len(tried_orders), _HIGHEST_AUTO_ORDER, f"order {order}: ")
         part(0.0, "fits of the bound")
-        own = np.random.default_rng([root, order])
-        if order - 2 in found and (lower := found[order - 2][1].best) is not None:
-            given = _embedded(problem, replace(cascade, sections=sections[:-1]), lower, cascade, own)
-        search = OrderSearch(problem, cascade, own, part, given)
+        order_rng = np.random.default_rng([root, order])
+        known_starts: list[Real] = []
+        if order - 2 in tried_orders:
+            lower_best = tried_orders[order - 2].result.best
+            if lower_best is not None:
+                lower = replace(cascade, sections=sections[:-1])
+                known_starts = _embedded(problem, lower, lower_best, cascade, order_rng)
+        search = OrderSearch(problem, cascade, order_rng, part, known_starts)
         result = search.fits_only(free)
         reports.extend(search.reports)
-        found[order] = np.inf if result.best is None else result.best.gamma, result, search
-        return found[order][0]
+        reached = np.inf if result.best is None else result.best.gamma
+        tried_orders[order] = _TriedOrder(reached, result, search)
+        return reached
 
-    def within() -> float:
-        return max(enough, min(value for value, *_ in found.values()) / _GAINS)
+    def acceptable() -> float:
+        """Worst case that the lowest order may have: enough, or nearly the best of those tried."""
+        best = min(attempt.gamma for attempt in tried_orders.values())
+        return max(enough, best / _GAINS)
 
-    order = _MIDDLE
-    while gamma(order) > enough and order + 2 <= _HIGHEST:
-        met = found[order][0] <= 1.0 or free.gamma > 1.0
-        if (met or not thorough) and order > _MIDDLE and found[order][0] > _GAINS * found[order - 2][0]:
+    # Upwards in twos until it is enough, or two more states gain nothing.
+    order = _FIRST_AUTO_ORDER
+    while gamma(order) > enough and order + 2 <= _HIGHEST_AUTO_ORDER:
+        reached = tried_orders[order].gamma
+        met_or_hopeless = reached <= 1.0 or free.gamma > 1.0
+        may_end = met_or_hopeless or not thorough
+        if may_end and order > _FIRST_AUTO_ORDER and reached > _GAINS * tried_orders[order - 2].gamma:
             break
         order += 2
-    if found[order][0] > enough:
-        order = min(number for number, (value, *_) in found.items() if value <= within())
-    while order > 1 and order - 1 not in found and gamma(order - 1) <= within():
+    if tried_orders[order].gamma > enough:
+        limit = acceptable()
+        order = min(number for number, attempt in tried_orders.items() if attempt.gamma <= limit)
+    # Downwards one by one while that is still acceptable.
+    while order > 1 and order - 1 not in tried_orders and gamma(order - 1) <= acceptable():
         order -= 1
-    reached, result, search = found[order]
-    if reached > enough:
+
+    chosen = tried_orders[order]
+    result = chosen.result
+    search = chosen.search
+    if chosen.gamma > enough:
+        # Fits with random weights, and other starts, at the order that was chosen.
         search.reports = []
         again, _ = search.quick(free)
         reports += search.reports
-        if again.best is not None and again.best.gamma < reached:
+        if again.best is not None and again.best.gamma < chosen.gamma:
             result = again
-    return _told(problem, search.cascade, result, tuple(reports), tell)
+    return _result(problem, search.cascade, result, tuple(reports), tell)
 
 
 def synthesise_near(
@@ -161,12 +248,29 @@ def synthesise_near(
     rng: np.random.Generator,
     progress: Progress | None = None,
 ) -> SynthesisResult:
-    """As `synthesise`, from one controller alone: several times faster, and in the valley that it is in.
+    """Design one controller from a known one, in the valley that it is in: several times faster.
 
-    controller : of any order, e.g. for a specification somewhat different; fitted by one of the asked order,
-    or for "auto" of its own.
+    Parameters
+    ----------
+    controller : Controller
+        Of any order, e.g. for a specification somewhat different; fitted by one of the asked order, or for
+        "auto" of its own.
+    plants : sequence of UncertainPlant
+    specification : Specification
+    options : SynthesisOptions, optional
+    rng : numpy.random.Generator
+    progress : callable, optional
+        Called with (fraction, message).
 
-    Raises SpecificationError if specification and plants contradict each other.
+    Returns
+    -------
+    SynthesisResult
+        Without `plants` and `specification`.
+
+    Raises
+    ------
+    SpecificationError
+        Specification and plants contradict each other.
     """
     if specification.controller_order == "auto":
         specification = specification.model_copy(update={"controller_order": max(controller.order, 1)})
@@ -176,23 +280,28 @@ def synthesise_near(
     cascade = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
-    result = OrderSearch(problem, cascade, rng, tell).fits_only(FreeControllers((known,), np.inf))
-    return _told(problem, cascade, result, result.reports, tell)
+    # No bound is known: nothing counts as near to it.
+    free = FreeControllers((known,), np.inf)
+    result = OrderSearch(problem, cascade, rng, tell).fits_only(free)
+    return _result(problem, cascade, result, result.reports, tell)
 
 
-def _told(
+def _result(
     problem: Problem, cascade: Cascade, result: OrderResult, reports: tuple[StartReport, ...], tell: Progress
 ) -> SynthesisResult:
+    """Result of a synthesis for the best controller of a search, or for none.
+
+    Anti-windup gains are chosen so that the nominal loops hold at the limits (`with_safe_limits`).
+    """
     best = result.best
     if best is None or best.gamma >= _MEANINGLESS:
         nearest = result.nearest if best is None else best.parameters
         return _nothing_stable(problem, cascade, nearest, best, reports)
     tell(1.0, f"gamma {best.gamma:.4g}")
+    controller = problem.controller(cascade, best.parameters)
     return SynthesisResult(
         outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
-        controller=with_safe_limits(
-            problem.controller(cascade, best.parameters), lambda law: limited_loops(law, problem.plants)
-        ),
+        controller=with_safe_limits(controller, lambda law: limited_loops(law, problem.plants)),
         gamma=best.gamma,
         blocking=_blocking(problem, cascade, best),
         starts=reports,
@@ -209,29 +318,35 @@ def _climbed(
     tell: Progress,
     reports: list[StartReport],
 ) -> OrderResult:
-    """Result of the last of the ladder's orders, each started from the one before and of its own; the last
-    from the fitted one, too. What was run is added to the reports."""
+    """Result of the last order of a ladder, each order started from the one before and from its own starts.
+
+    root: seed; each order has its own generator. The last order starts from the fitted controller, too. The
+    descents that were run are added to `reports`.
+    """
     result = OrderResult(None, (), ())
-    cascade: Cascade | None = None
+    lower: Cascade | None = None
     for number, sections in enumerate(ladder):
-        lower, cascade = cascade, Cascade(sections, problem.dt_s, problem.scale_rad_s)
-        own = np.random.default_rng([root, cascade.order])
-        given: list[Real] = []
+        cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
+        order_rng = np.random.default_rng([root, cascade.order])
+        known_starts: list[Real] = []
         if lower is not None and result.best is not None:
-            given = _embedded(problem, lower, result.best, cascade, own)
+            known_starts = _embedded(problem, lower, result.best, cascade, order_rng)
         if number == len(ladder) - 1 and fitted is not None:
-            given.append(fitted.parameters)
+            known_starts.append(fitted.parameters)
         part = part_of(tell, number, len(ladder), f"order {cascade.order}: ")
-        result = OrderSearch(problem, cascade, own, part, given).run()
+        result = OrderSearch(problem, cascade, order_rng, part, known_starts).run()
         reports += result.reports
+        lower = cascade
     return result
 
 
 def _embedded(
     problem: Problem, lower: Cascade, best: TriedController, higher: Cascade, rng: np.random.Generator
 ) -> list[Real]:
-    """The best of a lower order with a section more that cancels itself, in several ways."""
-    damping = max(0.8, 1.01 * (problem.spec.controller_damping or 0.0))
+    """Parameters of the best of a lower order with a section more that cancels itself, in several ways."""
+    # Clear of the bound on the controller's damping by 1 %.
+    asked_damping = problem.spec.controller_damping or 0.0
+    damping = max(_EMBEDDED_DAMPING, 1.01 * asked_damping)
     return [
         with_cancelling_section(lower, best.parameters, higher, rng, damping=damping)
         for _ in range(_EMBEDDINGS)
@@ -239,13 +354,17 @@ def _embedded(
 
 
 def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPlant]) -> Specification:
-    """With a least damping of the controller's own poles where some plant is known on its own frequencies
-    only and none is asked: a resonance narrower than their spacing would stand between them, unseen."""
-    own = [plant.own_grid for plant in plants if plant.own_grid is not None]
-    if specification.controller_damping is not None or not own:
+    """Specification with a least damping of the controller's own poles, where some plant needs one.
+
+    A plant that is known on its own frequencies only needs one: a resonance narrower than their spacing would
+    stand between them, unseen. A pair of poles is as wide as 2 zeta of its frequency, so half of the widest
+    relative spacing is asked. A damping that was asked already stays.
+    """
+    own_grids = [plant.own_grid for plant in plants if plant.own_grid is not None]
+    if specification.controller_damping is not None or not own_grids:
         return specification
-    widest = max(float(np.max(np.diff(grid) / grid[1:])) for grid in own)
-    return specification.model_copy(update={"controller_damping": min(widest / 2, _MOST_DAMPING)})
+    widest_spacing = max(float(np.max(np.diff(grid) / grid[1:])) for grid in own_grids)
+    return specification.model_copy(update={"controller_damping": min(widest_spacing / 2, _MOST_DAMPING)})
 
 
 def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[SectionKind, ...]]:
@@ -260,7 +379,23 @@ def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[Sectio
 
 
 def part_of(tell: Progress, number: int, count: int, head: str = "") -> Progress:
-    """Progress of one of `count` equal parts of a whole."""
+    """Progress of one of several equal parts of a whole.
+
+    Parameters
+    ----------
+    tell : Progress
+        Of the whole.
+    number : int
+        Of the part, from 0.
+    count : int
+        Number of parts.
+    head : str
+        Stands before every message.
+
+    Returns
+    -------
+    Progress
+    """
     return lambda fraction, message: tell((number + fraction) / count, head + message)
 
 
@@ -271,9 +406,17 @@ def _nothing_stable(
     edge: TriedController | None,
     reports: tuple[StartReport, ...],
 ) -> SynthesisResult:
-    """No controller, and where the search came nearest to one: which requirement fails there."""
-    delay, name = problem.spec.computational_delay_samples, "none: no stable design found"
-    nothing = Controller.proportional(0.0, problem.dt_s, computational_delay_samples=delay, name=name)
+    """Result without a controller, and with what fails where the search came nearest to one.
+
+    nearest: parameters (n,) of that controller, if any. edge: one that is stable with a worst case so large
+    that it means nothing; its requirements block where nothing else fails.
+    """
+    nothing = Controller.proportional(
+        0.0,
+        problem.dt_s,
+        computational_delay_samples=problem.spec.computational_delay_samples,
+        name="none: no stable design found",
+    )
     points = sum(grid.size for grid in problem.grids)
     blocking = () if nearest is None else what_destabilises(problem, cascade, nearest)
     if not blocking and edge is not None:
@@ -282,65 +425,97 @@ def _nothing_stable(
 
 
 def _blocking(problem: Problem, cascade: Cascade, best: TriedController) -> tuple[BlockingPoint, ...]:
+    """Local maxima of the weighted worst cases within 2 % of gamma, the largest first."""
     points = []
     for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s
         values = data.weighted(cascade.response(best.parameters, omega))
-        points += [
-            BlockingPoint(data.plant.name, name, float(omega[at]), float(values[name][at]))
-            for name in (each.requirement.name for each in data.weightings)
-            for at in local_maxima(values[name])[:10]
-            if values[name][at] >= _STILL_BLOCKING * best.gamma
-        ]
-    return tuple(sorted(points, key=lambda p: -p.value))
+        for weighting in data.weightings:
+            name = weighting.requirement.name
+            for at in local_maxima(values[name])[:_MOST_MAXIMA]:
+                if values[name][at] >= _STILL_BLOCKING * best.gamma:
+                    value = float(values[name][at])
+                    points.append(BlockingPoint(data.plant.name, name, float(omega[at]), value))
+    return tuple(sorted(points, key=lambda point: -point.value))
 
 
 def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> tuple[BlockingPoint, ...]:
-    """Points at which a controller fails before any weight counts, the worst first; empty if none does.
+    """Points at which a controller fails before any weight counts.
 
-    An unstable nominal loop is named by its poles (frequency of ln(z)/dt, the fastest growing first), one
-    that is stable by the frequencies at which an ellipse, or the ellipse behind the delay of the delay
-    margin, lies deepest over -1; a guard by the frequency where it comes nearest to -1; a controller that
-    rings too much by its own least damped pair.
+    Parameters
+    ----------
+    problem : Problem
+    cascade : Cascade
+    parameters : ndarray, shape (n,)
+        Of the controller.
+
+    Returns
+    -------
+    tuple of BlockingPoint
+        The worst first; empty if it does not fail. Unstable nominal loops come first, by their poles
+        (frequency of ln(z)/dt, the fastest growing first), then the frequencies at which an ellipse, or the
+        ellipse behind the delay of the delay margin, lies deepest over -1. Where there are none: guards, by
+        the frequency where each comes nearest to -1; and where there are none: the controller's own least
+        damped pair.
     """
-    found: list[tuple[int, float, BlockingPoint]] = []
-    for plant, z in zip(problem.plants, problem.closed_loop_poles(cascade, parameters), strict=True):
-        for pole in z[(np.abs(z) >= 1.0) & (z.imag >= 0) & np.isfinite(z)]:
+    # Unstable poles, as (-modulus, point), and ellipses over -1, as (scale to reach -1, point).
+    unstable_poles: list[tuple[float, BlockingPoint]] = []
+    poles_of_loops = problem.closed_loop_poles(cascade, parameters)
+    for plant, poles in zip(problem.plants, poles_of_loops, strict=True):
+        outside = np.abs(poles) >= 1.0
+        upper = poles.imag >= 0
+        named = outside & upper & np.isfinite(poles)
+        for pole in poles[named]:
             frequency = float(np.abs(np.log(pole))) / problem.dt_s
-            found.append((0, -float(np.abs(pole)), BlockingPoint(plant.name, NOMINAL, frequency, np.inf)))
+            point = BlockingPoint(plant.name, NOMINAL, frequency, np.inf)
+            unstable_poles.append((-float(np.abs(pole)), point))
+
+    ellipses_over: list[tuple[float, BlockingPoint]] = []
     for _, data in problem.checks(cascade, parameters):
-        name, omega = data.plant.name, data.ellipses.omega_rad_s
+        omega = data.ellipses.omega_rad_s
         k = cascade.response(parameters, omega)
-        late = [(ROBUST, np.ones(omega.size, dtype=np.complex128))]
+        delays = [(ROBUST, np.ones(omega.size, dtype=np.complex128))]
         if problem.spec.delay_margin_s is not None:
-            late.append((DELAYED, np.exp(-1j * omega * problem.spec.delay_margin_s)))
-        for word, delay in late:
+            delays.append((DELAYED, np.exp(-1j * omega * problem.spec.delay_margin_s)))
+        for word, delay in delays:
+            # By this factor an ellipse would have to change to just reach -1: up to 1, it covers it.
             scale = scale_to_minus_one(k * data.delay * delay, data.ellipses)
-            found += [
-                (1, float(scale[at]), BlockingPoint(name, word, float(omega[at]), np.inf))
-                for at in local_maxima(-scale)[:_PLACES]
-                if scale[at] <= 1.0
-            ]
-    points = [point for *_, point in sorted(found, key=lambda entry: entry[:2])]
+            for at in local_maxima(-scale)[:_MOST_PLACES]:
+                if scale[at] <= 1.0:
+                    point = BlockingPoint(data.plant.name, word, float(omega[at]), np.inf)
+                    ellipses_over.append((float(scale[at]), point))
+
+    unstable_poles.sort(key=lambda entry: entry[0])
+    ellipses_over.sort(key=lambda entry: entry[0])
+    points = [point for _, point in [*unstable_poles, *ellipses_over]]
     return tuple(points or _guards(problem, cascade, parameters) or _ringing(problem, cascade, parameters))
 
 
 def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:
+    """Points at which guards that are not stable come nearest to -1, one for each such guard."""
     points = []
     for guard in problem.guards:
-        if not problem.guarded(cascade, parameters, [guard]):
-            omega = guard.omega_rad_s
-            distance = np.abs(1.0 + guard.response * problem.delayed_response(cascade, parameters, omega))
-            at = int(np.argmin(distance))
-            points.append(BlockingPoint(problem.plants[guard.plant].name, GUARDED, float(omega[at]), np.inf))
+        if problem.guarded(cascade, parameters, [guard]):
+            continue
+        omega = guard.omega_rad_s
+        loop = guard.response * problem.delayed_response(cascade, parameters, omega)
+        at = int(np.argmin(np.abs(1.0 + loop)))
+        plant_name = problem.plants[guard.plant].name
+        points.append(BlockingPoint(plant_name, GUARDED, float(omega[at]), np.inf))
     return points
 
 
 def _ringing(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:
+    """The controller's own least damped pair, if it has less damping than is asked; else nothing.
+
+    The value is the damping asked over that of the pair.
+    """
     asked = problem.spec.controller_damping
     least = cascade.least_damping(parameters)
     if asked is None or not least < asked:
         return []
-    corners = [(parameters[at] - 0.5 * parameters[at + 1], at) for at in cascade.pair_positions]
-    corner = float(np.exp(0.5 * parameters[min(corners)[1] + 1])) * cascade.scale_rad_s
+    # Logarithms of a pair's denominator p^2 + e^a p + e^b: damping ratio e^(a - b/2) / 2, corner e^(b/2).
+    dampings = [(parameters[at] - 0.5 * parameters[at + 1], at) for at in cascade.pair_positions]
+    _, least_damped = min(dampings)
+    corner = float(np.exp(0.5 * parameters[least_damped + 1])) * cascade.scale_rad_s
     return [BlockingPoint("controller", DAMPING, corner, asked / least)]

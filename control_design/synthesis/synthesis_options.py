@@ -1,4 +1,8 @@
-"""How hard the synthesis searches."""
+"""How hard a synthesis searches: options of one loop, and of several joints.
+
+Every field says in its description what it sets and, with its default, within which bounds. Larger values
+take more time and may find a lower worst case gamma.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ class SynthesisOptions(GridOptions):
 
 
 class MultivariableOptions(Settings):
-    """The same for several joints."""
+    """Effort of the search for one controller of several joints; the defaults take seconds for two joints."""
 
     starts: int = Field(default=1, ge=1, le=50, description="starts to go down from; the best counts")
     rounds: int = Field(default=40, ge=1, le=100, description="rounds of descent, with exchange")

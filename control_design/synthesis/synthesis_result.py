@@ -1,4 +1,9 @@
-"""What a synthesis returns: the controller, how good it is, and what blocks it."""
+"""What a synthesis returns: the controller, how good it is, and what blocks it.
+
+gamma is the largest weighted worst case over plants, ellipses and frequencies: at most 1 where every
+requirement is met, 1.2 where requirements are exceeded by 20 %. Fields of these classes are written to
+files by name.
+"""
 
 from __future__ import annotations
 
@@ -11,22 +16,37 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from ident.data.shown import NOT_STORED, Shown
 
+# What a descent that found no stable loop reports in place of infinity, which JSON does not know.
+LARGEST_GAMMA = 1e300
+
 
 class Outcome(Enum):
-    """In words: `outcome` of the pages' sentences."""
+    """How a synthesis ended; its words are those of the pages' sentences."""
 
-    MET_ON_GRID = "met on the grid"  # every requirement at every frequency of the dense grid
-    NOT_MET = "not met"  # a stable loop, but some requirement is exceeded
-    NOT_CONVERGED = "not converged"  # no start led to a stable loop; the controller means nothing
+    # Every requirement at every frequency of the dense grid.
+    MET_ON_GRID = "met on the grid"
+    # A stable loop, but some requirement is exceeded.
+    NOT_MET = "not met"
+    # No start led to a stable loop; the controller means nothing.
+    NOT_CONVERGED = "not converged"
 
 
 @dataclass(frozen=True)
 class BlockingPoint:
     """A frequency at which a requirement keeps gamma from getting smaller.
 
-    weight: name of a weighted requirement; without a stable design, one of the words of `synthesis`. value:
-    weighted worst case there, inf where the loop or a member of the ellipse is unstable. joint: index of the
-    joint it lies at, of several.
+    Attributes
+    ----------
+    plant : str
+        Name of the plant, or "controller".
+    weight : str
+        Name of a weighted requirement; without a stable design, one of the words of `synthesis`, such as
+        `NOMINAL`.
+    omega_rad_s : float
+    value : float
+        Weighted worst case there; inf where the loop or a member of the ellipse is unstable.
+    joint : int or None
+        Index of the joint it lies at, of several.
     """
 
     plant: str
@@ -36,15 +56,20 @@ class BlockingPoint:
     joint: int | None = field(default=None, metadata={"since": 2})
 
 
-LARGEST_GAMMA = 1e300
-"""What a descent that found no stable loop reports in place of infinity."""
-
-
 @dataclass(frozen=True)
 class StartReport:
-    """One run of a solver from one start: status, iterations, gamma of its own grid and of the dense grid.
+    """One run of a solver from one start.
 
-    gamma_dense None: unstable, or (status "descent") not checked on the dense grid.
+    Attributes
+    ----------
+    status : str
+        How it ended; "descent" for `MinimaxDescent`.
+    iterations : int
+        Steps that were taken.
+    gamma_grid : float
+        Worst case on its own grid; `LARGEST_GAMMA`: no stable loop.
+    gamma_dense : float or None
+        Worst case on the dense grid; None: unstable, or (status "descent") not checked there.
     """
 
     status: str
@@ -55,18 +80,33 @@ class StartReport:
     @property
     def stable(self) -> bool:
         """Whether it ended in a stable loop; a descent never leaves stability: a finite gamma says it did."""
-        return self.gamma_dense is not None or (self.status == "descent" and self.gamma_grid < LARGEST_GAMMA)
+        is_stable_descent = self.status == "descent" and self.gamma_grid < LARGEST_GAMMA
+        return self.gamma_dense is not None or is_stable_descent
 
 
 @dataclass(frozen=True, repr=False)
 class SynthesisResult(Shown):
-    """Best controller found and how good it is.
+    """Best controller of a synthesis, and how good it is. Certify it with `certificate.certify` before use.
 
-    gamma: largest weighted worst case over plants, ellipses and the dense grid (<= 1: met; 1.2: requirements
-    exceeded by 20 %). blocking: where and which weight, worst first. gamma_history: dense gamma of the best
-    point after the starts and each exchange round. grid_points: final size of the programme's grids. outcome
-    says what gamma means; certify with `certificate.certify` before use. plants, specification: what it is
-    for; not stored.
+    Attributes
+    ----------
+    outcome : Outcome
+        Says what gamma means.
+    controller : Controller
+    gamma : float
+        Largest weighted worst case over plants, ellipses and the dense grid.
+    blocking : tuple of BlockingPoint
+        Where and by which weight gamma is reached, worst first.
+    starts : tuple of StartReport
+        All runs of a solver.
+    gamma_history : tuple of float
+        Dense gamma of the best point after the starts and each exchange round.
+    grid_points : int
+        Final size of the programme's grids.
+    plants : tuple of UncertainPlant
+        What it is for; not stored.
+    specification : Specification or None
+        What it is for; not stored.
     """
 
     outcome: Outcome
@@ -80,6 +120,16 @@ class SynthesisResult(Shown):
     specification: Specification | None = field(default=None, compare=False, metadata=NOT_STORED)
 
     def to_control(self, *, include_delay: bool = False) -> Any:
-        """The controller as `control.StateSpace` without its limits: `K_without_delay`, or with include_delay
-        `K_with_delay`, which the margins are about (`Controller.to_control`)."""
+        """The controller as `control.StateSpace`, without its limits.
+
+        Parameters
+        ----------
+        include_delay : bool
+            With the computational delay: `K_with_delay`, which the margins are about; else `K_without_delay`.
+
+        Returns
+        -------
+        control.StateSpace
+            As `Controller.to_control`.
+        """
         return self.controller.to_control(include_delay=include_delay)

@@ -1,10 +1,17 @@
-"""Starts from the controllers of the Youla bound: of no order, fitted by rational functions of the asked one.
+"""Starts from the controllers of the Youla bound: responses of no order, fitted by ones of the asked order.
 
-The bound's answers K (inscribed discs, ellipses, enclosing discs) are responses on a grid. Vector fitting
-relocates poles until (sum c_i/(p - a_i) + d)/(sum c'_i/(p - a_i) + 1) comes nearest to K, in the Tustin plane
-p of the cascade; the numerator then is linear least squares. Errors are weighted by 1/|K|: a relative change
-of K moves S by -T and K S by S times it. Which frequencies a low order can do without is not known
-beforehand: further starts weigh them at random.
+`free_controllers` solves a small Youla problem for every plant; its answers K (for inscribed discs,
+ellipses and enclosing discs) are responses on a grid. `fitted` approximates such a response by the
+structure of a cascade: vector fitting (Gustavsen and Semlyen, IEEE Transactions on Power Delivery 14, 1999)
+relocates poles until
+
+    (sum c_i / (p - a_i) + d) / (sum c'_i / (p - a_i) + 1)
+
+comes nearest to K, in the Tustin plane p of the cascade; the numerator then is linear least squares. Errors
+are weighted by 1/|K|: a relative change of K moves S by -T and K S by S times it. Which frequencies a low
+order can do without is not known beforehand: further starts weigh them at random.
+
+In shapes: F frequencies, n poles.
 """
 
 from __future__ import annotations
@@ -33,16 +40,38 @@ _SMALL = YoulaOptions(
     exchange_rounds=0,
     dense_points=1000,
 )
-_ACCURACY = 3e-3  # relative, of the small problems: a tenth of the 3 % that the search asks of them
-_RELOCATIONS = 12  # of the poles; the fifth already moves them by less than a per cent
-_SPREAD = 1.5  # standard deviation of the logarithms of random weights, at `_KNOTS` frequencies
-_KNOTS = 8  # over four decades of frequency two a decade: weights bend, and do not jitter
-_HIGHEST = 1e6  # |p| towards Nyquist, where nothing of the fit is left
+# Relative accuracy of the small problems: a tenth of the 3 % that the search asks of them.
+_ACCURACY = 3e-3
+# Relocations of the poles; the fifth already moves them by less than a per cent.
+_RELOCATIONS = 12
+# First poles, in units of the scale: real, over two decades around it.
+_SLOWEST_POLE = 0.1
+_FASTEST_POLE = 10.0
+# Standard deviation of the logarithms of random weights: factors of 4.5 up and down are usual.
+_SPREAD = 1.5
+# Frequencies at which they are drawn; over four decades two a decade: weights bend, and do not jitter.
+_KNOTS = 8
+# |p| towards Nyquist, where nothing of the fit is left.
+_HIGHEST = 1e6
+# Least modulus of a pole, in units of the scale: one at 0 would be an integrator that nobody asked for.
+_LEAST_POLE = 1e-9
+# Singular values below this share of the largest are rounding.
+_ROUNDING = 1e-12
+# No division by zero.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class FreeController:
-    """Response k (F,) at omega (F,) of a controller of no order."""
+    """Response of a controller of no order.
+
+    Attributes
+    ----------
+    omega_rad_s : ndarray, shape (F,)
+        Ascending.
+    k : ndarray, shape (F,)
+        Without the computational delay.
+    """
 
     omega_rad_s: Real
     k: Complex
@@ -50,8 +79,15 @@ class FreeController:
 
 @dataclass(frozen=True, eq=False)
 class FreeControllers:
-    """Of every plant by itself, and the largest of their worst cases over the ellipses (inf: some plant has
-    none)."""
+    """Controllers of the Youla bound of every plant by itself.
+
+    Attributes
+    ----------
+    each : tuple of FreeController
+        Up to three of each plant.
+    gamma : float
+        Largest of their worst cases over the ellipses, one for each plant; inf: some plant has none.
+    """
 
     each: tuple[FreeController, ...]
     gamma: float
@@ -60,103 +96,176 @@ class FreeControllers:
 def free_controllers(
     plants: Sequence[UncertainPlant], specification: Specification, options: YoulaOptions = _SMALL
 ) -> FreeControllers:
-    """Controllers of the Youla bound, on a small basis if not told otherwise, one plant after the other."""
-    found: list[FreeController] = []
+    """Controllers of the Youla bound, one plant after the other.
+
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+    specification : Specification
+    options : YoulaOptions
+        By default a small basis and coarse grids.
+
+    Returns
+    -------
+    FreeControllers
+        Where a plant has no such bound, gamma is inf, and the plants that follow are left out.
+    """
+    controllers: list[FreeController] = []
     gamma = 0.0
     for plant in plants:
         try:
             problem = BracketProblem(plant, specification, options, accuracy=_ACCURACY)
-        except (ValueError, ArithmeticError):  # no factorisation: the bound does not know such a plant
-            return FreeControllers(tuple(found), np.inf)
+        except (ValueError, ArithmeticError):
+            # No factorisation: the bound does not know such a plant.
+            return FreeControllers(tuple(controllers), np.inf)
         answers = problem.answers()
-        found += [FreeController(*problem.controller(x)) for value, x in answers if np.isfinite(value)]
-        gamma = max(gamma, answers[0][0])
-    return FreeControllers(tuple(found), gamma)
+        for value, x in answers:
+            if np.isfinite(value):
+                controllers.append(FreeController(*problem.controller(x)))
+        # The first answer is that over the ellipses.
+        gamma_over_ellipses = answers[0][0]
+        gamma = max(gamma, gamma_over_ellipses)
+    return FreeControllers(tuple(controllers), gamma)
 
 
 def fitted(
     cascade: Cascade, free: FreeController, *, least_damping: float, rng: np.random.Generator | None = None
 ) -> Real | None:
-    """Parameters of the cascade nearest to a free controller; rng: with random weights over frequency.
+    """Parameters of the cascade nearest to a free controller.
 
-    None for structures with notches, whose zeros are not free, or a fit that degenerates.
+    Parameters
+    ----------
+    cascade : Cascade
+        Structure, scale and sampling time of the fit.
+    free : FreeController
+    least_damping : float
+        Damping ratio that no pair of poles goes below.
+    rng : numpy.random.Generator, optional
+        Draws weights over frequency; without it all relative errors count the same.
+
+    Returns
+    -------
+    ndarray, shape (parameters,), or None
+        None for structures with notches, whose zeros are not free, or a fit that degenerates. Poles are
+        stable; the loop need not be.
     """
     if "notch" in cascade.sections:
         return None
-    weight = 1.0 / np.maximum(np.abs(free.k), 1e-300)
-    log = np.log(free.omega_rad_s)
+    weight = 1.0 / np.maximum(np.abs(free.k), _TINY)
+    log_omega = np.log(free.omega_rad_s)
     if rng is not None:
-        knots = np.linspace(log[0], log[-1], _KNOTS)
-        weight = weight * np.exp(np.interp(log, knots, rng.normal(0.0, _SPREAD, _KNOTS)))
+        knots = np.linspace(log_omega[0], log_omega[-1], _KNOTS)
+        log_factors = rng.normal(0.0, _SPREAD, _KNOTS)
+        weight = weight * np.exp(np.interp(log_omega, knots, log_factors))
     p = 1j * tustin_frequency(free.omega_rad_s, cascade.dt_s) / cascade.scale_rad_s
     use = np.abs(p) < _HIGHEST
-    p, k, weight = p[use], free.k[use], weight[use]
+    p = p[use]
+    k = free.k[use]
+    weight = weight[use]
+
+    # An integrator's pole stays at 0, the direct term at infinity; all others are relocated.
     fixed = [1.0 / p] if "integrator" in cascade.sections else []
-    poles = -np.geomspace(0.1, 10.0, cascade.order - len(fixed)).astype(np.complex128)
-    still = np.stack([np.ones_like(p), *fixed], axis=1)
+    unmoved = np.stack([np.ones_like(p), *fixed], axis=1)
+    moving_count = cascade.order - len(fixed)
+    poles = -np.geomspace(_SLOWEST_POLE, _FASTEST_POLE, moving_count).astype(np.complex128)
     try:
         for _ in range(_RELOCATIONS if poles.size else 0):
+            # Numerator - K (denominator - 1) = K: linear in both; the zeros of the denominator become poles.
             functions = _functions(p, poles)
-            columns = np.hstack([functions, still, -k[:, None] * functions]) * weight[:, None]
-            denominator = _least_squares(columns, k * weight)[-poles.size :]
+            unweighted = np.hstack([functions, unmoved, -k[:, None] * functions])
+            coefficients = _least_squares(unweighted * weight[:, None], k * weight)
+            denominator = coefficients[-poles.size :]
             poles = _usable(_zeros(poles, denominator), least_damping)
     except np.linalg.LinAlgError:
         return None
+
+    # With poles that stay: the numerator by least squares, its roots dealt to the sections.
     denominators = _dealt(cascade, poles)
-    whole = np.prod([np.polyval(each, p) for each in denominators], axis=0)
-    powers = np.stack([p**power / whole for power in range(cascade.order, -1, -1)], axis=1)
-    return in_sections(cascade.sections, _least_squares(powers * weight[:, None], k * weight), denominators)
+    whole = np.prod([np.polyval(denominator, p) for denominator in denominators], axis=0)
+    powers = range(cascade.order, -1, -1)
+    columns = np.stack([p**power / whole for power in powers], axis=1)
+    numerator = _least_squares(columns * weight[:, None], k * weight)
+    return in_sections(cascade.sections, numerator, denominators)
 
 
 def _functions(p: Complex, poles: Complex) -> Complex:
-    """Partial fractions (F, n): 1/(p - a) of real poles; of a pair, which stands next to each other, the real
-    and the imaginary combination."""
-    one = 1.0 / (p[:, None] - poles)
-    upper, lower = poles.imag > 0, poles.imag < 0
-    both = one.copy()
-    both[:, upper], both[:, lower] = one[:, upper] + one[:, lower], 1j * (one[:, upper] - one[:, lower])
-    return both
+    """Partial fractions (F, n) of poles (n,) at p (F,), with real coefficients for real responses.
+
+    1/(p - a) of real poles. Of a pair, whose poles stand next to each other, the sum of both fractions, and j
+    times their difference.
+    """
+    fractions = 1.0 / (p[:, None] - poles)
+    upper = poles.imag > 0
+    lower = poles.imag < 0
+    functions = fractions.copy()
+    functions[:, upper] = fractions[:, upper] + fractions[:, lower]
+    functions[:, lower] = 1j * (fractions[:, upper] - fractions[:, lower])
+    return functions
 
 
 def _zeros(poles: Complex, coefficients: Real) -> Complex:
-    """Zeros of 1 + sum of coefficients times `_functions`."""
-    a, b = np.diag(poles.real), np.where(poles.imag > 0, 2.0, np.where(poles.imag < 0, 0.0, 1.0))
-    for at in np.flatnonzero(poles.imag > 0):
-        a[at, at + 1], a[at + 1, at] = poles[at].imag, -poles[at].imag
+    """Zeros (n,) of 1 + sum of coefficients (n,) times `_functions` of poles (n,).
+
+    Eigenvalues of A - b c with A, b of the real realisation of the partial fractions. Raises LinAlgError
+    where they are not finite.
+    """
+    a = np.diag(poles.real)
+    is_upper = poles.imag > 0
+    is_lower = poles.imag < 0
+    b = np.where(is_upper, 2.0, np.where(is_lower, 0.0, 1.0))
+    for upper in np.flatnonzero(is_upper):
+        a[upper, upper + 1] = poles[upper].imag
+        a[upper + 1, upper] = -poles[upper].imag
     return np.asarray(np.linalg.eigvals(a - np.outer(b, coefficients)), dtype=np.complex128)
 
 
 def _usable(roots: Complex, least_damping: float) -> Complex:
-    """In the left half plane, pairs next to each other and damped as asked."""
-    found: list[complex] = []
-    for root in roots[roots.imag >= 0].tolist():
-        size = max(abs(root), 1e-9)
+    """Roots (n,) mirrored into the left half plane, pairs next to each other and damped as asked.
+
+    A pair whose damping would exceed 1 becomes a double real pole.
+    """
+    poles: list[complex] = []
+    upper_or_real = roots.imag >= 0
+    for root in roots[upper_or_real].tolist():
+        size = max(abs(root), _LEAST_POLE)
         zeta = max(abs(root.real) / size, least_damping)
-        if root.imag == 0 or zeta >= 1.0:
-            found += [complex(-size)] * (1 if root.imag == 0 else 2)
+        if root.imag == 0:
+            poles.append(complex(-size))
+        elif zeta >= 1.0:
+            poles += [complex(-size), complex(-size)]
         else:
             pole = size * complex(-zeta, np.sqrt(1.0 - zeta**2))
-            found += [pole, pole.conjugate()]
-    return np.array(found)
+            poles += [pole, pole.conjugate()]
+    return np.array(poles)
 
 
 def _dealt(cascade: Cascade, poles: Complex) -> list[Real]:
-    """Denominators of the sections: pairs to those of second order, and the slowest real poles in twos."""
+    """Denominators of the sections, highest power of p first: poles (n,) dealt to them.
+
+    Pairs go to sections of second order, and where there are fewer pairs, the slowest real poles in twos.
+    """
     pairs = [np.real(np.poly([pole, pole.conjugate()])) for pole in poles if pole.imag > 0]
-    real = sorted(-float(pole.real) for pole in poles if pole.imag == 0)
-    while len(pairs) < sum(kind == "second_order" for kind in cascade.sections):
-        pairs.append(np.poly([-real.pop(0), -real.pop(0)]))
-    return [
-        np.array([1.0, 0.0])
-        if kind == "integrator"
-        else np.array([1.0, real.pop(0)])
-        if kind == "first_order"
-        else pairs.pop(0)
-        for kind in cascade.sections
-    ]
+    corners = sorted(-float(pole.real) for pole in poles if pole.imag == 0)
+    second_order_sections = sum(kind == "second_order" for kind in cascade.sections)
+    while len(pairs) < second_order_sections:
+        pairs.append(np.poly([-corners.pop(0), -corners.pop(0)]))
+    denominators = []
+    for kind in cascade.sections:
+        if kind == "integrator":
+            denominators.append(np.array([1.0, 0.0]))
+        elif kind == "first_order":
+            denominators.append(np.array([1.0, corners.pop(0)]))
+        else:
+            denominators.append(pairs.pop(0))
+    return denominators
 
 
 def _least_squares(columns: Complex, right: Complex) -> Real:
+    """Real coefficients (n,) with which complex columns (F, n) come nearest to the right side (F,).
+
+    Columns are scaled to one size first. Raises LinAlgError where the solution does not converge.
+    """
     rows = real_rows(columns)
-    size = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-    return np.asarray(np.linalg.lstsq(rows / size, real_rows(right), rcond=1e-12)[0] / size)
+    size = np.maximum(np.linalg.norm(rows, axis=0), _TINY)
+    solution = np.linalg.lstsq(rows / size, real_rows(right), rcond=_ROUNDING)[0]
+    return np.asarray(solution / size)

@@ -65,5 +65,5 @@ def test_where_none_is_met_the_lowest_is_designed_for():
 
 @pytest.mark.parametrize("change", [{"bandwidth_rad_s": 0.5}, {"bandwidth_rad_s": None}])
 def test_a_lowest_bandwidth_needs_a_higher_one(change):
-    with pytest.raises(ValueError, match="lowest_bandwidth_rad_s needs a larger bandwidth_rad_s"):
+    with pytest.raises(ValueError, match=r"lowest_bandwidth_rad_s.* bandwidth_rad_s"):
         _asked(**change)

@@ -105,11 +105,11 @@ def test_different_responses_come_first_from_far_apart():
 
 def test_bad_input_is_refused():
     plant = uncertain_lag(0.1, 0.95)
-    with pytest.raises(ValueError, match="at least 1000 are needed"):
+    with pytest.raises(ValueError, match="1000"):
         control_design.synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), draws=500)
-    with pytest.raises(ValueError, match="stable_share must lie in"):
+    with pytest.raises(ValueError, match="stable_share"):
         control_design.synthesise_jointly([plant], _FAST, rng=np.random.default_rng(0), stable_share=1.0)
-    with pytest.raises(ValueError, match="one shape"):
+    with pytest.raises(ValueError, match="shape"):
         control_design.Guard(0, np.array([1.0, 2.0]), np.array([1.0 + 0j]))
     with pytest.raises(ValueError, match="ascending"):
         control_design.Guard(0, np.array([2.0, 1.0]), np.array([1.0 + 0j, 1.0]))
