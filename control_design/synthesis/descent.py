@@ -214,15 +214,13 @@ class MinimaxDescent:
         """
         unit = local.unit
         near = log > np.max(log) - _FAR_BELOW
-        step = minimax_step(
-            log[near],
-            local.slope[near] * unit,
-            local.curvature * np.outer(unit, unit),
-            np.maximum(-box, (self._low - x) / unit),
-            np.minimum(box, (self._high - x) / unit),
-            self._damping_rows * unit,
-            self._damping_limit - self._damping_rows @ x,
-        )
+        slope = local.slope[near] * unit
+        curvature = local.curvature * np.outer(unit, unit)
+        low = np.maximum(-box, (self._low - x) / unit)
+        high = np.minimum(box, (self._high - x) / unit)
+        damping_rows = self._damping_rows * unit
+        damping_room = self._damping_limit - self._damping_rows @ x
+        step = minimax_step(log[near], slope, curvature, low, high, damping_rows, damping_room)
         if step is None:
             return None
         multipliers = np.zeros(log.size)

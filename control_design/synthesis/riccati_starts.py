@@ -107,7 +107,8 @@ def weighted_plant(
     Neglected: a ball that is known on its own frequencies only, and errors of channels.
     """
     A, B, C, D = continuous(plant.delayed(specification.computational_delay_samples))
-    states_at_scale = np.linalg.solve(1j * scale_rad_s * np.eye(A.shape[0]) - A, B)
+    shifted = 1j * scale_rad_s * np.eye(A.shape[0]) - A
+    states_at_scale = np.linalg.solve(shifted, B)
     gains_at_scale = np.linalg.svd(C @ states_at_scale + D, compute_uv=False)
     smallest_gain = float(gains_at_scale[-1])
 
@@ -151,13 +152,16 @@ def weighted_plant(
     dynamics = np.block([plant_row, y_row, u_row])
     z_y_row = [D_y @ C, C_y, zero((z_y, k))]
     z_u_row = [zero((z_u, n + m)), C_u]
+    to_e = [-C, zero((plant.outputs, m + k))]
+    from_d = [zero((n, n_d)), B_y @ entering, zero((k, n_d))]
+    d_to_z = [D_y @ entering, zero((z_u, n_d))]
     return WeightedPlant(
         A=dynamics - slowest_rad_s * np.eye(n + m + k),
-        B1=np.vstack([zero((n, n_d)), B_y @ entering, zero((k, n_d))]),
+        B1=np.vstack(from_d),
         B2=np.vstack([B, B_y @ D, B_u]),
         C1=np.block([z_y_row, z_u_row]),
-        C2=np.hstack([-C, zero((plant.outputs, m + k))]),
-        D11=np.vstack([D_y @ entering, zero((z_u, n_d))]),
+        C2=np.hstack(to_e),
+        D11=np.vstack(d_to_z),
         D12=np.vstack([D_y @ D, D_u]),
         D21=-entering,
         D22=-D,
@@ -408,7 +412,8 @@ def continuous(system: control.StateSpace) -> System:
 
 def _resolvent(A: Real, B: Real, s: Complex) -> Complex:
     """(s I - A)^-1 B (F, n, m) at s (F,), for A (n, n) and B (n, m)."""
-    return np.asarray(np.linalg.solve(s[:, None, None] * np.eye(A.shape[0]) - A, B + 0j))
+    shifted = s[:, None, None] * np.eye(A.shape[0]) - A
+    return np.asarray(np.linalg.solve(shifted, B + 0j))
 
 
 def _root(gramian: Real) -> Real:
@@ -421,6 +426,9 @@ def _diagonal(weights: Sequence[RationalWeight]) -> System:
     """Weights of one channel each, side by side: a system of as many inputs and outputs."""
     import control  # here, because it brings a plotting library with it
 
-    parts = [control.ss(control.tf(list(weight.numerator), list(weight.denominator))) for weight in weights]
+    parts = []
+    for weight in weights:
+        transfer = control.tf(list(weight.numerator), list(weight.denominator))
+        parts.append(control.ss(transfer))
     whole = control.append(*parts)
     return System(whole.A, whole.B, whole.C, whole.D)

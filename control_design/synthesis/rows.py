@@ -153,7 +153,9 @@ def _polynomial(coefficients: list[Any], far: Any, near: Any) -> tuple[Any, Any]
     *highest, linear, constant = coefficients
     if not highest:
         return constant * near, linear * far
-    return constant * near**2 - highest[0] * far**2, linear * near * far
+    real_part = constant * near**2 - highest[0] * far**2
+    imaginary_part = linear * near * far
+    return real_part, imaginary_part
 
 
 class _Mapped:

@@ -448,8 +448,10 @@ class StartMaker:
         ends: list[tuple[Real, float]] = []
         for x in followed:
             # Steps in proportion to the parameters, of which some are logarithms near zero.
-            edge = np.where(np.abs(x) > _NEAR_ZERO, _SIMPLEX_SHARE * np.abs(x), _SIMPLEX_EDGE)
-            end = _simplex(cost, np.vstack([x, x + np.diag(edge)]), _RADIUS_EVALUATIONS * x.size)
+            size = np.abs(x)
+            edge = np.where(size > _NEAR_ZERO, _SIMPLEX_SHARE * size, _SIMPLEX_EDGE)
+            around = np.vstack([x, x + np.diag(edge)])
+            end = _simplex(cost, around, _RADIUS_EVALUATIONS * x.size)
             if np.isfinite(self.score(end)):
                 # On towards what is asked: a simplex steps over valleys that the descent stays in.
                 around = np.vstack([end, end + np.diag(edge)])
@@ -529,7 +531,8 @@ class StartMaker:
                 x += [jitter[0], corner * abs(jitter[1]), np.log(corner)]
             elif kind == "notch":
                 # The numerator's damping is 1: a wide notch at the corner.
-                x += [np.log(2 * damping * corner), np.log(2 * corner), 2 * np.log(corner)]
+                damping_term = np.log(2 * damping * corner)
+                x += [damping_term, np.log(2 * corner), 2 * np.log(corner)]
             else:
                 numerator = np.array([1.0, 2 * damping * corner, corner**2]) * jitter
                 x += [*numerator, np.log(2 * damping * corner), 2 * np.log(corner)]
@@ -697,7 +700,8 @@ def in_sections(
     gain = trimmed[0]
 
     roots = np.roots(trimmed)
-    pairs = [np.real(np.poly([root, np.conj(root)])) for root in roots if root.imag > 0]
+    upper_roots = [root for root in roots if root.imag > 0]
+    pairs = [np.real(np.poly([root, np.conj(root)])) for root in upper_roots]
     real_zeros = sorted((float(root.real) for root in roots if root.imag == 0), key=abs)
     second_order_sections = sum(kind == "second_order" for kind in sections)
     while len(pairs) > second_order_sections:

@@ -129,7 +129,8 @@ def synthesise(
     # First search: fits of the Youla bound's controllers.
     cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
     first_grids = list(problem.grids)
-    search = OrderSearch(problem, cascade, np.random.default_rng([seed, 0]), part_of(tell, 0, 2))
+    fits_rng = np.random.default_rng([seed, 0])
+    search = OrderSearch(problem, cascade, fits_rng, part_of(tell, 0, 2))
     order_result, settled = search.quick(free_controllers(problem.plants, specification))
     reports = list(search.reports)
 
@@ -298,10 +299,12 @@ def _result(
         nearest = result.nearest if best is None else best.parameters
         return _nothing_stable(problem, cascade, nearest, best, reports)
     tell(1.0, f"gamma {best.gamma:.4g}")
+    outcome = Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET
     controller = problem.controller(cascade, best.parameters)
+    controller = with_safe_limits(controller, lambda law: limited_loops(law, problem.plants))
     return SynthesisResult(
-        outcome=Outcome.MET_ON_GRID if best.gamma <= 1.0 else Outcome.NOT_MET,
-        controller=with_safe_limits(controller, lambda law: limited_loops(law, problem.plants)),
+        outcome=outcome,
+        controller=controller,
         gamma=best.gamma,
         blocking=_blocking(problem, cascade, best),
         starts=reports,
@@ -363,7 +366,8 @@ def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPl
     own_grids = [plant.own_grid for plant in plants if plant.own_grid is not None]
     if specification.controller_damping is not None or not own_grids:
         return specification
-    widest_spacing = max(float(np.max(np.diff(grid) / grid[1:])) for grid in own_grids)
+    spacings = [np.diff(grid) / grid[1:] for grid in own_grids]
+    widest_spacing = max(float(np.max(spacing)) for spacing in spacings)
     return specification.model_copy(update={"controller_damping": min(widest_spacing / 2, _MOST_DAMPING)})
 
 

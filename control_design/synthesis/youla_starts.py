@@ -197,9 +197,11 @@ def _functions(p: Complex, poles: Complex) -> Complex:
     fractions = 1.0 / (p[:, None] - poles)
     upper = poles.imag > 0
     lower = poles.imag < 0
+    of_upper = fractions[:, upper]
+    of_lower = fractions[:, lower]
     functions = fractions.copy()
-    functions[:, upper] = fractions[:, upper] + fractions[:, lower]
-    functions[:, lower] = 1j * (fractions[:, upper] - fractions[:, lower])
+    functions[:, upper] = of_upper + of_lower
+    functions[:, lower] = 1j * (of_upper - of_lower)
     return functions
 
 
@@ -244,11 +246,14 @@ def _dealt(cascade: Cascade, poles: Complex) -> list[Real]:
 
     Pairs go to sections of second order, and where there are fewer pairs, the slowest real poles in twos.
     """
-    pairs = [np.real(np.poly([pole, pole.conjugate()])) for pole in poles if pole.imag > 0]
+    upper_poles = [pole for pole in poles if pole.imag > 0]
+    pairs = [np.real(np.poly([pole, pole.conjugate()])) for pole in upper_poles]
     corners = sorted(-float(pole.real) for pole in poles if pole.imag == 0)
     second_order_sections = sum(kind == "second_order" for kind in cascade.sections)
     while len(pairs) < second_order_sections:
-        pairs.append(np.poly([-corners.pop(0), -corners.pop(0)]))
+        slowest = -corners.pop(0)
+        next_slowest = -corners.pop(0)
+        pairs.append(np.poly([slowest, next_slowest]))
     denominators = []
     for kind in cascade.sections:
         if kind == "integrator":
