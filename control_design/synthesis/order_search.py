@@ -11,7 +11,7 @@ descents go on. So two numbers belong to every end: `gamma_grid`, of the lean gr
 one.
 
 The constants below are efforts: larger ones take more time and may find a better valley. "Doubled" says what
-became of the worst cases of five designs (three of random plants, damping of an arm, an arm that integrates).
+became of the worst cases of five designs: two of random plants, two dampings of an arm, one that integrates.
 """
 
 from __future__ import annotations
