@@ -298,8 +298,8 @@ class ModalForm:
         for k in upper:
             distances = np.abs(poles - np.conj(poles[k]))
             pairs.append(np.array([k, np.argmin(distances)]))
-        for k in range(0, len(real), 2):
-            pairs.append(np.array(real[k : k + 2]))
+        for first in range(0, len(real), 2):
+            pairs.append(np.array(real[first : first + 2]))
         log_w, log_zeta, C_blocks, B_blocks = self.spread(1.0, 1.0, 1.0)
         for block, pair in enumerate(pairs):
             both_poles = poles[pair]
