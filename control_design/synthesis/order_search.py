@@ -76,7 +76,8 @@ _TRIAL_STEPS = 10
 _ROUGH_DRAWS = 50
 # Worst case over that of the small Youla problem (`youla_starts`) at which a search may end: near enough.
 _NEAR = 1.03
-# The same where several ends agree before all kinds of starts were tried.
+# Worst case over that of the small Youla problem where several ends agree before all kinds of starts were
+# tried.
 _FAIR = 1.05
 # How far the small problem's worst case lies above that of the default one, at most. A design below both
 # shows that the small problem has ended in a valley of its own, and that its value is no bound.
