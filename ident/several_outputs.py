@@ -1,7 +1,12 @@
-"""Records of several inputs, of one output or several, in, one model with shared poles out.
+"""Identify one model with shared poles from records of several inputs and one or several outputs.
 
-Poles are searched on the joint cost of all outputs, each weighted by its noise; then every mode is given one
-shape (`ident.mode_shapes`) where the records do not refuse it.
+The poles are searched on the sum of the outputs' residual energies, which is the likelihood where the noises
+of the outputs are independent and equally strong. So the outputs are whitened first: multiplied by a matrix W
+that makes the covariance of their noise the unit matrix. W is not known before a fit, so search and estimate
+of the covariance are repeated. At the end each mode gets one shape, a residue of rank one, where a likelihood
+ratio does not refuse it (`ident.mode_shapes`), and the result is written in the outputs' units.
+
+Assumed: the noise is white in time. Its covariance between outputs is estimated.
 """
 
 from __future__ import annotations
@@ -36,15 +41,33 @@ from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import PoleSearch, SearchTrace
 from ident.uncertainty.embedding import NOISE_ROUNDS
 
-# Covariance of whitened residuals, off the unit matrix by less: the weights are right.
-_WHITE = 0.05
-# Level of the test of one shape per mode.
-_LEVEL = 1e-3
-# A residual worth less than this share of its samples is not white.
-_COLOURED = 0.8
+# Rounds of search and noise covariance end when no entry of the covariance of whitened residuals is off the
+# unit matrix by more: weights that are wrong by w make estimates worse by about w^2, here 0.3 %.
+LARGEST_WHITENING_ERROR = 0.05
+# Probability with which modes that have one shape are refused by noise. Halved or doubled, no test of several
+# outputs moves: a wrong shape is refused with a probability far below it.
+SHAPE_REFUSAL_LEVEL = 1e-3
+# A residual worth a smaller share of its samples as independent ones is called coloured. The share of white
+# noise is 1 but for chance; at 0.95 and at 0.4 the tests of several outputs do not move.
+WHITE_SHARE = 0.8
+# Power of a combination of outputs, each of unit length, below which it is zero. Sensors have at least a
+# millionth of their motion as noise, 1e-12 in power; a copied column leaves 1e-16 of rounding.
+SMALLEST_DISTINCT_POWER = 1e-12
+# Where the bar of progress stands when the rounds of search are over; the shapes of the modes follow.
+ROUNDS_END = 0.9
+# Begin and length of every round, as shares of all of them: the first has no poles to start from.
+ROUND_SPANS = ((0.0, 0.7), (0.7, 0.15), (0.85, 0.15))
 
 
-class _Found(NamedTuple):
+class _FittedPoles(NamedTuple):
+    """Poles from one search on whitened records, with free residues.
+
+    search : problem (its `data`), options, bounds and trace of the fit that ended it
+    selection : structures that were tried
+    end : the poles, and the residual sum of squares J
+    verdicts : what the data said about an initial state, where that was left to them
+    """
+
     search: PoleSearch[OutputRegressions]
     selection: OrderSelection
     end: Refined
@@ -61,15 +84,36 @@ def identify_mimo(
 ) -> MimoIdentification:
     """Fit one model with shared poles to all inputs and outputs of all records together.
 
-    records: of equal inputs, outputs and sampling time; each has its own offset and initial state. An input
-    may rest in some records. options: as for `identify`, the same for every channel; with several outputs at
-    most one integrator in a row, for each joint has its own. No relative degree; what you know is not tested.
-    free_shapes: leave every residue free. start: poles at a neighbouring operating point, where the search
-    begins.
+    Parameters
+    ----------
+    records : sequence of Record
+        K records of equal inputs (U), outputs (Y) and sampling time; each has its own offset and initial
+        state. An input may rest in some records.
+    options : IdentOptions, optional
+        As for `identify`, the same for every channel. With several outputs at most one integrator in a row,
+        for each joint has its own. No relative degree. What is stated as known is not tested.
+    free_shapes : bool
+        Leave every residue (Y, U) free, also where one of rank one would do.
+    start : Poles, optional
+        Where the search begins: poles at a neighbouring operating point.
+    progress : callable, optional
+        Called with a share 0 .. 1 and a short message.
 
-    Raises ValueError, one line, if a record cannot be used: an output that stands still or is another one
-    again, inputs that differ between records or are one signal, too few samples for the order. Noise is taken
-    as white in time; its covariance between outputs is estimated and weights them. Deterministic.
+    Returns
+    -------
+    MimoIdentification
+        Model in the outputs' units, how well it fits, and what was tried. Deterministic.
+
+    Raises
+    ------
+    ValueError
+        In one line: an output that stands still or is another one again, inputs that differ between records
+        or are one signal, too few samples for the order, an option that is not available.
+
+    Notes
+    -----
+    Noise is taken as white in time. Its covariance between outputs is estimated from the residuals, divided
+    by the share of measured numbers that are left after the unknowns, and weights the outputs.
     """
     options = options or IdentOptions()
     if options.relative_degree is not None:
@@ -83,32 +127,54 @@ def identify_mimo(
         )
     report = progress or silent
     _refuse_outputs(records, options)
-    white = np.diag(1 / np.std(np.concatenate([record.output for record in records]), axis=0))
-    for turn in range(NOISE_ROUNDS):
-        # Most of the time goes into the first round.
-        begun, part = 0.9 * (0.0, 0.7, 0.85)[turn], 0.9 * (0.7, 0.15, 0.15)[turn]
-        told = partial(lambda begun, part, share, what: report(begun + part * share, what), begun, part)
-        found = _searched(whitened(records, white), options, told, start)
-        data, start = found.search.data, found.end.poles
-        residual = data.residual(found.end.poles).reshape(len(data.each), -1)
-        spare = 1 - data.n_parameters(found.end.poles.order) / data.n_samples
-        covariance = residual @ residual.T / residual.shape[1] / spare
-        refined = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), white))
-        if turn == NOISE_ROUNDS - 1 or np.max(np.abs(covariance - np.eye(len(covariance)))) < _WHITE:
+
+    # Before anything is known about the noise every output counts by how much it moves.
+    output_std = np.std(np.concatenate([record.output for record in records]), axis=0)
+    whitening = np.diag(1 / output_std)
+    for noise_round in range(NOISE_ROUNDS):
+        round_begin, round_length = ROUND_SPANS[noise_round]
+        round_report = _part_of(report, ROUNDS_END * round_begin, ROUNDS_END * round_length)
+        fitted = _searched(whitened(records, whitening), options, round_report, start)
+        data = fitted.search.data
+        start = fitted.end.poles
+
+        # Covariance (Y, Y) of what the whitened outputs leave; the unit matrix where the weights are right.
+        residual = data.residual(start).reshape(len(data.each), -1)
+        share_left = 1 - data.n_parameters(start.order) / data.n_samples
+        covariance = residual @ residual.T / residual.shape[1] / share_left
+        whitening_error = np.max(np.abs(covariance - np.eye(len(covariance))))
+        if noise_round == NOISE_ROUNDS - 1 or whitening_error < LARGEST_WHITENING_ERROR:
             break
-        white = refined
+        # With L L^T the covariance, L^-1 whitens what the last weights left.
+        whitening = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), whitening))
+
     report(0.95, "one shape for every mode")
-    return _described(records, white, found, options, free_shapes=free_shapes)
+    return _identification(records, whitening, fitted, options, free_shapes=free_shapes)
+
+
+def _part_of(report: Progress, begin: float, length: float) -> Progress:
+    """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole."""
+
+    def report_step(share: float, message: str) -> None:
+        report(begin + length * share, message)
+
+    return report_step
 
 
 def _refuse_outputs(records: Sequence[Record], options: IdentOptions) -> None:
-    """What `refuse_unusable` says of each output; and outputs that are one signal."""
+    """Raise ValueError for an output that `refuse_unusable` refuses, or for outputs that are dependent.
+
+    Dependent are outputs of which a combination is zero but for rounding: the same sensor twice, or a column
+    that was computed from others.
+    """
     data = prepare_outputs(records, options.structure())
-    for k, one in enumerate(data.each):
-        refuse_unusable([record.only(k) for record in records], one, least_order(options))
-    rows = np.stack([one.y_clear for one in data.each])
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    if np.linalg.eigvalsh(rows @ rows.T)[0] <= 1e-12:
+    for index, regression in enumerate(data.each):
+        refuse_unusable([record.only(index) for record in records], regression, least_order(options))
+    # Eigenvalues of the correlation of the outputs (Y, Y), offsets taken off.
+    outputs = np.stack([regression.y_clear for regression in data.each])
+    outputs /= np.linalg.norm(outputs, axis=1, keepdims=True)
+    smallest_power = np.linalg.eigvalsh(outputs @ outputs.T)[0]
+    if smallest_power <= SMALLEST_DISTINCT_POWER:
         raise ValueError(
             f"{records[0].label}: the outputs {list(records[0].output_names)} are linearly dependent (the "
             "same sensor twice?); leave out what others tell"
@@ -117,109 +183,170 @@ def _refuse_outputs(records: Sequence[Record], options: IdentOptions) -> None:
 
 def _searched(
     records: Sequence[Record], options: IdentOptions, report: Progress, start: Poles | None
-) -> _Found:
-    """Poles from a search on the records, or a part of long ones; polished on all of them."""
+) -> _FittedPoles:
+    """Poles with free residues from a search on whitened records, or on a part of long ones.
+
+    `start` : poles to begin with; None: a global search. Where a part was searched, the poles are polished on
+    all records. Whether initial states are estimated is left to a likelihood ratio if the options say "auto".
+    """
     part, in_mid_record = thinned(records, options.search_samples)
     structure = options.structure()
-    structure = replace(structure, estimate_initial_state=True) if in_mid_record else structure
+    if in_mid_record:
+        # A stretch from the middle of a record does not begin at rest.
+        structure = replace(structure, estimate_initial_state=True)
     search = PoleSearch(prepare_outputs(part, structure), options)
     selection = OrderSelection(search, report)
-    end = selection.with_real(
-        selection.run(None if start is None else search.descend(start, "other weights"))
-    )
+    first = None if start is None else search.descend(start, "other weights")
+    end = selection.with_real(selection.run(first))
+
+    # Did the records begin in motion? Fit free responses beside the poles, and compare.
     verdicts: tuple[Finding, ...] = ()
     if options.estimate_initial_state == "auto" and not in_mid_record and end.poles.order:
-        free = PoleSearch(prepare_outputs(part, replace(structure, estimate_initial_state=True)), options)
-        other = free.descend(end.poles, "with initial state")
-        # Likelihood ratio, the samples counted that the residual is worth.
-        columns = free.data.n_parameters(end.poles.order) - search.data.n_parameters(end.poles.order)
-        worth = free.colour(other).effective_samples
-        ratio = max(end.rss, 1e-300) / max(other.rss, 1e-300)
-        test = NuisanceTest("initial state", columns, float(worth * np.log(ratio)))
+        structure_in_motion = replace(structure, estimate_initial_state=True)
+        search_in_motion = PoleSearch(prepare_outputs(part, structure_in_motion), options)
+        end_in_motion = search_in_motion.descend(end.poles, "with initial state")
+        test = _initial_state_test(search, end, search_in_motion, end_in_motion)
         verdicts = (test.finding,)
         if test.needed:
-            search, selection = free, OrderSelection(free, report)
-            end = selection.with_real(selection.run(other))
-            structure = free.data.structure
-    if (part is not records and len(part) < len(records)) or in_mid_record:
-        everything = PoleSearch(prepare_outputs(records, structure), options)
-        end = everything.descend(end.poles, "final polish")
-        everything.minima[:0] = search.minima
-        everything.stages[:0] = search.stages
-        search = everything
-    return _Found(search, selection, end, verdicts)
+            # Other poles may be the best ones now, and another number of them.
+            search = search_in_motion
+            selection = OrderSelection(search, report)
+            end = selection.with_real(selection.run(end_in_motion))
+            structure = search.data.structure
+
+    # A single record of which the first stretch was searched is not told from a whole one here: its poles
+    # and coefficients are then those of the stretch.
+    if len(part) < len(records) or in_mid_record:
+        search_on_all = PoleSearch(prepare_outputs(records, structure), options)
+        end = search_on_all.descend(end.poles, "final polish")
+        search_on_all.minima[:0] = search.minima
+        search_on_all.stages[:0] = search.stages
+        search = search_on_all
+    return _FittedPoles(search, selection, end, verdicts)
 
 
-def _described(
-    records: Sequence[Record], white: RealArray, found: _Found, options: IdentOptions, *, free_shapes: bool
+def _initial_state_test(
+    at_rest: PoleSearch[OutputRegressions],
+    end_at_rest: Refined,
+    in_motion: PoleSearch[OutputRegressions],
+    end_in_motion: Refined,
+) -> NuisanceTest:
+    """Likelihood ratio of a fit whose records begin in motion to one whose records begin at rest.
+
+    The statistic is Ne ln(J at rest / J in motion), with Ne the independent samples that the residual of the
+    larger fit is worth; its degrees of freedom are the free responses that the larger fit has more.
+    """
+    order = end_at_rest.poles.order
+    columns = in_motion.data.n_parameters(order) - at_rest.data.n_parameters(order)
+    effective_samples = in_motion.colour(end_in_motion).effective_samples
+    # Data without noise may leave nothing: the smallest double that can be divided by stands for it.
+    ratio = max(end_at_rest.rss, 1e-300) / max(end_in_motion.rss, 1e-300)
+    return NuisanceTest("initial state", columns, float(effective_samples * np.log(ratio)))
+
+
+def _identification(
+    records: Sequence[Record],
+    whitening: RealArray,
+    fitted: _FittedPoles,
+    options: IdentOptions,
+    *,
+    free_shapes: bool,
 ) -> MimoIdentification:
-    """The model in the outputs' units, modes with one shape each where the records let them."""
-    search, data = found.search, found.search.data
-    poles = in_order(found.end.poles, search.fixed)
-    fits = [fit(one, poles) for one in data.each]
-    coefficients = np.stack([one.coefficients for one in fits])
-    direct = np.stack([one.feedthrough for one in fits])
-    residual = np.stack([one.residual for one in fits])
+    """The model and how well it fits, from poles that were fitted to whitened outputs.
+
+    `whitening` W (Y, Y) : takes outputs in their units to those of the fit. Modes get one shape each where
+    `free_shapes` is False and the records do not refuse it. Model, residuals and noise covariance are in the
+    outputs' units; rss and noise_std are those of the whitened outputs.
+    """
+    search = fitted.search
+    data = search.data
+    poles = in_order(fitted.end.poles, search.fixed)
+    linear_fits = [fit(regression, poles) for regression in data.each]
+    coefficients = np.stack([linear.coefficients for linear in linear_fits])
+    direct = np.stack([linear.feedthrough for linear in linear_fits])
+    residual = np.stack([linear.residual for linear in linear_fits])
     rss = float(np.sum(residual**2))
     unknowns = data.n_parameters(poles.order)
-    worth = search.colour(found.end).effective_samples / data.n_samples
-    free, noise_power = rss, rss / (data.n_samples - unknowns)
 
-    def chance(rss: float, saved: int) -> float:
-        return float(chi2.sf(max(rss - free, 0.0) / noise_power * worth, saved))
+    # One shape for each mode: less free numbers, so a larger residual, by no more than chance makes of them.
+    free_rss = rss
+    noise_power = free_rss / (data.n_samples - unknowns)
+    effective_share = search.colour(fitted.end).effective_samples / data.n_samples
 
-    given, refused = (data, poles, coefficients, direct), lambda rss, saved: chance(rss, saved) < _LEVEL
-    shaped = None if free_shapes else one_shape_each(*given, n_fixed=search.fixed.counts, refused=refused)
+    def chance_of(shaped_rss: float, saved_numbers: int) -> float:
+        """Probability that noise alone makes free residues fit so much better."""
+        loss = max(shaped_rss - free_rss, 0.0)
+        return float(chi2.sf(loss / noise_power * effective_share, saved_numbers))
+
+    def refused(shaped_rss: float, saved_numbers: int) -> bool:
+        return chance_of(shaped_rss, saved_numbers) < SHAPE_REFUSAL_LEVEL
+
+    shaped = None
+    if not free_shapes:
+        n_fixed = search.fixed.counts
+        shaped = one_shape_each(data, poles, coefficients, direct, n_fixed=n_fixed, refused=refused)
+    rank_one: tuple[bool, ...] = ()
+    rank_one_chance = 1.0
     if shaped is not None:
-        poles, coefficients, direct = shaped.poles, shaped.coefficients, shaped.direct
-        residual, rss, unknowns = shaped.residual, shaped.rss, unknowns - shaped.saved
-    back = np.linalg.inv(white)
-    coefficients, direct = np.einsum("xy,yub->xub", back, coefficients), back @ direct
+        poles = shaped.poles
+        coefficients = shaped.coefficients
+        direct = shaped.direct
+        residual = shaped.residual
+        rss = shaped.rss
+        unknowns -= shaped.saved
+        rank_one = shaped.rank_one
+        rank_one_chance = chance_of(shaped.rss, shaped.saved)
+
+    # Back to the outputs' units.
+    unwhitening = np.linalg.inv(whitening)
+    coefficients = np.einsum("xy,yub->xub", unwhitening, coefficients)
+    direct = unwhitening @ direct
     model = MimoModel(
         tuple(
             MisoModel(
                 poles=poles,
-                coefficients=coefficients[k],
-                feedthrough=direct[k],
+                coefficients=coefficients[index],
+                feedthrough=direct[index],
                 dt_s=records[0].dt_s,
                 input_names=records[0].input_names,
                 output_name=name,
                 integrators=options.integrators,
                 input_delay_samples=data.structure.input_delay_samples,
             )
-            for k, name in enumerate(records[0].output_names)
+            for index, name in enumerate(records[0].output_names)
         )
     )
-    noise = residual @ residual.T / (residual.shape[1] * (1 - unknowns / data.n_samples))
-    own, segments = back @ residual, data.each[0].segments
-    measured = back @ np.stack([one.y for one in data.each])
-    by_output = np.array(
-        [
-            [
-                100 * (1 - np.linalg.norm(own[k, part]) / np.linalg.norm(y[part] - y[part].mean()))
-                for k, y in enumerate(measured)
-            ]
-            for part in segments
-        ]
-    )
+    share_left = 1 - unknowns / data.n_samples
+    noise_covariance = residual @ residual.T / (residual.shape[1] * share_left)
+    output_residual = unwhitening @ residual
+    segments = data.each[0].segments
+
+    # How much of the motion of each output about its mean is explained, record by record: (K, Y), percent.
+    measured = unwhitening @ np.stack([regression.y for regression in data.each])
+    output_fit_percent = np.empty((len(segments), len(measured)))
+    for record_index, rows in enumerate(segments):
+        for output_index, signal in enumerate(measured):
+            motion = np.linalg.norm(signal[rows] - signal[rows].mean())
+            unexplained = np.linalg.norm(output_residual[output_index, rows])
+            output_fit_percent[record_index, output_index] = 100 * (1 - unexplained / motion)
+
+    linearisation = data.linearise(*poles.writable())
     return MimoIdentification(
         model=model,
-        noise_covariance=back @ noise @ back.T,
-        output_fit_percent=by_output,
-        rank_one=() if shaped is None else shaped.rank_one,
-        rank_one_test=1.0 if shaped is None else chance(shaped.rss, shaped.saved),
+        noise_covariance=unwhitening @ noise_covariance @ unwhitening.T,
+        output_fit_percent=output_fit_percent,
+        rank_one=rank_one,
+        rank_one_test=rank_one_chance,
         structure=data.structure,
         record_names=tuple(record.name for record in records),
-        residuals=tuple(own[:, part].T for part in segments),
-        fit_percent=by_output.mean(axis=1),
+        residuals=tuple(output_residual[:, rows].T for rows in segments),
+        fit_percent=output_fit_percent.mean(axis=1),
         rss=rss,
         noise_std=float(np.sqrt(rss / (data.n_samples - unknowns))),
-        tangent_optimality=free_optimality(
-            data.linearise(*poles.writable()), poles, search.bounds, search.fixed
-        ),
-        order_table=found.selection.table(found.end),
+        tangent_optimality=free_optimality(linearisation, poles, search.bounds, search.fixed),
+        order_table=fitted.selection.table(fitted.end),
         n_fixed=search.fixed.counts,
-        verdicts=found.verdicts,
+        verdicts=fitted.verdicts,
         search=SearchTrace(tuple(search.stages), tuple(search.minima), (), search.evaluations),
         advise=partial(_advice, records, search, model, residual),
     )
@@ -228,12 +355,17 @@ def _described(
 def _advice(
     records: Sequence[Record], search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray
 ) -> list[Finding]:
-    data, found = search.data, pole_warnings(model.outputs[0], search.fixed, search.bounds)
+    """What to look at before trusting the model; `residual` (Y, N) is that of the whitened outputs."""
+    data = search.data
+    findings = pole_warnings(model.outputs[0], search.fixed, search.bounds)
     if model.order:
-        for one, rest in zip(data.each, residual, strict=True):
-            found += explains_nothing(one, model.poles, search.fixed, rest)
-    found += few_samples(data.each[0], model.order) + alike_inputs(records)
-    worth = data.colour(residual.ravel()).effective_samples
-    if worth < _COLOURED * data.n_samples:
-        found.append(finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=worth))
-    return found
+        for regression, output_residual in zip(data.each, residual, strict=True):
+            findings += explains_nothing(regression, model.poles, search.fixed, output_residual)
+    findings += few_samples(data.each[0], model.order)
+    findings += alike_inputs(records)
+    effective_samples = data.colour(residual.ravel()).effective_samples
+    if effective_samples < WHITE_SHARE * data.n_samples:
+        findings.append(
+            finding(FindingKind.COLOURED_RESIDUAL, n_samples=data.n_samples, worth=effective_samples)
+        )
+    return findings
