@@ -1,8 +1,16 @@
-"""One shape for every mode: a residue c b of rank one in place of a free one, where the records let it.
+"""Give every mode of a model of several inputs and outputs one shape, where the records let it.
 
-The likelihood ratio of both fits is chi-squared, with (Y - 1)(U - 1) degrees for a real pole and twice as
-many for a pair. Mode after mode is tried, those nearest to one shape first. Two modes that lie together, or
-an input that acts past the structure, keep a free residue.
+A mode of a structure has one shape: its residue, (Y, U) for Y outputs and U inputs, is a product c b of a
+column c (which outputs move) and a row b (which inputs drive it), a matrix of rank one. Two modes that lie
+together, or an input that acts past the structure, have a residue of higher rank, which stays free here.
+
+`one_shape_each` begins at a fit with free residues and tries one mode after the other, those nearest to one
+shape first. Each trial is refitted by nonlinear least squares (`ModalFit`), with a pole as the logarithm of
+its decay and the logistic number of its angle. The caller refuses a trial by the likelihood ratio of both
+fits, which is chi-squared with (Y - 1)(U - 1) degrees for a real pole and twice as many for a pair.
+
+`ModalFit` also says how uncertain the numbers are and how they change the response, to first order. Assumed:
+poles that differ, and outputs whitened to independent noise of power 1.
 """
 
 from __future__ import annotations
@@ -10,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.fft import next_fast_len
@@ -25,17 +33,45 @@ from ident.data.arrays import ComplexArray, RealArray
 from ident.fit.least_squares import project
 from ident.fit.several_outputs import OutputRegressions
 
-_MOST_EVALUATIONS = 40  # limit of work: it begins at the best free residues, near its end
-# Relative change of the residual's power: a thousandth of a degree of freedom in 10 000 samples.
-_ENOUGH = 1e-7
-_LOG_DECAY = -25.0, 6.0  # of a sample: poles stay inside the circle, and off zero
+# Evaluations of one refit at most: a limit of work. A refit begins at the best free residues, near its end,
+# and takes two or three; of two modes at one place, which have no common shape and are refused, twenty.
+MOST_EVALUATIONS = 40
+# A refit ends when the residual's power, or its numbers, change by a smaller share: a thousandth of a degree
+# of freedom in 10 000 samples, far below what the likelihood ratio decides by.
+LEAST_CHANGE = 1e-7
+# Lowest logarithm of a pole's decay per sample: a time constant of 7e10 samples. It keeps poles inside the
+# unit circle; no pole that records show comes near it.
+LOWEST_LOG_DECAY = -25.0
+# Highest one: a pole of e^-403, which keeps its logarithm finite. Records show none below e^-30 or so.
+HIGHEST_LOG_DECAY = 6.0
+# Singular values of Jacobian columns of one length below this share of the largest are not seen by the data:
+# they get no variance instead of an infinite one. Rounding leaves about 1e-15 of a column.
+SMALLEST_SEEN = 1e-12
+# Smallest double that still can be divided by, in place of a length of zero.
+TINY = 1e-300
+
+# Whether a fit that leaves a residual sum of squares with so many free numbers fewer is refused.
 Refused = Callable[[float, int], bool]
 
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """The fit with one shape per mode where `rank_one` says so: poles, coefficients (Y, U, B), direct terms
-    (Y, U), residual (Y, N), its sum of squares, and how many free numbers the shapes saved."""
+    """A fit in which some modes have one shape.
+
+    Attributes
+    ----------
+    poles : Poles
+    coefficients : ndarray, shape (Y, U, B)
+        Of the basis functions of these poles.
+    direct : ndarray, shape (Y, U)
+    residual : ndarray, shape (Y, N)
+    rss : float
+        Its sum of squares.
+    rank_one : tuple of bool
+        Of each mode: it has one shape.
+    saved : int
+        Free numbers that the shapes saved.
+    """
 
     poles: Poles
     coefficients: RealArray
@@ -46,10 +82,62 @@ class Shaped:
     saved: int
 
 
+class _ModeValue(NamedTuple):
+    """A mode at some values of its free numbers.
+
+    mode : ShapedMode, which says what of it is free
+    pole : real, or the upper one of a pair
+    residue (Y, U)
+    residue_slopes : change of the residue with each of its free numbers, (Y, U) each
+    """
+
+    mode: ShapedMode
+    pole: complex
+    residue: ComplexArray
+    residue_slopes: list[ComplexArray]
+
+    def pole_slopes(self) -> list[complex]:
+        """Change of the pole with the logarithm of its decay, and with the logistic number of its angle."""
+        # With |p| = exp(-exp(x)) the slope is p ln|p|, which is zero at p = 0.
+        with_log_decay = 0j
+        if self.pole:
+            with_log_decay = self.pole * np.log(abs(self.pole))
+        if not self.mode.is_pair:
+            return [with_log_decay]
+        # The angle is pi expit(x): its slope is angle (1 - angle / pi).
+        angle = np.angle(self.pole)
+        with_angle = 1j * self.pole * angle * (1 - angle / np.pi)
+        return [with_log_decay, with_angle]
+
+    def seen(self, rows: RealArray | ComplexArray) -> RealArray:
+        """Real rows (R, N) that complex rows (R, N) of the mode are at the outputs.
+
+        A pair's rows come with those of its conjugate: twice their real part.
+        """
+        if self.mode.is_pair:
+            return 2 * np.real(rows)
+        return np.real(rows)
+
+
 @dataclass(frozen=True, eq=False)
 class ShapedMode:
-    """A pole (the upper one of a pair) and its residue (Y, U); whether it moves, and has a residue of rank
-    one."""
+    """A mode, and what of it a fit may change.
+
+    Its free numbers, in this order: where it moves, the logarithm of its decay per sample and, for a pair,
+    the logistic number of its angle over pi; then those of the residue, for a pair first all real and then
+    all imaginary parts. The residue has either Y U entries, row by row, or as c b the Y of c and the U - 1 of
+    b without its largest, which is one.
+
+    Attributes
+    ----------
+    pole : complex
+        Real, or the upper one of a pair.
+    residue : ndarray, shape (Y, U), complex
+    moves : bool
+        The pole is fitted; False: it was given.
+    rank_one : bool
+        The residue is a product c b.
+    """
 
     pole: complex
     residue: ComplexArray
@@ -58,11 +146,95 @@ class ShapedMode:
 
     @property
     def is_pair(self) -> bool:
+        """Whether the pole stands for itself and its conjugate."""
         return self.pole.imag != 0
 
+    @property
+    def reals_per_number(self) -> int:
+        """Real numbers in a free number of the residue: 2 for a pair."""
+        return 2 if self.is_pair else 1
+
     def saved(self) -> int:
+        """Free real numbers that one shape has fewer than a free residue; 0 where the residue is free."""
+        if not self.rank_one:
+            return 0
         outputs, inputs = self.residue.shape
-        return int((outputs - 1) * (inputs - 1) * (1 + self.is_pair) * self.rank_one)
+        return int((outputs - 1) * (inputs - 1) * self.reals_per_number)
+
+    def n_free(self) -> int:
+        """Free real numbers of the mode."""
+        outputs, inputs = self.residue.shape
+        residue_numbers = outputs + inputs - 1 if self.rank_one else outputs * inputs
+        pole_numbers = 1 if self.moves else 0
+        return int(self.reals_per_number * (residue_numbers + pole_numbers))
+
+    def largest_input(self) -> int:
+        """Index of the input that drives the mode most: its share b of the shape is one."""
+        return int(np.argmax(np.linalg.norm(self.residue, axis=0)))
+
+    def pack(self, input_sizes: RealArray) -> RealArray:
+        """Free numbers (P,) of pole and residue as they are.
+
+        A residue of higher rank than a shape may have is replaced by the nearest one of rank one, where
+        `input_sizes` (U,) weigh the inputs by how strongly they drive the mode.
+        """
+        pole_numbers = []
+        if self.moves:
+            pole_numbers.append(np.log(-np.log(abs(self.pole))))
+            if self.is_pair:
+                pole_numbers.append(logit(np.angle(self.pole) / np.pi))
+        if self.rank_one:
+            # The nearest c b; its scale goes into c, so that the largest of b is one.
+            left, size, right = np.linalg.svd(self.residue * input_sizes)
+            drive = right[0] / input_sizes
+            fixed = self.largest_input()
+            shape = left[:, 0] * size[0] * drive[fixed]
+            numbers = np.concatenate([shape, np.delete(drive / drive[fixed], fixed)])
+        else:
+            numbers = self.residue.ravel()
+        if self.is_pair:
+            return np.concatenate([pole_numbers, numbers.real, numbers.imag])
+        return np.concatenate([pole_numbers, numbers.real])
+
+    def at(self, numbers: RealArray) -> _ModeValue:
+        """Pole, residue and the residue's slopes at free numbers (P,)."""
+        pole = self.pole
+        if self.moves:
+            modulus = np.exp(-np.exp(np.clip(numbers[0], LOWEST_LOG_DECAY, HIGHEST_LOG_DECAY)))
+            if self.is_pair:
+                pole = modulus * np.exp(1j * np.pi * expit(numbers[1]))
+                numbers = numbers[2:]
+            else:
+                pole = complex(np.copysign(modulus, self.pole.real))
+                numbers = numbers[1:]
+        # A complex number has two free ones, along 1 and along j.
+        units: tuple[complex, ...]
+        if self.is_pair:
+            half = numbers.size // 2
+            values = numbers[:half] + 1j * numbers[half:]
+            units = (1.0 + 0j, 1j)
+        else:
+            values = numbers.astype(np.complex128)
+            units = (1.0 + 0j,)
+
+        outputs, inputs = self.residue.shape
+        slopes: list[ComplexArray] = []
+        if not self.rank_one:
+            entries = np.eye(values.size, dtype=np.complex128).reshape(-1, outputs, inputs)
+            for unit in units:
+                slopes += [unit * entry for entry in entries]
+            return _ModeValue(self, complex(pole), values.reshape(outputs, inputs), slopes)
+
+        # d(c b) is dc b + c db.
+        fixed = self.largest_input()
+        shape = values[:outputs]
+        drive = np.insert(values[outputs:], fixed, 1.0)
+        for unit in units:
+            for output_unit in np.eye(outputs):
+                slopes.append(np.asarray(unit * np.outer(output_unit, drive)))
+            for input_unit in np.delete(np.eye(inputs), fixed, axis=0):
+                slopes.append(np.asarray(unit * np.outer(shape, input_unit)))
+        return _ModeValue(self, complex(pole), np.asarray(np.outer(shape, drive)), slopes)
 
 
 def one_shape_each(
@@ -74,11 +246,28 @@ def one_shape_each(
     n_fixed: tuple[int, int],
     refused: Refused,
 ) -> Shaped | None:
-    """Refit with one shape per mode from a fit with free residues, coefficients (Y, U, B), direct (Y, U).
+    """Refit with one shape per mode, from a fit with free residues.
 
-    n_fixed: real poles and pairs that do not move; those at zero stand for integrators. refused(rss, saved):
-    whether a fit that leaves rss with so many numbers fewer is refused. None with one input or output, poles
-    that repeat, or all modes refused.
+    Parameters
+    ----------
+    data : OutputRegressions
+        A regression per output, of the same inputs; outputs whitened to noise of power 1.
+    poles : Poles
+        Of the fit with free residues.
+    coefficients : ndarray, shape (Y, U, B)
+        Of the basis functions of these poles.
+    direct : ndarray, shape (Y, U)
+        Direct terms.
+    n_fixed : tuple of int
+        Real poles and pairs, first of each type, that do not move; those at zero stand for integrators.
+    refused : callable
+        (residual sum of squares, free numbers saved) -> whether such a fit is refused.
+
+    Returns
+    -------
+    Shaped or None
+        None with one input or output, where a residue has one shape anyway; where poles repeat; and where
+        every mode was refused.
     """
     if min(direct.shape) < 2:
         return None
@@ -86,328 +275,438 @@ def one_shape_each(
         modes = modes_of(poles, coefficients, n_fixed)
     except ValueError:
         return None
-    modes = [replace(mode, rank_one=False) for mode in modes]
-    best = ModalFit(data, modes)
-    # By the second singular value of a residue over its first, inputs weighed by how much they drive it.
-    sizes = [np.linalg.svd(mode.residue * best.sizes(mode), compute_uv=False) for mode in modes]
-    for k in np.argsort([one[1] / max(one[0], 1e-300) for one in sizes]):
-        trial = [
-            replace(mode, pole=pole, residue=residue, rank_one=mode.rank_one or at == int(k))
-            for at, (mode, (pole, residue)) in enumerate(zip(best.modes, best.found(), strict=True))
-        ]
-        problem = ModalFit(data, trial)
-        problem.solve()
-        if not refused(problem.rss, sum(mode.saved() for mode in trial)):
-            best = problem
-    return best.shaped(poles) if any(mode.rank_one for mode in best.modes) else None
+    free_modes = [replace(mode, rank_one=False) for mode in modes]
+    best = ModalFit(data, free_modes)
+
+    # How far a residue is from rank one: its second singular value over its first, inputs weighed by how
+    # strongly they drive the mode.
+    remoteness = []
+    for mode in free_modes:
+        singular_values = np.linalg.svd(mode.residue * best.input_sizes(mode), compute_uv=False)
+        remoteness.append(singular_values[1] / max(singular_values[0], TINY))
+    for shaped_index in np.argsort(remoteness):
+        # This mode gets one shape; the others stay as the last accepted fit has them.
+        trial_modes = []
+        for index, value in enumerate(best.values()):
+            rank_one = value.mode.rank_one or index == int(shaped_index)
+            trial_modes.append(replace(value.mode, pole=value.pole, residue=value.residue, rank_one=rank_one))
+        trial = ModalFit(data, trial_modes)
+        trial.solve()
+        if not refused(trial.rss, sum(mode.saved() for mode in trial_modes)):
+            best = trial
+    if not any(mode.rank_one for mode in best.modes):
+        return None
+    return best.shaped(poles)
 
 
 def modes_of(
     poles: Poles, coefficients: RealArray, n_fixed: tuple[int, int], rank_one: Sequence[bool] | None = None
 ) -> list[ShapedMode]:
-    """Modes of coefficients (Y, U, B), those at zero left out; rank_one: of each, default all. Raises
-    ValueError where poles repeat."""
+    """Modes of a model on the basis of some poles.
+
+    Parameters
+    ----------
+    poles : Poles
+    coefficients : ndarray, shape (Y, U, B)
+    n_fixed : tuple of int
+        Real poles and pairs, first of each type, that do not move.
+    rank_one : sequence of bool, optional
+        Of each mode: it has one shape; default: all have.
+
+    Returns
+    -------
+    list of ShapedMode
+        Real poles, then pairs. Those at zero are left out: they stand for integrators.
+
+    Raises
+    ------
+    ValueError
+        Poles repeat, so that they have no residue each.
+    """
     values, columns = residue_columns(poles)
     residues = np.einsum("yub,bm->myu", coefficients, columns)
-    given = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
+    fixed_poles = [*poles.real[: n_fixed[0]], *poles.pairs[: n_fixed[1]]]
+    # The eigenvalues of the basis come in another order than its poles.
     listed = [pole for pole in (*poles.real, *poles.pairs) if pole != 0]
-    return [
-        ShapedMode(complex(pole), residues[int(np.argmin(np.abs(values - pole)))], pole not in given, one)
-        for pole, one in zip(listed, rank_one or [True] * len(listed), strict=True)
-    ]
+    shapes = rank_one or [True] * len(listed)
+    modes = []
+    for pole, has_one_shape in zip(listed, shapes, strict=True):
+        nearest = int(np.argmin(np.abs(values - pole)))
+        modes.append(ShapedMode(complex(pole), residues[nearest], pole not in fixed_poles, has_one_shape))
+    return modes
 
 
 class ModalFit:
-    """Output error over poles, shapes and free residues from modes as given; what is linear is projected
-    out."""
+    """Output error of modes driven by the inputs, and its least squares over their free numbers.
+
+    What is linear and has no shape is projected out: nuisance columns of each record, and for every output a
+    coefficient of each `linear_rows` row (the inputs where there is a direct term, and the inputs one sample
+    later where there are integrators).
+
+    Parameters
+    ----------
+    data : OutputRegressions
+        A regression per output, of the same inputs.
+    modes : sequence of ShapedMode
+        The start.
+
+    Attributes
+    ----------
+    u : ndarray, shape (U, N)
+        Inputs behind delay and integrators, all records one after the other.
+    y : ndarray, shape (Y, N)
+        Outputs of the same rows.
+    linear_rows : ndarray, shape (Q, N)
+    x : ndarray, shape (P,)
+        Free numbers of all modes.
+    residual : ndarray, shape (Y, N)
+    rss : float
+        Its sum of squares.
+    """
 
     def __init__(self, data: OutputRegressions, modes: Sequence[ShapedMode]) -> None:
-        self.data, self.modes = data, modes
         first = data.each[0]
-        self.u, self.segments, self.structure = first.u, first.segments, data.structure
-        self.y = np.stack([one.y for one in data.each])
-        free = [self._filtered(0.0, self.u)] if self.structure.integrators else []
-        free += [self.u] if self.structure.feedthrough else []
-        self.free = np.real(np.concatenate(free)) if free else np.zeros((0, first.n_samples))
-        self._set(np.concatenate([_start(mode, self.sizes(mode)) for mode in self.modes]))
+        self.data = data
+        self.modes = modes
+        self.u = first.u
+        self.segments = first.segments
+        self.structure = data.structure
+        self.y = np.stack([regression.y for regression in data.each])
+        linear_rows: list[RealArray | ComplexArray] = []
+        if self.structure.integrators:
+            linear_rows.append(self._filtered(0.0, self.u))
+        if self.structure.feedthrough:
+            linear_rows.append(self.u)
+        self.linear_rows: RealArray = np.zeros((0, first.n_samples))
+        if linear_rows:
+            self.linear_rows = np.real(np.concatenate(linear_rows))
+        self._set(np.concatenate([mode.pack(self.input_sizes(mode)) for mode in modes]))
 
     def _set(self, x: RealArray) -> None:
+        """Take free numbers (P,), and the residual and Jacobian there."""
+        residual, jacobian = self._linearised(x)
         self.x = x
-        residual, self._jacobian = self._linearised(x)
-        self.residual, self.rss = residual.reshape(self.y.shape), float(residual @ residual)
+        self.residual = residual.reshape(self.y.shape)
+        self.rss = float(residual @ residual)
+        self._jacobian = jacobian
 
     def _filtered(self, pole: complex, rows: RealArray | ComplexArray) -> RealArray | ComplexArray:
-        """Rows (R, N) through 1/(z - pole), record by record from rest."""
-        out = np.empty(rows.shape, dtype=np.complex128 if np.imag(pole) else rows.dtype)
-        for here in self.segments:
-            out[:, here] = lfilter(
-                [0.0, 1.0], [1.0, -pole if np.imag(pole) else -np.real(pole)], rows[:, here]
-            )
-        return out
+        """Rows (R, N) through 1/(z - pole), record by record from rest, (R, N)."""
+        # A real pole leaves real rows real, which is half the work.
+        kind: np.dtype[Any] = rows.dtype
+        denominator: list[complex] = [1.0, -np.real(pole)]
+        if np.imag(pole):
+            kind = np.dtype(np.complex128)
+            denominator = [1.0, -pole]
+        filtered = np.empty(rows.shape, dtype=kind)
+        for record_rows in self.segments:
+            filtered[:, record_rows] = lfilter([0.0, 1.0], denominator, rows[:, record_rows])
+        return filtered
 
     def solve(self) -> None:
-        """Levenberg and Marquardt from where the modes are."""
-        last: list[tuple[RealArray, tuple[RealArray, RealArray]]] = []
+        """Move the free numbers to the least residual, by Levenberg and Marquardt from where they are."""
+        # SciPy asks for the residual and then for the Jacobian at the same numbers: both come from one pass.
+        last: dict[bytes, tuple[RealArray, RealArray]] = {}
 
-        def both(x: RealArray) -> tuple[RealArray, RealArray]:
-            if not (last and np.array_equal(last[-1][0], x)):
-                last[:] = [(x.copy(), self._linearised(x))]
-            return last[-1][1]
+        def linearised(x: RealArray) -> tuple[RealArray, RealArray]:
+            if x.tobytes() not in last:
+                last.clear()
+                last[x.tobytes()] = self._linearised(x)
+            return last[x.tobytes()]
 
-        given: dict[str, Any] = {"method": "lm", "x_scale": "jac", "ftol": _ENOUGH, "xtol": _ENOUGH}
-        given |= {"fun": lambda x: both(x)[0], "jac": lambda x: both(x)[1], "max_nfev": _MOST_EVALUATIONS}
-        self._set(least_squares(x0=self.x, **given).x)
+        def residual_at(x: RealArray) -> RealArray:
+            return linearised(x)[0]
 
-    def sizes(self, mode: ShapedMode) -> RealArray:
-        """How much each input drives a mode, (U,): by that a residue's columns are weighed."""
+        def jacobian_at(x: RealArray) -> RealArray:
+            return linearised(x)[1]
+
+        solution = least_squares(
+            residual_at,
+            self.x,
+            jac=jacobian_at,
+            method="lm",
+            x_scale="jac",
+            ftol=LEAST_CHANGE,
+            xtol=LEAST_CHANGE,
+            max_nfev=MOST_EVALUATIONS,
+        )
+        self._set(solution.x)
+
+    def input_sizes(self, mode: ShapedMode) -> RealArray:
+        """How strongly each input drives a mode, (U,): length of the state that it makes of the input."""
         return np.asarray(np.linalg.norm(self._filtered(mode.pole, self.u), axis=1))
 
     def _linearised(self, x: RealArray, *, linear: bool = True) -> tuple[RealArray, RealArray]:
-        """Residual (Y N,) and its Jacobian (Y N, P), off the nuisances and every output's linear columns."""
-        model, columns, poles = np.zeros_like(self.y), list[RealArray](), list[complex]()
-        for mode, (pole, residue), slopes in self._unpacked(x):
-            poles.append(pole)
-            state = self._filtered(pole, self.u)
-            model += _shown(residue @ state, mode)
-            if mode.moves:
-                again = residue @ self._filtered(pole, state)
-                columns += [_shown(step * again, mode) for step in _pole_steps(mode, pole)]
-            columns += [_shown(slope @ state, mode) for slope in slopes]
+        """Residual (Y N,) and its Jacobian (Y N, P) at free numbers (P,), projected off the nuisances.
+
+        `linear` : off the linear rows of every output, too.
+        """
+        model = np.zeros_like(self.y)
+        columns: list[RealArray] = []
+        poles: list[complex] = []
+        for value in self._values_at(x):
+            poles.append(value.pole)
+            state = self._filtered(value.pole, self.u)
+            model += value.seen(value.residue @ state)
+            if value.mode.moves:
+                # d/dp of 1/(z - p) is 1/(z - p)^2.
+                slope_state = value.residue @ self._filtered(value.pole, state)
+                columns += [value.seen(slope * slope_state) for slope in value.pole_slopes()]
+            columns += [value.seen(slope @ state) for slope in value.residue_slopes]
+        # Residual and columns, output after output, are projected together.
         rows = np.concatenate([(self.y - model)[None], -np.array(columns)]).reshape(-1, self.y.shape[1])
         self._take_out(rows, poles, linear=linear)
         rows = rows.reshape(1 + len(columns), -1)
         return rows[0], rows[1:].T
 
     def _local_q(self, poles: Sequence[complex]) -> RealArray:
-        """Nuisance columns of each record, orthonormal."""
+        """Nuisance columns (Ql, N), orthonormal within each record: polynomials, and free responses of the
+        poles where records may begin in motion."""
         first = self.data.each[0]
         if not self.structure.estimate_initial_state:
             return first.polynomials_q
         real = [pole.real for pole in poles if pole.imag == 0]
+        if self.structure.integrators:
+            # The pole at zero that stands for an integrator moves freely, too.
+            real.insert(0, 0.0)
         pairs = np.array([pole for pole in poles if pole.imag], dtype=np.complex128)
-        local = Poles(np.array([0.0] * bool(self.structure.integrators) + real), pairs)
-        return project(first, NO_POLES, local).local_q
+        return project(first, NO_POLES, Poles(np.array(real), pairs)).local_q
 
     def _take_out(self, rows: RealArray, poles: Sequence[complex], *, linear: bool = True) -> None:
-        """Project rows (R, N) off nuisances and linear columns, in place."""
-        first, local_q = self.data.each[0], self._local_q(poles)
+        """Project rows (R, N) off the nuisances and, with `linear`, off the linear rows, in place."""
+        first = self.data.each[0]
+        local_q = self._local_q(poles)
         first.take_out_local(local_q, rows)
-        if len(self.free) and linear:
-            free = self.free.copy()
-            first.take_out_local(local_q, free)
-            q = np.linalg.qr(free.T)[0]
+        if len(self.linear_rows) and linear:
+            linear_rows = self.linear_rows.copy()
+            first.take_out_local(local_q, linear_rows)
+            q = np.linalg.qr(linear_rows.T)[0]
             rows -= (rows @ q) @ q.T
 
     def covariance_factor(self, noise: Sequence[RealArray] = ()) -> RealArray:
-        """S (P, P'), S S^T the covariance of all free numbers to first order, noise of one: the modes', then
-        of every output the coefficients of the linear columns.
+        """Factor S of the covariance S S^T of all free numbers, to first order.
 
-        noise: A(q) of every output, A(q) e white and e of power 1; without, white. The fit takes it as white:
-        (J^T J)^-1 J^T R J (J^T J)^-1, R that of the noise, at no frequency below white noise of its power:
-        an A(q) does not see how little there is at low ones.
+        Parameters
+        ----------
+        noise : sequence of ndarray, optional
+            Of every output 1, a_1 .. a_p, the weights by lag of A(q): A(q) e is white, where e is the noise
+            of power 1. Default: white noise.
+
+        Returns
+        -------
+        ndarray, shape (P, P')
+            Numbers of the modes, then of every output the coefficients of the linear rows.
+
+        Notes
+        -----
+        The fit takes noise as white: the covariance is (J^T J)^-1 J^T R J (J^T J)^-1, with R that of the
+        noise. R is taken at no frequency below white noise of power 1, for an autoregression does not see
+        how little noise there is at low frequencies.
         """
-        factor, slopes, linear = _inverse_factor(self._jacobian), self._jacobian, self._linear_columns()
-        if len(self.free):
+        slopes = self._jacobian
+        linear = self._linear_columns()
+        factor = _inverse_factor(self._jacobian)
+        if len(self.linear_rows):
+            # The numbers of the modes take the linear coefficients with them, by the regression of their
+            # columns on the linear ones; what is left of the coefficients' errors is independent of them.
             slopes = self._linearised(self.x, linear=False)[1]
-            # The modes' columns off the linear ones: what is left of these is independent of them.
             mixed = np.linalg.lstsq(linear, slopes, rcond=None)[0]
-            own = _inverse_factor(linear)
-            factor = np.block([[factor, np.zeros((len(factor), own.shape[1]))], [mixed @ factor, own]])
+            linear_factor = _inverse_factor(linear)
+            corner = np.zeros((len(factor), linear_factor.shape[1]))
+            factor = np.block([[factor, corner], [mixed @ factor, linear_factor]])
         if all(weights.size == 1 for weights in noise):
             return factor
+
+        # Triangle T with T^T T = J^T R J, J with the linear columns, from spectra of the columns. Records are
+        # padded to twice their length, so that nothing wraps round.
         columns = np.concatenate([-slopes, linear], axis=1).reshape(*self.y.shape, -1)
-        through: RealArray = np.zeros((0, columns.shape[2]))
-        for rows, weights in zip(columns, noise, strict=True):
-            for here in self.segments:
-                size = next_fast_len(2 * (here.stop - here.start), real=True)
-                power = np.maximum(1 / np.abs(np.fft.rfft(weights, size)) ** 2, 1.0) * 2 / size
-                lines = np.fft.rfft(rows[here], size, axis=0) * np.sqrt(power)[:, None]
-                parts = [through, lines.real, lines.imag]
-                through = np.asarray(np.linalg.qr(np.concatenate(parts), mode="r"))
-        return np.asarray(factor @ factor.T @ through.T)
+        triangle: RealArray = np.zeros((0, columns.shape[2]))
+        for output_columns, weights in zip(columns, noise, strict=True):
+            for record_rows in self.segments:
+                size = next_fast_len(2 * (record_rows.stop - record_rows.start), real=True)
+                noise_power = np.maximum(1 / np.abs(np.fft.rfft(weights, size)) ** 2, 1.0)
+                # Half of the lines are computed, and stand for both halves.
+                line_weight = noise_power * 2 / size
+                spectra = np.fft.rfft(output_columns[record_rows], size, axis=0)
+                lines = spectra * np.sqrt(line_weight)[:, None]
+                stacked = np.concatenate([triangle, lines.real, lines.imag])
+                triangle = np.asarray(np.linalg.qr(stacked, mode="r"))
+        return np.asarray(factor @ factor.T @ triangle.T)
 
     def _linear_columns(self) -> RealArray:
-        """Of all outputs, off the nuisances, (Y N, Y Q)."""
-        n_outputs, n_free = self.y.shape[0], len(self.free)
-        columns = np.zeros((n_outputs * n_free, *self.y.shape))
-        for k in range(n_outputs):
-            columns[k * n_free : (k + 1) * n_free, k] = self.free
+        """Linear columns of all outputs, off the nuisances, (Y N, Y Q): output after output."""
+        n_outputs = self.y.shape[0]
+        n_linear = len(self.linear_rows)
+        columns = np.zeros((n_outputs * n_linear, *self.y.shape))
+        for output in range(n_outputs):
+            columns[output * n_linear : (output + 1) * n_linear, output] = self.linear_rows
         rows = columns.reshape(-1, self.y.shape[1])
-        if n_free:
-            self.data.each[0].take_out_local(self._local_q([pole for pole, _ in self.found()]), rows)
-        return rows.reshape(n_outputs * n_free, self.y.size).T
+        if n_linear:
+            poles = [value.pole for value in self.values()]
+            self.data.each[0].take_out_local(self._local_q(poles), rows)
+        return rows.reshape(n_outputs * n_linear, self.y.size).T
 
     def response_columns(self, omega_rad_s: RealArray) -> ComplexArray:
-        """Change of the response with each number of `covariance_factor`, (F, Y, U, P)."""
-        a, b, seen = self._one_input()
+        """Change of the response with each number of `covariance_factor`, (F, Y, U, P).
+
+        `omega_rad_s` (F,) ; without integrators and delay, which stand in front of the modes.
+        """
+        dynamics, drive, seen = self._one_input()
         z = np.exp(1j * np.asarray(omega_rad_s) * self.data.dt_s)
-        states = np.linalg.solve(z[:, None, None] * np.eye(len(a)) - a, b)[..., 0]
-        both = np.concatenate([states, np.ones((z.size, 1))], axis=1)
-        return np.asarray(np.einsum("pyum,fm->fyup", seen, both))
+        states = np.linalg.solve(z[:, None, None] * np.eye(len(dynamics)) - dynamics, drive)[..., 0]
+        states_and_input = np.concatenate([states, np.ones((z.size, 1))], axis=1)
+        return np.asarray(np.einsum("pyum,fm->fyup", seen, states_and_input))
 
     def response_states(self) -> tuple[RealArray, RealArray, RealArray]:
-        """The same as a state space: A (n, n), B (n, U), and C (P, Y, n + U) that takes states and inputs to
-        what each number changes. Every input drives states of its own."""
-        a, b, seen = self._one_input()
-        eye, size = np.eye(self.u.shape[0]), len(a)
-        rows = [seen[..., :size].reshape(*seen.shape[:2], -1), seen[..., size]]
-        return np.asarray(np.kron(eye, a)), np.asarray(np.kron(eye, b)), np.concatenate(rows, axis=2)
+        """State space of what `response_columns` gives at frequencies: A (n, n), B (n, U), C (P, Y, n + U).
+
+        C takes states and inputs to what each number of `covariance_factor` changes. Every input drives
+        states of its own.
+        """
+        dynamics, drive, seen = self._one_input()
+        size = len(dynamics)
+        each_input = np.eye(self.u.shape[0])
+        from_states = seen[..., :size].reshape(*seen.shape[:2], -1)
+        from_inputs = seen[..., size]
+        return (
+            np.asarray(np.kron(each_input, dynamics)),
+            np.asarray(np.kron(each_input, drive)),
+            np.concatenate([from_states, from_inputs], axis=2),
+        )
 
     def _one_input(self) -> tuple[RealArray, RealArray, RealArray]:
-        """State space of what one input drives, A (m, m), B (m, 1), and (P, Y, U, m + 1): what each number
-        of `covariance_factor` changes, seen from the states and the input itself. Inputs as they drive the
-        modes, without integrator and delay."""
-        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
-        blocks, drive = [np.zeros((1, 1))], [1.0]  # one sample later, for the integrators' columns
-        seen: list[
-            tuple[int, ComplexArray, bool]
-        ] = []  # first state, change (Y, U), whether it has a conjugate
-        for mode, (pole, residue), slopes in self._unpacked(self.x):
-            turn = np.array([[0.0, -pole.imag], [pole.imag, 0.0]]) if mode.is_pair else np.zeros((1, 1))
-            own, size, at = pole.real * np.eye(len(turn)) + turn, len(turn), len(drive)
-            blocks.append(np.block([[own, np.zeros_like(own)], [np.eye(size), own]]))
+        """State space of what one input drives, and what each number of `covariance_factor` changes.
+
+        A (m, m), B (m, 1), and (P, Y, U, m + 1): the change of each output for each input, seen from the m
+        states of that input and the input itself. Inputs as they drive the modes, behind integrators and
+        delay. A mode has a state (two for a pair: real and imaginary part) and as many again for 1/(z - p)^2.
+        """
+        n_outputs = self.y.shape[0]
+        n_inputs = self.u.shape[0]
+
+        # The first state is the input one sample later, for the columns that stand for integrators.
+        blocks = [np.zeros((1, 1))]
+        drive = [1.0]
+        changes: list[_ResponseChange] = []
+        for value in self._values_at(self.x):
+            is_pair = value.mode.is_pair
+            turn = np.zeros((1, 1))
+            if is_pair:
+                turn = np.array([[0.0, -value.pole.imag], [value.pole.imag, 0.0]])
+            size = len(turn)
+            dynamics = value.pole.real * np.eye(size) + turn
+            blocks.append(np.block([[dynamics, np.zeros_like(dynamics)], [np.eye(size), dynamics]]))
+            first_state = len(drive)
             drive += [1.0] + [0.0] * (2 * size - 1)
-            if mode.moves:
-                seen += [(at + size, step * residue, mode.is_pair) for step in _pole_steps(mode, pole)]
-            seen += [(at, slope, mode.is_pair) for slope in slopes]
-        at, columns = len(drive), []
-        for state, change, is_pair in seen:
-            column = np.zeros((n_outputs, n_inputs, at + 1))
-            column[:, :, state] = change.real
-            if is_pair:  # twice the real part of change times the complex state
-                column[:, :, state : state + 2] = 2 * np.stack([change.real, -change.imag], axis=-1)
+            if value.mode.moves:
+                for slope in value.pole_slopes():
+                    changes.append(_ResponseChange(first_state + size, slope * value.residue, is_pair))
+            for residue_slope in value.residue_slopes:
+                changes.append(_ResponseChange(first_state, residue_slope, is_pair))
+
+        # What each free number of the modes changes.
+        n_states = len(drive)
+        columns = []
+        for change in changes:
+            column = np.zeros((n_outputs, n_inputs, n_states + 1))
+            column[:, :, change.state] = change.residue.real
+            if change.is_pair:
+                # Twice the real part of the change times the complex state.
+                parts = np.stack([change.residue.real, -change.residue.imag], axis=-1)
+                column[:, :, change.state : change.state + 2] = 2 * parts
             columns.append(column)
-        parts = [0] if self.structure.integrators else []
-        parts += [at] if self.structure.feedthrough else []
-        for k, part, j in product(range(n_outputs), parts, range(n_inputs)):
-            column = np.zeros((n_outputs, n_inputs, at + 1))
-            column[k, j, part] = 1.0
+        # Every coefficient of a linear row: from one input to one output.
+        linear_states = []
+        if self.structure.integrators:
+            linear_states.append(0)
+        if self.structure.feedthrough:
+            linear_states.append(n_states)
+        for output, state, input_ in product(range(n_outputs), linear_states, range(n_inputs)):
+            column = np.zeros((n_outputs, n_inputs, n_states + 1))
+            column[output, input_, state] = 1.0
             columns.append(column)
         return np.asarray(block_diag(*blocks)), np.array(drive)[:, None], np.array(columns)
 
-    def _unpacked(
-        self, x: RealArray
-    ) -> Iterator[tuple[ShapedMode, tuple[complex, ComplexArray], list[ComplexArray]]]:
-        parts = np.split(x, np.cumsum([_count(mode) for mode in self.modes])[:-1])
-        for mode, part in zip(self.modes, parts, strict=True):
-            pole, residue, slopes = _unpacked(mode, part)
-            yield mode, (pole, residue), slopes
+    def _values_at(self, x: RealArray) -> Iterator[_ModeValue]:
+        """Every mode at free numbers (P,) of all of them."""
+        ends = np.cumsum([mode.n_free() for mode in self.modes])
+        for mode, numbers in zip(self.modes, np.split(x, ends[:-1]), strict=True):
+            yield mode.at(numbers)
 
-    def found(self) -> list[tuple[complex, ComplexArray]]:
-        """Pole and residue (Y, U) of every mode."""
-        return [both for _, both, _ in self._unpacked(self.x)]
+    def values(self) -> list[_ModeValue]:
+        """Every mode as it is now: pole and residue (Y, U)."""
+        return list(self._values_at(self.x))
 
     def shaped(self, before: Poles) -> Shaped:
-        """Coefficients on the basis of the poles as they are now."""
-        found = self.found()
-        zeros = np.zeros(int(np.sum(before.real == 0)))
-        real = [(pole, residue) for pole, residue in found if pole.imag == 0]
-        pairs = [(pole, residue) for pole, residue in found if pole.imag != 0]
-        poles = Poles(
-            np.concatenate([zeros, [pole.real for pole, _ in real]]),
-            np.array([pole for pole, _ in pairs], complex),
-        )
-        values, columns = residue_columns(poles)
-        explained = np.zeros_like(self.y)
-        for mode, (pole, residue) in zip(self.modes, found, strict=True):
-            explained += _shown(residue @ self._filtered(pole, self.u), mode)
-        linear = self._free_coefficients(self.y - explained, [pole for pole, _ in found])
-        n_outputs, n_inputs = self.y.shape[0], self.u.shape[0]
-        parts = linear.reshape(n_outputs, -1, n_inputs)
-        rho = np.zeros((poles.order, n_outputs, n_inputs), dtype=np.complex128)
-        for pole, residue in found:
-            rho[int(np.argmin(np.abs(values - pole)))] = residue
-            if pole.imag:
-                rho[int(np.argmin(np.abs(values - pole.conjugate())))] = residue.conj()
-        if zeros.size:
-            rho[int(np.argmin(np.abs(values)))] = parts[:, 0]
-        direct = parts[:, -1] if self.structure.feedthrough else np.zeros((n_outputs, n_inputs))
-        coefficients = np.real(np.einsum("bm,myu->yub", np.linalg.inv(columns.T), rho))
-        return Shaped(
-            poles, coefficients, direct, self.residual, self.rss,
-            tuple(mode.rank_one for mode in self.modes), sum(mode.saved() for mode in self.modes),
-        )  # fmt: skip
+        """The fit as coefficients on the basis of the poles as they are now.
 
-    def _free_coefficients(self, rest: RealArray, poles: list[complex]) -> RealArray:
-        """Least squares of what the modes leave (Y, N) on the free columns, nuisances beside them: (Y, Q)."""
-        if not len(self.free):
-            return np.zeros((len(rest), 0))
-        both = np.concatenate([rest, self.free])
-        self.data.each[0].take_out_local(self._local_q(poles), both)
-        return np.asarray(np.linalg.lstsq(both[len(rest) :].T, both[: len(rest)].T, rcond=None)[0].T)
+        `before` : poles of the fit with free residues; those at zero, which stand for integrators, are taken
+        over as they are.
+        """
+        values = self.values()
+        integrator_poles = np.zeros(int(np.sum(before.real == 0)))
+        real = [value.pole.real for value in values if value.pole.imag == 0]
+        pairs = [value.pole for value in values if value.pole.imag != 0]
+        poles = Poles(np.concatenate([integrator_poles, real]), np.array(pairs, complex))
+
+        # Coefficients (Y, Q) of the linear rows: of each output those of the integrators, then direct terms.
+        explained = np.zeros_like(self.y)
+        for value in values:
+            explained += value.seen(value.residue @ self._filtered(value.pole, self.u))
+        linear = self._linear_coefficients(self.y - explained, [value.pole for value in values])
+        n_outputs = self.y.shape[0]
+        n_inputs = self.u.shape[0]
+        linear_parts = linear.reshape(n_outputs, -1, n_inputs)
+        direct = np.zeros((n_outputs, n_inputs))
+        if self.structure.feedthrough:
+            direct = linear_parts[:, -1]
+
+        # Residues of all poles (B, Y, U), in the order in which the basis has them.
+        basis_poles, columns = residue_columns(poles)
+        residues = np.zeros((poles.order, n_outputs, n_inputs), dtype=np.complex128)
+        for value in values:
+            residues[int(np.argmin(np.abs(basis_poles - value.pole)))] = value.residue
+            if value.pole.imag:
+                conjugate = int(np.argmin(np.abs(basis_poles - value.pole.conjugate())))
+                residues[conjugate] = value.residue.conj()
+        if integrator_poles.size:
+            residues[int(np.argmin(np.abs(basis_poles)))] = linear_parts[:, 0]
+        coefficients = np.real(np.einsum("bm,myu->yub", np.linalg.inv(columns.T), residues))
+        return Shaped(
+            poles,
+            coefficients,
+            direct,
+            self.residual,
+            self.rss,
+            rank_one=tuple(mode.rank_one for mode in self.modes),
+            saved=sum(mode.saved() for mode in self.modes),
+        )
+
+    def _linear_coefficients(self, unexplained: RealArray, poles: list[complex]) -> RealArray:
+        """Coefficients (Y, Q) of the linear rows in what the modes leave of the outputs (Y, N), nuisances
+        beside them."""
+        n_outputs = len(unexplained)
+        if not len(self.linear_rows):
+            return np.zeros((n_outputs, 0))
+        rows = np.concatenate([unexplained, self.linear_rows])
+        self.data.each[0].take_out_local(self._local_q(poles), rows)
+        solution = np.linalg.lstsq(rows[n_outputs:].T, rows[:n_outputs].T, rcond=None)[0]
+        return np.asarray(solution.T)
+
+
+class _ResponseChange(NamedTuple):
+    """Change of the response with one free number: a residue (Y, U) at a state (two for a pair)."""
+
+    state: int
+    residue: ComplexArray
+    is_pair: bool
 
 
 def _inverse_factor(columns: RealArray) -> RealArray:
-    """S with S S^T = (C^T C)^-1; columns scaled, so that what is left out as unseen has no units."""
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    return np.asarray(np.linalg.pinv(np.linalg.qr(columns / scale, mode="r"), rcond=1e-12) / scale[:, None])
+    """S (P, P) with S S^T = (C^T C)^-1 for columns C (N, P); what the columns do not see gets zero.
 
-
-def _shown(rows: RealArray | ComplexArray, mode: ShapedMode) -> RealArray:
-    """What a mode adds to the outputs: with its conjugate where it is a pair."""
-    return 2 * np.real(rows) if mode.is_pair else np.real(rows)
-
-
-def _count(mode: ShapedMode) -> int:
-    """Free numbers: those of the pole, and of a residue with or without one shape."""
-    outputs, inputs = mode.residue.shape
-    numbers = outputs + inputs - 1 if mode.rank_one else outputs * inputs
-    return int((1 + mode.is_pair) * (numbers + mode.moves))
-
-
-def _start(mode: ShapedMode, sizes: RealArray) -> RealArray:
-    """Free numbers of a mode: log decay (and logistic angle), then c, and b without its largest, which is
-    one."""
-    pole, residue = mode.pole, mode.residue
-    head = [np.log(-np.log(abs(pole)))] if mode.moves else []
-    head += [logit(np.angle(pole) / np.pi)] if mode.moves and mode.is_pair else []
-    if mode.rank_one:
-        left, size, right = np.linalg.svd(residue * sizes)
-        b = right[0] / sizes
-        fixed = _largest(mode)
-        numbers = np.concatenate([left[:, 0] * size[0] * b[fixed], np.delete(b / b[fixed], fixed)])
-    else:
-        numbers = residue.ravel()
-    return np.concatenate([head, *([numbers.real, numbers.imag] if mode.is_pair else [numbers.real])])
-
-
-def _largest(mode: ShapedMode) -> int:
-    """The input that drives a mode most: its share of the shape is one."""
-    return int(np.argmax(np.linalg.norm(mode.residue, axis=0)))
-
-
-def _unpacked(mode: ShapedMode, x: RealArray) -> tuple[complex, ComplexArray, list[ComplexArray]]:
-    """Pole, residue (Y, U), and the residue's change with each of its free numbers."""
-    pole = mode.pole
-    if mode.moves:
-        size, x = np.exp(-np.exp(np.clip(x[0], *_LOG_DECAY))), x[1:]
-        if mode.is_pair:
-            pole, x = size * np.exp(1j * np.pi * expit(x[0])), x[1:]
-        else:
-            pole = complex(np.copysign(size, mode.pole.real))
-    outputs, inputs = mode.residue.shape
-    values = x[: x.size // 2] + 1j * x[x.size // 2 :] if mode.is_pair else x.astype(np.complex128)
-    turns = (1.0 + 0j, 1j) if mode.is_pair else (1.0 + 0j,)
-    slopes: list[ComplexArray] = []
-    if not mode.rank_one:
-        residue: ComplexArray = values.reshape(outputs, inputs)
-        slopes += [
-            turn * unit
-            for turn in turns
-            for unit in np.eye(values.size, dtype=np.complex128).reshape(-1, outputs, inputs)
-        ]
-        return complex(pole), residue, slopes
-    fixed = _largest(mode)
-    c, b = values[:outputs], np.insert(values[outputs:], fixed, 1.0)
-    for turn in turns:
-        slopes += [np.asarray(turn * np.outer(np.eye(outputs)[k], b)) for k in range(outputs)]
-        others = (k for k in range(inputs) if k != fixed)
-        slopes += [np.asarray(turn * np.outer(c, np.eye(inputs)[k])) for k in others]
-    return complex(pole), np.asarray(np.outer(c, b)), slopes
-
-
-def _pole_steps(mode: ShapedMode, pole: complex) -> list[complex]:
-    """Change of the pole with its log decay, and with the logistic number of its angle."""
-    decay = pole * np.log(abs(pole)) if pole else 0j
-    angle = np.angle(pole)
-    return [decay, 1j * pole * angle * (1 - angle / np.pi)] if mode.is_pair else [decay]
+    Columns are scaled to one length, so that what counts as unseen has no units.
+    """
+    scale = np.maximum(np.linalg.norm(columns, axis=0), TINY)
+    triangle = np.linalg.qr(columns / scale, mode="r")
+    return np.asarray(np.linalg.pinv(triangle, rcond=SMALLEST_SEEN) / scale[:, None])
