@@ -1,4 +1,12 @@
-"""Records of one input and output and settings in, a GOBF model with everything needed to judge it out."""
+"""Identify a model of one input and one output from records: the path of `identify` from data to answer.
+
+Poles are searched on the records, or on a part of long ones (`searched`), with free responses where records
+begin in motion, and again behind a dead time where the data show one. They are then refined on all samples,
+where what was left to the data is decided: initial state and offset (`fitted_on_all`). What somebody stated
+as known is tested by likelihood ratios, and a relative degree is imposed (`_priors_judged`). At the end the
+model and what describes its fit are read off (`description`). All noise is taken as white here;
+`ident.coloured_noise` runs the same path on records that were whitened.
+"""
 
 from __future__ import annotations
 
@@ -39,87 +47,176 @@ from ident.search.dead_time import SearchOutcome, first_answer, seek
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, SearchTrace
 
-# Initial states that raise the residual of a fit from rest by this factor may have led its search astray.
-_MISLED = 1.2
+# Factor in residual energy from a fit whose records begin in motion to one from rest. From it on, the search
+# from rest may have been led to other poles, and the records are searched anew; below it the search goes on
+# from the poles that were found from rest, which is faster. Set to 1 or doubled, no test of `identify` moves.
+MISLED_FACTOR = 1.2
+# Fewest poles beside the fixed ones with which a search from rest counts as one that found the dynamics: a real
+# pole and a pair.
+DYNAMICS_ORDER = 3
+# Fits with free responses are tried only where there are samples enough for so many poles, or for as many as
+# were found from rest: two real poles and a pair, the first search.
+LEAST_ORDER_IN_MOTION = 4
 
 
 def identify(
     records: Sequence[Record], options: IdentOptions | None = None, *, progress: Progress | None = None
 ) -> Identification:
-    """Fit one GOBF model to all single-input single-output records (equal sampling time) together.
+    """Fit one GOBF model to all records of one input and one output together.
 
-    Each has its own nuisance columns (offset, initial state). progress: called with a fraction 0..1 and a
-    short message. Raises ValueError for a record that cannot be used (constant signal, several columns, other
-    sampling time) or too few samples for the order. Deterministic.
+    Parameters
+    ----------
+    records : sequence of Record
+        Of equal sampling time; each has its own nuisance columns (offset, initial state).
+    options : IdentOptions, optional
+        What is known, what is left to the data, and limits of the search.
+    progress : callable, optional
+        Called with a share 0 .. 1 and a short message.
+
+    Returns
+    -------
+    Identification
+        Model, residuals, verdicts and trace. Deterministic.
+
+    Raises
+    ------
+    ValueError
+        In one line: a record that cannot be used (constant signal, several columns, other sampling time), or
+        too few samples for the order.
     """
     options = options or IdentOptions()
     report = progress or silent
-    if options.noise == "auto":
-        refuse_unusable(records, prepare(records, options.structure()), least_order(options))
-        return identify_in_noise(
-            records,
-            options,
-            lambda part, asked, start, end: _identified(
-                part, asked, lambda f, message: report(start + (end - start) * f, message)
-            ),
-        )
-    return _identified(records, options, report)
+    if options.noise != "auto":
+        return _identified(records, options, report)
+
+    def identified_step(
+        step_records: Sequence[Record], step_options: IdentOptions, begin: float, end: float
+    ) -> Identification:
+        """Fit in white noise, with the part `begin` to `end` of the progress."""
+        return _identified(step_records, step_options, part_of(report, begin, end - begin))
+
+    refuse_unusable(records, prepare(records, options.structure()), least_order(options))
+    return identify_in_noise(records, options, identified_step)
+
+
+def part_of(report: Progress, begin: float, length: float) -> Progress:
+    """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole."""
+
+    def report_step(share: float, message: str) -> None:
+        report(begin + length * share, message)
+
+    return report_step
 
 
 def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfModel:
-    """The model of `identify` in white noise, without relative degree, before what is stated as known is
-    tested. Raises ValueError as `identify`."""
+    """Model of `identify` in white noise before what is stated as known is tested.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one input and one output, of equal sampling time.
+    options : IdentOptions
+        The relative degree is not imposed, and no dead time is sought.
+
+    Returns
+    -------
+    GobfModel
+
+    Raises
+    ------
+    ValueError
+        As `identify`.
+    """
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, _ = searched(records, data, options, silent)
-    return description(records, outcome, fitted_on_all(records, outcome)[0])[0]
+    fitted, _ = fitted_on_all(records, outcome)
+    model, _ = description(records, outcome, fitted)
+    return model
 
 
 def _identified(records: Sequence[Record], options: IdentOptions, report: Progress) -> Identification:
-    """The fit that takes the noise as white."""
+    """The identification that takes the noise as white; raises ValueError as `identify`."""
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
-    outcome, at_once = _behind_dead_time(part, outcome, report)
+    outcome, answers_at_once = _behind_dead_time(part, outcome, report)
     fitted, verdicts = fitted_on_all(records, outcome)
     if outcome.dead_time is not None:
         verdicts = (outcome.dead_time, *verdicts)
+
     report(0.9, "tests of what is stated as known")
     fitted, tests = _priors_judged(records, part, outcome, fitted)
-    model, found = description(records, outcome, fitted)
-    refused = tuple(
-        test.finding for test in tests if test.refused and (test.imposed or options.relative_degree != "auto")
-    )
-    if at_once and not options.feedthrough and options.relative_degree is None and fitted.poles.order:
+    model, fields = description(records, outcome, fitted)
+
+    # What the reader is warned of: priors that the data refuse. A relative degree that was left to the data
+    # and refused was not imposed, which is no reason to warn.
+    warnings = []
+    for test in tests:
+        if test.refused and (test.imposed or options.relative_degree != "auto"):
+            warnings.append(test.finding)
+    # An output that answers in the very sample of the input has a direct term, which nobody asked for.
+    nobody_asked = not options.feedthrough and options.relative_degree is None
+    if answers_at_once and nobody_asked and fitted.poles.order:
         test = direct_term_test(records, fitted)
-        refused += (finding(FindingKind.ANSWERS_AT_ONCE, **test.finding.values),) if test.refused else ()
+        if test.refused:
+            warnings.append(finding(FindingKind.ANSWERS_AT_ONCE, **test.finding.values))
     report(1.0, "identified")
     return Identification(
         model=model,
         verdicts=(*verdicts, *(test.finding for test in tests)),
         prior_tests=tests,
-        advise=partial(_advice, tuple(records), fitted, model, found["residuals"], refused),
-        **found,
+        advise=partial(_advice, tuple(records), fitted, model, fields["residuals"], tuple(warnings)),
+        **fields,
     )
 
 
 def least_order(options: IdentOptions) -> int:
-    """Poles that the data have to be enough for."""
-    wanted = options.fixed().order + (options.n_real or 0) + 2 * (options.n_pairs or 0)
-    return wanted if wanted else min(2, options.max_real) + 2 * min(1, options.max_pairs)
+    """Number of poles that the data have to be enough for.
+
+    Those that are stated; where none is, those that a search begins with: two real poles and a pair, or as
+    many as the options allow.
+    """
+    n_real = options.n_real or 0
+    n_pairs = options.n_pairs or 0
+    stated_order = options.fixed().order + n_real + 2 * n_pairs
+    if stated_order:
+        return stated_order
+    return min(2, options.max_real) + 2 * min(1, options.max_pairs)
 
 
 def searched(
     records: Sequence[Record], data: Regression, options: IdentOptions, report: Progress
 ) -> tuple[SearchOutcome, Sequence[Record]]:
-    """Poles from a search on the records, or a part of long ones, and that part; initial states are estimated
-    where the data ask for it. `data` are the records made ready for a fit from rest."""
+    """Poles from a search, and the records that were searched.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one input and one output.
+    data : Regression
+        These records made ready for a fit from rest.
+    options : IdentOptions
+    report : callable
+        Told of shares 0 to .85.
+
+    Returns
+    -------
+    SearchOutcome
+        Search, selection of the order, and where they ended. Initial states are estimated where the data ask
+        for it.
+    sequence of Record
+        All records, or a part of long ones.
+    """
     part, in_mid_record = thinned(records, options.search_samples)
     structure = options.structure()
-    structure = replace(structure, estimate_initial_state=True) if in_mid_record else structure
+    if in_mid_record:
+        # A stretch from the middle of a record does not begin at rest.
+        structure = replace(structure, estimate_initial_state=True)
     if in_mid_record or len(part) < len(records):
         data = prepare(part, structure)
-    outcome = _searched(data, options, lambda f, message: report(0.4 * f, message))
+    outcome = _searched(data, options, part_of(report, 0.0, 0.4))
+    # In mid-record the free responses are there already.
     if options.estimate_initial_state == "auto" and not in_mid_record:
         outcome = _searched_with_initial_state(part, outcome, report)
     report(0.85, "refinement and tests on all samples")
@@ -127,29 +224,35 @@ def searched(
 
 
 def _behind_dead_time(
-    records: Sequence[Record], plain: SearchOutcome, report: Progress
+    records: Sequence[Record], outcome: SearchOutcome, report: Progress
 ) -> tuple[SearchOutcome, bool]:
-    """The search behind a delay that the data show, where nobody stated one; and whether the output answers
-    in the very sample of the input. Not where a reference was recorded: noise that comes back looks like dead
-    time."""
-    looped = any(record.reference is not None for record in records)
-    if looped or plain.search.options.input_delay_samples:
-        return plain, False
+    """Outcome of the search behind a delay that the data show, and whether the output answers at once.
+
+    Nothing is sought where somebody stated a delay, or where a reference was recorded: noise that comes back
+    through a loop looks like dead time. At once means in the very sample of the input.
+    """
+    in_loop = any(record.reference is not None for record in records)
+    if in_loop or outcome.search.options.input_delay_samples:
+        return outcome, False
     report(0.86, "dead time")
-    starts, at_once = first_answer(records)
-    found = seek(records, plain, starts) if plain.search.options.delay_left_to_data else None
-    if found is None:
-        return plain, at_once
-    search = found.search
-    search.minima = [*plain.search.minima, *search.minima]
-    search.stages = [*plain.search.stages, *search.stages]
-    search.evaluations += plain.search.evaluations
-    return found, False
+    starts, answers_at_once = first_answer(records)
+    delayed = None
+    if outcome.search.options.delay_left_to_data:
+        delayed = seek(records, outcome, starts)
+    if delayed is None:
+        return outcome, answers_at_once
+    # The trace tells of both searches.
+    search = delayed.search
+    search.minima = [*outcome.search.minima, *search.minima]
+    search.stages = [*outcome.search.stages, *search.stages]
+    search.evaluations += outcome.search.evaluations
+    return delayed, False
 
 
 def _searched(
     data: Regression, options: IdentOptions, report: Progress, start: Refined | None = None
 ) -> SearchOutcome:
+    """Outcome of one selection of the order on these data; `start`: poles to go on from."""
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
     return SearchOutcome(search, selection.run(start), selection)
@@ -158,76 +261,118 @@ def _searched(
 def _searched_with_initial_state(
     records: Sequence[Record], outcome: SearchOutcome, report: Progress
 ) -> SearchOutcome:
-    """Search again with unknown initial states if the fit from rest is improbably worse than one with
-    them."""
-    data, options = outcome.data, outcome.search.options
-    free = restructured(records, data, replace(data.structure, estimate_initial_state=True))
-    without: Fitted = outcome
-    if not free.n_samples > free.n_parameters(max(without.poles.order, 4)):
+    """Outcome of a second search with unknown initial states, or of the first one from rest.
+
+    `outcome` : the search from rest on these records. It stays unless it is improbably worse than a fit with
+    free responses of all poles, by `nuisance_test`; or where there are too few samples for such a fit.
+    """
+    data = outcome.data
+    options = outcome.search.options
+    data_in_motion = restructured(records, data, replace(data.structure, estimate_initial_state=True))
+    tried_order = max(outcome.poles.order, LEAST_ORDER_IN_MOTION)
+    if not data_in_motion.n_samples > data_in_motion.n_parameters(tried_order):
         return outcome
-    search = PoleSearch(free, options)
-    start, polished = None, None
-    if without.poles.order - search.fixed.order < 3 and None in (options.n_real, options.n_pairs):
-        # Nothing found from rest: a free decay looks just so. Judge by a search with free responses.
+    search = PoleSearch(data_in_motion, options)
+    searched_order = outcome.poles.order - search.fixed.order
+    order_left_to_data = options.n_real is None or options.n_pairs is None
+    from_rest: Fitted = outcome
+    start = None
+    polished = None
+    if searched_order < DYNAMICS_ORDER and order_left_to_data:
+        # Nothing was found from rest. A free decay looks just like that, so one mode is sought with free
+        # responses, and its poles are judged with and without them.
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         end = search.joint(n_real, min(1, most_pairs))
-        rest = PoleSearch(data, options)
-        without = Fitted(rest, rest.descend(end.poles, "from rest"))
+        search_from_rest = PoleSearch(data, options)
+        from_rest = Fitted(search_from_rest, search_from_rest.descend(end.poles, "from rest"))
     else:
-        if without.poles.order > 0 and (clear := clearly_left_out("initial state", without, free)):
-            return replace(outcome, from_rest=clear.finding)
-        end = polished = search.descend(without.poles, "with initial state")
+        if from_rest.poles.order > 0:
+            # A step on the linearisation is enough to see that free responses gain nothing.
+            left_out = clearly_left_out("initial state", from_rest, data_in_motion)
+            if left_out is not None:
+                return replace(outcome, from_rest=left_out.finding)
+        end = search.descend(from_rest.poles, "with initial state")
+        polished = end
         # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
-        start = end if without.end.rss < _MISLED * end.rss else None
-    if end.poles.order == 0 or not nuisance_test("initial state", without, Fitted(search, end)).needed:
+        if from_rest.end.rss < MISLED_FACTOR * end.rss:
+            start = end
+    if end.poles.order == 0 or not nuisance_test("initial state", from_rest, Fitted(search, end)).needed:
         return replace(outcome, free=polished)
-    return _searched(free, options, lambda fraction, message: report(0.45 + 0.4 * fraction, message), start)
+    return _searched(data_in_motion, options, part_of(report, 0.45, 0.4), start)
 
 
 def fitted_on_all(records: Sequence[Record], outcome: SearchOutcome) -> tuple[Fitted, tuple[Finding, ...]]:
-    """Refine on all samples and decide what was left to the data: initial state first, then the offset."""
-    options, structure = outcome.search.options, outcome.data.structure
-    here: Fitted = outcome
-    if outcome.data.n_samples < sum(record.n_samples - structure.input_delay_samples for record in records):
-        if options.estimate_initial_state is False:  # a search in mid-record had to estimate it all the same
+    """Poles refined on all samples, and what the data said about initial state and offset.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All of them.
+    outcome : SearchOutcome
+        Of a search on these records, or a part of them.
+
+    Returns
+    -------
+    Fitted
+        The optimum, with the nuisances that the options state or the data ask for.
+    tuple of Finding
+        A verdict for each nuisance that was left to the data: initial state first, then the offset.
+    """
+    options = outcome.search.options
+    structure = outcome.data.structure
+    fitted: Fitted = outcome
+    n_samples = sum(record.n_samples - structure.input_delay_samples for record in records)
+    if outcome.data.n_samples < n_samples:
+        if options.estimate_initial_state is False:
+            # A search in mid-record had to estimate it all the same.
             structure = replace(structure, estimate_initial_state=False)
-        here = _moved(outcome, prepare(records, structure), outcome.poles)
+        fitted = _moved(outcome, prepare(records, structure), outcome.poles)
+
     verdicts = []
     for name, key in (("initial state", "estimate_initial_state"), ("offset", "estimate_offset")):
         if getattr(options, key) != "auto":
             continue
-        # The search put this question to the very same records.
-        again = key == "estimate_initial_state" and here is outcome
-        if again and outcome.from_rest:
+        # The search has put this question to the very same records, where all of them were searched.
+        already_asked = key == "estimate_initial_state" and fitted is outcome
+        if already_asked and outcome.from_rest:
             verdicts.append(outcome.from_rest)
             continue
-        present = getattr(here.data.structure, key)
-        changed: dict[str, Any] = {key: not present}
-        other = restructured(records, here.data, replace(here.data.structure, **changed))
-        needed = other.n_parameters(here.poles.order)
+
+        # The same records with the nuisance, or without it: whichever they are not fitted with.
+        is_estimated = getattr(fitted.data.structure, key)
+        changed: dict[str, Any] = {key: not is_estimated}
+        changed_data = restructured(records, fitted.data, replace(fitted.data.structure, **changed))
+        unknowns = changed_data.n_parameters(fitted.poles.order)
         # With integrators the polynomials that they leave free contain the offset.
-        if needed == here.data.n_parameters(here.poles.order) or not other.n_samples > needed:
+        no_difference = unknowns == fitted.data.n_parameters(fitted.poles.order)
+        if no_difference or not changed_data.n_samples > unknowns:
             continue
-        if again and outcome.free:
-            there = Fitted(PoleSearch(other, options), outcome.free)
+        if already_asked and outcome.free:
+            changed_fit = Fitted(PoleSearch(changed_data, options), outcome.free)
         else:
-            there = _moved(outcome, other, here.poles)
-        with_it, without = (here, there) if present else (there, here)
+            changed_fit = _moved(outcome, changed_data, fitted.poles)
+        if is_estimated:
+            with_it = fitted
+            without = changed_fit
+        else:
+            with_it = changed_fit
+            without = fitted
         test = nuisance_test(name, without, with_it)
         verdicts.append(test.finding)
-        here = with_it if test.needed else without
-    return here, tuple(verdicts)
+        fitted = with_it if test.needed else without
+    return fitted, tuple(verdicts)
 
 
 def _priors_judged(
     records: Sequence[Record], part: Sequence[Record], outcome: SearchOutcome, fitted: Fitted
 ) -> tuple[Fitted, tuple[PriorTest, ...]]:
-    """Test what somebody stated as known, and impose the relative degree.
+    """The fit under the relative degree, and a test of each thing that somebody stated as known.
 
-    What the program chose from the data, in options of its own, is not tested. Each test starts from a model
-    that the data have not refused: with integrators refused, relative degree is judged with slow poles in
-    their place.
+    `part` : records that were searched; `fitted` : the optimum on all records. In this order: integrators,
+    fixed poles, direct term, relative degree, delay. What the program chose from the data, in options of its
+    own, is not tested. Each test starts from a model that the data have not refused: with integrators
+    refused, relative degree is judged with slow poles in their place.
     """
     options = outcome.search.options
     integrators_stated = options.integrators > 0 and options.is_stated("integrators")
@@ -237,36 +382,49 @@ def _priors_judged(
         return fitted, ()
     search = PoleSearch(fitted.data, options)
     search.minima = list(outcome.search.minima)
-    given = judged = Fitted(search, fitted.end)
-    searched = part, outcome.data.structure
+    # Both are fits to all records: one keeps to every prior, the other to those that were not refused.
+    as_stated = Fitted(search, fitted.end)
+    not_refused = as_stated
+    searched_part = (part, outcome.data.structure)
     tests: list[PriorTest] = []
     if integrators_stated:
-        test, free = integrators_test(records, searched, given)
+        test, without_integrators = integrators_test(records, searched_part, as_stated)
         tests.append(test)
-        outcome.search.evaluations += free.search.evaluations
+        outcome.search.evaluations += without_integrators.search.evaluations
         if test.refused:
-            judged = free
+            not_refused = without_integrators
     if options.fixed_poles:
-        tests.append(fixed_poles_test(records, searched, given))
+        tests.append(fixed_poles_test(records, searched_part, as_stated))
+
+    # Relative degree 1 is no direct term. Where they are left to the data higher ones are tried one after the
+    # other, up to the first that is refused; a stated one is imposed even so.
     asked = options.relative_degree
     if asked in (1, "auto"):
-        tests.append(direct_term_test(records, judged))
-    relative_degree, end = 1, fitted.end
-    trials = (2, 3) if asked == "auto" else (asked,) if asked is not None and asked > 1 else ()
+        tests.append(direct_term_test(records, not_refused))
+    relative_degree = 1
+    end = fitted.end
+    trials: tuple[int, ...] = ()
+    if asked == "auto":
+        trials = (2, 3)
+    elif asked is not None and asked > 1:
+        trials = (asked,)
     for trial in trials:
-        if trial > min(given.poles.order, judged.poles.order):
+        if trial > min(as_stated.poles.order, not_refused.poles.order):
             if asked != "auto":
-                tests.append(too_few_poles(trial, given.poles.order))
+                tests.append(too_few_poles(trial, as_stated.poles.order))
             break
-        test, constrained = relative_degree_test(judged, trial)
+        test, constrained = relative_degree_test(not_refused, trial)
         if asked == "auto" and test.refused:
             tests.append(replace(test, imposed=False))
             break
         tests.append(test)
         relative_degree = trial
-        end = constrained if judged is given else best_under_relative_degree(given, trial)
+        end = constrained
+        if not_refused is not as_stated:
+            # The model keeps its integrators, also refused ones: the same degree with them.
+            end = best_under_relative_degree(as_stated, trial)
     if delay_stated:
-        tests.append(delay_test(records, given, relative_degree))
+        tests.append(delay_test(records, as_stated, relative_degree))
     if relative_degree > 1:
         structure = replace(fitted.data.structure, relative_degree=relative_degree)
         fitted = Fitted(PoleSearch(replace(fitted.data, structure=structure), options), end)
@@ -275,17 +433,34 @@ def _priors_judged(
 
 
 def in_order(poles: Poles, fixed: Poles) -> Poles:
-    """Fixed poles first as they are, then real ones from slow to fast and pairs from low to high
-    frequency."""
-    real, pairs = poles.real[fixed.real.size :], poles.pairs[fixed.pairs.size :]
+    """Poles in the order of a model: fixed ones first of each type, then the fitted ones sorted.
+
+    Parameters
+    ----------
+    poles : Poles
+        Fixed ones first of each type.
+    fixed : Poles
+        Only their numbers count here.
+
+    Returns
+    -------
+    Poles
+        Fixed poles as they are, then real ones from slow to fast and pairs from low to high frequency.
+    """
+    n_fixed_real, n_fixed_pairs = fixed.counts
+    fitted_real = poles.real[n_fixed_real:]
+    fitted_pairs = poles.pairs[n_fixed_pairs:]
+    slow_to_fast = np.sort(fitted_real)[::-1]
+    # |log p| is the undamped frequency, in radians per sample.
+    low_to_high = fitted_pairs[np.argsort(np.abs(np.log(fitted_pairs)))]
     return Poles(
-        np.concatenate([poles.real[: fixed.real.size], np.sort(real)[::-1]]),
-        np.concatenate([poles.pairs[: fixed.pairs.size], pairs[np.argsort(np.abs(np.log(pairs)))]]),
+        np.concatenate([poles.real[:n_fixed_real], slow_to_fast]),
+        np.concatenate([poles.pairs[:n_fixed_pairs], low_to_high]),
     )
 
 
 def _moved(outcome: SearchOutcome, data: Regression, poles: Poles) -> Fitted:
-    """The poles polished on other rows or columns; noted in the trace of the search."""
+    """Optimum near these poles on other rows or columns; noted in the trace of the search."""
     search = PoleSearch(data, outcome.search.options)
     end = search.descend(poles, "final polish")
     outcome.search.minima += search.minima
@@ -296,16 +471,36 @@ def _moved(outcome: SearchOutcome, data: Regression, poles: Poles) -> Fitted:
 def description(
     records: Sequence[Record], outcome: SearchOutcome, fitted: Fitted
 ) -> tuple[GobfModel, dict[str, Any]]:
-    """The model, and the fields of `ident.identification.FittedRecords` that are read from fit and search."""
-    data, search, options = fitted.data, outcome.search, outcome.search.options
+    """Model of a fit, and the fields that describe it.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All that were fitted.
+    outcome : SearchOutcome
+        The search, for the trace and the table of orders.
+    fitted : Fitted
+        The optimum; the structure of its data holds the relative degree.
+
+    Returns
+    -------
+    GobfModel
+    dict
+        Fields of `ident.identification.FittedRecords` that are read from fit and search, by name.
+    """
+    data = fitted.data
+    options = outcome.search.options
+    search = outcome.search
     degree = data.structure.relative_degree
-    poles, bounds = in_order(fitted.poles, search.fixed), fitted.search.bounds
+    poles = in_order(fitted.poles, search.fixed)
+    bounds = fitted.search.bounds
     if degree > 1:
         linear = structured_fit(data, poles, degree)
         optimality = UnderRelativeDegree(data, degree, search.fixed).optimality(poles, bounds)
     else:
         linear = fit(data, poles)
-        optimality = free_optimality(data.linearise(*poles.writable()), poles, bounds, search.fixed)
+        linearisation = data.linearise(*poles.writable())
+        optimality = free_optimality(linearisation, poles, bounds, search.fixed)
     model = GobfModel(
         poles=poles,
         coefficients=linear.coefficients[0],
@@ -317,16 +512,22 @@ def description(
         input_delay_samples=options.input_delay_samples,
         unstable=data.structure.unstable,
     )
-    residuals = tuple(linear.residual[here] for here in data.segments)
-    spread = [np.linalg.norm(data.y[here] - data.y[here].mean()) for here in data.segments]
+
+    # Record by record: what the fit leaves, as a share of the motion about its mean.
+    residuals = []
+    fit_percent = []
+    for rows in data.segments:
+        residual = linear.residual[rows]
+        motion = np.linalg.norm(data.y[rows] - data.y[rows].mean())
+        residuals.append(residual)
+        fit_percent.append(100 * (1 - np.linalg.norm(residual) / motion))
+    # Each degree beyond the first is one equation for the coefficients, so one number less is free.
     unknowns = data.n_parameters(poles.order) - (degree - 1)
     return model, {
         "structure": data.structure,
         "record_names": tuple(record.name for record in records),
-        "residuals": residuals,
-        "fit_percent": np.array(
-            [100 * (1 - np.linalg.norm(r) / size) for r, size in zip(residuals, spread, strict=True)]
-        ),
+        "residuals": tuple(residuals),
+        "fit_percent": np.array(fit_percent),
         "rss": linear.rss,
         "noise_std": float(np.sqrt(linear.rss / (data.n_samples - unknowns))),
         "tangent_optimality": optimality,
@@ -343,13 +544,16 @@ def _advice(
     residuals: tuple[RealArray, ...],
     refused: tuple[Finding, ...],
 ) -> list[Finding]:
-    """All that `Identification.warnings` has to say."""
-    data, fixed, bounds = fitted.data, fitted.search.fixed, fitted.search.bounds
-    unanswered = explains_nothing(data, model.poles, fixed, np.concatenate(residuals)) if model.order else []
-    return [
-        *unanswered,
-        *advice(records, data, model, residuals, fixed),
-        *pole_warnings(model, fixed, bounds),
-        *implausible_pairs(model.poles, fixed, data.dt_s, data.longest * data.dt_s),
-        *refused,
-    ]
+    """Everything that `Identification.warnings` has to say beside the search: whether there is an answer at
+    all, doubts about records and poles, and the priors that were refused."""
+    data = fitted.data
+    fixed = fitted.search.fixed
+    longest_s = data.longest * data.dt_s
+    warnings = []
+    if model.order:
+        warnings += explains_nothing(data, model.poles, fixed, np.concatenate(residuals))
+    warnings += advice(records, data, model, residuals, fixed)
+    warnings += pole_warnings(model, fixed, fitted.search.bounds)
+    warnings += implausible_pairs(model.poles, fixed, data.dt_s, longest_s)
+    warnings += refused
+    return warnings

@@ -36,7 +36,7 @@ from ident.fit.regression import thinned
 from ident.fit.several_outputs import OutputRegressions, prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import one_shape_each
-from ident.one_input import in_order, least_order
+from ident.one_input import in_order, least_order, part_of
 from ident.search.order_selection import OrderSelection, Progress, silent
 from ident.search.pole_search import PoleSearch, SearchTrace
 from ident.uncertainty.embedding import NOISE_ROUNDS
@@ -133,7 +133,7 @@ def identify_mimo(
     whitening = np.diag(1 / output_std)
     for noise_round in range(NOISE_ROUNDS):
         round_begin, round_length = ROUND_SPANS[noise_round]
-        round_report = _part_of(report, ROUNDS_END * round_begin, ROUNDS_END * round_length)
+        round_report = part_of(report, ROUNDS_END * round_begin, ROUNDS_END * round_length)
         fitted = _searched(whitened(records, whitening), options, round_report, start)
         data = fitted.search.data
         start = fitted.end.poles
@@ -150,15 +150,6 @@ def identify_mimo(
 
     report(0.95, "one shape for every mode")
     return _identification(records, whitening, fitted, options, free_shapes=free_shapes)
-
-
-def _part_of(report: Progress, begin: float, length: float) -> Progress:
-    """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole."""
-
-    def report_step(share: float, message: str) -> None:
-        report(begin + length * share, message)
-
-    return report_step
 
 
 def _refuse_outputs(records: Sequence[Record], options: IdentOptions) -> None:
