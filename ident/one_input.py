@@ -51,8 +51,8 @@ from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, Search
 # from rest may have been led to other poles, and the records are searched anew; below it the search goes on
 # from the poles that were found from rest, which is faster. Set to 1 or doubled, no test of `identify` moves.
 MISLED_FACTOR = 1.2
-# Fewest poles beside the fixed ones with which a search from rest counts as one that found the dynamics: a real
-# pole and a pair.
+# Fewest poles beside the fixed ones with which a search from rest counts as one that found the dynamics: one
+# real pole and a pair.
 DYNAMICS_ORDER = 3
 # Fits with free responses are tried only where there are samples enough for so many poles, or for as many as
 # were found from rest: two real poles and a pair, the first search.
