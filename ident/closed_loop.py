@@ -1,12 +1,15 @@
-"""Logs taken in closed loop with a known reference: two-stage identification, its output corrected.
+"""Make open-loop records of logs that were taken in closed loop with a known reference.
 
-Stage one fits r -> u; u_hat, its fit, is free of the noise v that the loop feeds back. With any model G0
+In a loop the command u answers to the noise v in the output y, which biases a fit of y to u. Stage one fits
+the command to the reference r: u_hat, what r explains of u, is free of v. With any model G0 of the plant G
 
     y - G0 (u - u_hat) = G u_hat + (G - G0) (u - u_hat) + v,
 
 an open-loop record with input u_hat (an instrumental variable; Gilson and Van den Hof, Automatica 41(2),
 2005) and noise v. An error of u_hat counts times G - G0 only; with G0 = 0 it is the method of Van den Hof and
-Schrama (Automatica 29(6), 1993), where it counts in full.
+Schrama (Automatica 29(6), 1993), where it counts in full. G0 is fitted first to the logs as they are, then
+again to the records that it opened (`two_stage`, `two_stage_several`). Where no reference was recorded, a
+known controller makes one (`with_controller`). Assumed: a linear loop, and references without noise.
 """
 
 from __future__ import annotations
@@ -32,17 +35,35 @@ from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
 from ident.unstable import quick_poles
 
-# A first stage that explains less of the input than this has gone wrong.
+# A first stage that explains less of the command than this, percent, has gone wrong: more than half of what
+# the command does then comes from noise, or from a reference that is not the one that was recorded.
 EXPLAINED_PERCENT = 50.0
-# The same for balls: with 89 % they held a response at .90 of the frequencies, not .95, with 70 % at .40.
-_ENOUGH_FOR_BALLS = 90.0
-_FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
+# Percent of the commands that the first stage has to explain for balls of several inputs and outputs. Where
+# it explained 89 %, 95 % balls held the true response at 90 % of the frequencies, at 70 % at 40 % of them.
+EXPLAINED_PERCENT_FOR_BALLS = 90.0
+# Fit from reference to command. Behind a noise model: what noise of high frequency moved at a low one would
+# pass for excitation there. Only the fit is used, no ellipse, so no mode is taken for missed; and the poles
+# are a fit's own, so one tap beside them is enough.
+FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
+# Standard deviation of a command that stands still, in place of zero.
+TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
 class TwoStage:
-    """Open-loop records: input u_hat, output y - G0 (u - u_hat); fit_percent (per record) of u by u_hat;
-    plant G0."""
+    """Open-loop records that were made of logs of a loop.
+
+    Attributes
+    ----------
+    records : tuple of Record
+        Input u_hat, output y - G0 (u - u_hat), no reference.
+    fit_percent : tuple of float
+        Of each record, 100 (1 - |u - u_hat| / |u - mean u|).
+    plant : GobfModel or MimoModel
+        G0.
+    enough_percent : float
+        Below this fit of a record there is a warning.
+    """
 
     records: tuple[Record, ...]
     fit_percent: tuple[float, ...]
@@ -51,49 +72,77 @@ class TwoStage:
 
     @property
     def finding(self) -> Finding:
+        """What the references explain of the commands, least and most of all records."""
         return finding(
             FindingKind.TWO_STAGE, least_percent=min(self.fit_percent), most_percent=max(self.fit_percent)
         )
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
+        """A finding where the references explain too little of the commands of some record; else empty."""
         explained = min(self.fit_percent)
-        lost = finding(FindingKind.UNEXPLAINED_INPUT, explained_percent=explained)
-        return (lost,) if explained < self.enough_percent else ()
+        if explained >= self.enough_percent:
+            return ()
+        return (finding(FindingKind.UNEXPLAINED_INPUT, explained_percent=explained),)
 
 
 def two_stage(
     records: Sequence[Record], options: IdentOptions | None = None, plant: GobfModel | None = None
 ) -> TwoStage:
-    """Turn r -> u -> y into an open-loop problem for `identify` and `tangent` with the same options.
+    """Open-loop records of logs with one reference, one input and one output.
 
-    r -> u: a direct term and as many poles as the data ask for, common to the records, zeros of each. plant:
-    G0; default: of a second stage on the direct fit. Raises ValueError when a record has not exactly one
-    reference and input, or where the records excite few frequencies. Noise at the plant's input needs a noise
-    model of high order (`EmbeddingOptions.max_ar_order`).
+    Parameters
+    ----------
+    records : sequence of Record
+        Of one sampling time. They may begin in motion and at any offset.
+    options : IdentOptions, optional
+        Of the plant; the same are to be used for `identify` and `tangent` afterwards.
+    plant : GobfModel, optional
+        G0; default: of a second stage on the direct fit.
+
+    Returns
+    -------
+    TwoStage
+
+    Raises
+    ------
+    ValueError
+        A record has not exactly one reference and one input, or the records excite few frequencies.
+
+    Notes
+    -----
+    r -> u has a direct term and as many poles as the data ask for, common to the records, and zeros of each.
+    Noise at the plant's input needs a noise model of high order (`EmbeddingOptions.max_ar_order`).
     """
     options = options or IdentOptions()
-    closed, fixed = [_reference_to_input(record) for record in records], options.fixed()
+    reference_to_input = [_reference_to_input(record) for record in records]
+    fixed = options.fixed()
     refuse_few_lines(records)
-    poles = quick_poles(closed, options)
-    first = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
-    # Behind a noise model: what noise of high frequency moved at a low one would pass for excitation there.
-    loops = [tangent([loop], first, _FIRST_STAGE) for loop in closed]
-    # With its own start and offset: a log may begin in motion, and at any operating point.
-    rests = [fit_on_fresh_data(loop, record).residual for loop, record in zip(loops, closed, strict=True)]
+
+    # Stage one: what the reference does not explain of each input.
+    poles = quick_poles(reference_to_input, options)
+    loop_poles = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
+    unexplained = []
+    for loop_record in reference_to_input:
+        loop = tangent([loop_record], loop_poles, FIRST_STAGE)
+        # With a start and an offset of its own: a log may begin in motion, and at any operating point.
+        unexplained.append(fit_on_fresh_data(loop, loop_record).residual)
+
     if plant is None:
         options = options.with_delay_stated()
-        plant = identify(records, options).model
-        # What feedback does to the direct fit would be noise of the second stage.
-        n_real, n_pairs = (own - given for own, given in zip(plant.poles.counts, fixed.counts, strict=True))
-        again = options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs})
-        plant = identify(_opened(records, rests, plant), again).model
-    moved = [record.input[:, 0] - record.input.mean() for record in records]
-    fits = [
-        100 * (1 - float(np.linalg.norm(rest) / np.linalg.norm(u)))
-        for rest, u in zip(rests, moved, strict=True)
-    ]
-    return TwoStage(tuple(_opened(records, rests, plant)), tuple(fits), plant)
+        direct_plant = identify(records, options).model
+        # The second fit keeps the order of the direct one: what feedback did is noise in it, which further
+        # poles would follow.
+        n_real = direct_plant.poles.real.size - fixed.real.size
+        n_pairs = direct_plant.poles.pairs.size - fixed.pairs.size
+        same_order = options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs})
+        plant = identify(_opened(records, unexplained, direct_plant), same_order).model
+
+    fit_percent = []
+    for record, remainder in zip(records, unexplained, strict=True):
+        motion = record.input[:, 0] - record.input.mean()
+        fit_percent.append(100 * (1 - float(np.linalg.norm(remainder) / np.linalg.norm(motion))))
+    return TwoStage(tuple(_opened(records, unexplained, plant)), tuple(fit_percent), plant)
 
 
 def two_stage_several(
@@ -103,101 +152,176 @@ def two_stage_several(
     start: Poles | None = None,
     progress: Progress = silent,
 ) -> TwoStage:
-    """The same for several inputs and outputs: open-loop records for `identify_mimo` and `matrix_posterior`.
+    """Open-loop records of logs with several references, inputs and outputs.
 
-    References are set points, or signals added to the commands; as many of them move as there are inputs, or
-    more. A record without any is of the open loop and stays as it is. r -> u is fitted record by record, in
-    white noise. start: of the plant's search. Raises ValueError as `identify_mimo`, and for few references.
+    Parameters
+    ----------
+    records : sequence of Record
+        Of equal inputs (U), outputs (Y) and sampling time. References are set points, or signals added to the
+        commands; over all records at least U of them move. A record without references is of the open loop
+        and stays as it is.
+    options : IdentOptions, optional
+        Of the plant, as for `identify_mimo`.
+    start : Poles, optional
+        Where the plant's search begins.
+    progress : callable
+        Called with a share 0 .. 1 and a short message.
+
+    Returns
+    -------
+    TwoStage
+        For `identify_mimo` and `matrix_posterior`.
+
+    Raises
+    ------
+    ValueError
+        Fewer references move than there are inputs, or as `identify_mimo`.
+
+    Notes
+    -----
+    r -> u is fitted record by record, in white noise.
     """
-    moved = {
-        name
-        for record in records
-        if record.reference is not None
-        for name, signal in zip(record.reference_names, record.reference.T, strict=True)
-        if np.ptp(signal)
-    }
-    names = records[0].input_names
-    if len(moved) < len(names) and all(record.reference is not None for record in records):
+    input_names = records[0].input_names
+    moving_references = set()
+    for record in records:
+        if record.reference is None:
+            continue
+        for name, signal in zip(record.reference_names, record.reference.T, strict=True):
+            if np.ptp(signal):
+                moving_references.add(name)
+    all_in_loop = all(record.reference is not None for record in records)
+    if len(moving_references) < len(input_names) and all_in_loop:
         raise ValueError(
-            f"{records[0].label}: {len(moved)} references move ({sorted(moved)}) for {len(names)} inputs "
-            f"{list(names)}: too little to tell a machine from its loop; move every joint's reference by its "
-            "own signal"
+            f"{records[0].label}: {len(moving_references)} references move ({sorted(moving_references)}) for "
+            f"{len(input_names)} inputs {list(input_names)}: too little to tell a machine from its loop; "
+            "move every joint's reference by its own signal"
         )
-    options, rests = options or IdentOptions(), []
+
+    # Stage one: what the references do not explain of the inputs.
+    options = options or IdentOptions()
+    unexplained = []
     for number, record in enumerate(records):
         progress(0.5 * number / len(records), "from references to inputs")
-        rests.append(_unexplained(record))
-    plant: MimoModel | None = None
-    fitted = list(records)
-    for share in (0.5, 0.7, 0.9):  # what feedback does to a direct fit would be noise of the second stage
+        unexplained.append(_unexplained(record))
+
+    # The plant, three times: of the logs as they are, then of records that the plant before has opened. The
+    # second fit sees as noise what feedback did, so it may choose another order; the third one keeps that.
+    opened = list(records)
+    for share in (0.5, 0.7, 0.9):
         progress(share, "without what the loop fed back")
-        found = identify_mimo(fitted, options, start=plant.poles if plant else start, free_shapes=True)
-        plant = found.model
-        n_real, n_pairs = (own - given for own, given in zip(plant.poles.counts, found.n_fixed, strict=True))
+        fitted = identify_mimo(opened, options, start=start, free_shapes=True)
+        plant = fitted.model
+        start = plant.poles
         if share > 0.5:
+            n_fixed_real, n_fixed_pairs = fitted.n_fixed
+            n_real = plant.poles.real.size - n_fixed_real
+            n_pairs = plant.poles.pairs.size - n_fixed_pairs
             options = options.model_copy(update={"n_real": n_real, "n_pairs": n_pairs})
-        fitted = [
-            replace(
-                record, input=record.input - rest, output=record.output - plant.simulate(rest),
-                reference=None, reference_names=(),
-            )
-            for record, rest in zip(records, rests, strict=True)
-        ]  # fmt: skip
-    fits = []
-    for record, rest in zip(records, rests, strict=True):
-        size = np.maximum(np.std(record.input, axis=0), 1e-300)
-        fits.append(100 * (1 - float(np.linalg.norm(np.std(rest, axis=0) / size)) / np.sqrt(size.size)))
-    assert plant is not None
-    return TwoStage(tuple(fitted), tuple(fits), plant, _ENOUGH_FOR_BALLS)
+        opened = []
+        for record, remainder in zip(records, unexplained, strict=True):
+            input_ = record.input - remainder
+            output = record.output - plant.simulate(remainder)
+            opened.append(replace(record, input=input_, output=output, reference=None, reference_names=()))
+
+    # Root mean square, over the inputs, of what is unexplained of each as a share of its motion.
+    fit_percent = []
+    for record, remainder in zip(records, unexplained, strict=True):
+        input_std = np.maximum(np.std(record.input, axis=0), TINY)
+        shares = np.std(remainder, axis=0) / input_std
+        fit_percent.append(100 * (1 - float(np.linalg.norm(shares)) / np.sqrt(input_std.size)))
+    return TwoStage(tuple(opened), tuple(fit_percent), plant, EXPLAINED_PERCENT_FOR_BALLS)
 
 
 def _unexplained(record: Record) -> RealArray:
-    """Inputs (T, U) less what the references that move make of them; zero in the open loop."""
+    """Inputs (T, U) of a record less what its moving references explain of them, in their units.
+
+    Zero in the open loop, where nothing was fed back; the inputs about their means where no reference moves.
+    """
     if record.reference is None:
         return np.zeros_like(record.input)
-    moved = np.flatnonzero(np.ptp(record.reference, axis=0))
-    if not moved.size:
+    moving = np.flatnonzero(np.ptp(record.reference, axis=0))
+    if not moving.size:
         return np.asarray(record.input - record.input.mean(axis=0))
-    loop = replace(
-        record, input=record.reference[:, moved], output=record.input, reference=None, reference_names=(),
-        input_names=tuple(record.reference_names[i] for i in moved), output_names=record.input_names,
-        input_units=(), output_units=(),
-    )  # fmt: skip
-    return np.asarray(identify_mimo([loop], IdentOptions(feedthrough=True), free_shapes=True).residuals[0])
+    reference_to_input = replace(
+        record,
+        input=record.reference[:, moving],
+        output=record.input,
+        reference=None,
+        reference_names=(),
+        input_names=tuple(record.reference_names[index] for index in moving),
+        output_names=record.input_names,
+        input_units=(),
+        output_units=(),
+    )
+    # A controller answers in the same sample.
+    options = IdentOptions(feedthrough=True)
+    return np.asarray(identify_mimo([reference_to_input], options, free_shapes=True).residuals[0])
 
 
 def with_controller(record: Record, numerator: Sequence[float], denominator: Sequence[float]) -> Record:
-    """The record with a reference made of its known controller K = numerator / denominator, in z, highest
-    power first: u = K (r - y) says denominator u + numerator y = numerator r, free of the noise in y;
-    delayed, and the record shorter, by the order. Raises ValueError for a controller that is not proper, or
-    several channels."""
+    """Record with a reference that is made of its known controller.
+
+    Parameters
+    ----------
+    record : Record
+        Of one input u and one output y.
+    numerator, denominator : sequence of float
+        Of K in z, highest power first: u = K (r - y).
+
+    Returns
+    -------
+    Record
+        Shorter by the order of the controller, with the reference numerator r, delayed by that order.
+
+    Raises
+    ------
+    ValueError
+        The controller is not proper, or zero, or the record has several inputs or outputs.
+
+    Notes
+    -----
+    u = K (r - y) says denominator u + numerator y = numerator r: the left side is known, and free of the
+    noise in y.
+    """
     order = len(denominator) - 1
-    late = order + 1 - len(numerator)
-    if late < 0 or not denominator[0] or not any(numerator):
+    relative_degree = order + 1 - len(numerator)
+    if relative_degree < 0 or not denominator[0] or not any(numerator):
         raise ValueError("the controller needs a denominator of at least the numerator's degree")
     if record.input.shape[1] != 1 or record.output.shape[1] != 1:
         raise ValueError(f"{record.label}: a controller has one input and one output")
-    u, y = record.input[:, 0], record.output[:, 0]
-    known = np.convolve(u, denominator)[order : u.size]
-    known += np.convolve(y, [0.0] * late + list(numerator))[order : u.size]
+    command = record.input[:, 0]
+    output = record.output[:, 0]
+    n_samples = command.size
+    # Filters of the same length, so that both sums end at the same sample; the first ones are incomplete.
+    long_numerator = [0.0] * relative_degree + list(numerator)
+    reference = np.convolve(command, denominator)[order:n_samples]
+    reference += np.convolve(output, long_numerator)[order:n_samples]
     return replace(
-        record.slice(order, record.n_samples), reference=known[:, None], reference_names=("controller",)
+        record.slice(order, record.n_samples),
+        reference=reference[:, None],
+        reference_names=("controller",),
     )
 
 
-def _opened(records: Sequence[Record], rests: Sequence[RealArray], plant: GobfModel) -> list[Record]:
-    """Records without the rests (T,) of their inputs, and without what the plant makes of them."""
+def _opened(records: Sequence[Record], unexplained: Sequence[RealArray], plant: GobfModel) -> list[Record]:
+    """Open-loop records: inputs without their unexplained part, outputs without what the plant makes of it.
+
+    `unexplained` : of each record, (T,), units of the input; `plant` : G0, which may be unstable.
+    """
     opened = []
-    for record, rest in zip(records, rests, strict=True):
-        answer = plant.stable_part.simulate(rest)
+    for record, remainder in zip(records, unexplained, strict=True):
+        answer = plant.stable_part.simulate(remainder)
         # 1/B backwards in time: the bounded answer of an unstable plant to what a loop keeps bounded.
         answer = all_pass_signal(plant.unstable, answer[::-1])[::-1]
-        input_, output = record.input - rest[:, None], record.output - answer[:, None]
+        input_ = record.input - remainder[:, None]
+        output = record.output - answer[:, None]
         opened.append(replace(record, input=input_, output=output, reference=None, reference_names=()))
     return opened
 
 
 def _reference_to_input(record: Record) -> Record:
+    """Record whose input is the reference and whose output is the input; raises ValueError where a record has
+    not exactly one of each."""
     if record.reference is None or record.reference.shape[1] != 1:
         raise ValueError(f"{record.label}: closed-loop identification needs exactly one reference column")
     if record.input.shape[1] != 1:

@@ -50,8 +50,8 @@ LEAST_DEVIATIONS = 5.0
 LEAST_TIME_CONSTANTS = 1.0
 # Largest modulus of a pole of the basis: a time constant of ten million samples.
 LARGEST_MODULUS = 1 - 1e-7
-# Step of the differences at a zero, as a share of its distance from the circle, inside which the basis has all
-# its poles: the slopes are then right to 1e-4.
+# Step of the differences at a zero, as a share of its distance from the circle: poles of the basis are at
+# least that far away, so the slopes are right to 1e-4.
 DIFFERENCE_SHARE = 0.01
 # Singular values of the regression below this share of the largest are rounding, and get no variance.
 SMALLEST_SEEN = 1e-12
