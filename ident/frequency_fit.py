@@ -1,10 +1,17 @@
-"""A measured frequency response in, a GOBF model with everything needed to judge it out."""
+"""Identify a model from a measured frequency response whose errors have known covariances.
+
+The response is divided by its errors' size, so that the residual energy is chi-square where the model is
+right. Poles are searched and their number is chosen as for records (`_OrderFit`). Poles that no measured frequency
+shows are then replaced where fits without them are as good but for chance (`_limited_to_data`). What is left
+are the model, ellipses around it (`embed_response`), standard deviations of its poles, and what it assumes
+outside the measured band. Assumed: errors that are independent from frequency to frequency.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2
@@ -27,16 +34,54 @@ from ident.uncertainty.embedding import embed_response
 
 __all__ = ["FrfIdentification", "identify_frf"]
 
+# Frequencies at which the model is looked at over two decades below the measured band: 2.3 % apart, so that
+# the peak of a mode of damping .01 is not missed.
+POINTS_BELOW = 200
+# Frequencies from the last measured one to the Nyquist frequency: .12 % apart over a decade, so that the peak
+# of a mode of damping .001 is not missed.
+POINTS_ABOVE = 2000
+# Share of the Nyquist frequency from which the look below begins at least, where frequency zero was measured.
+LOWEST_SHARE = 1e-6
+# Eigenvalues of the normal matrix, columns scaled to one length, below this share of the largest are
+# rounding: the data do not show these directions, which get no variance.
+SMALLEST_EIGENVALUE = 1e-14
+# Smallest number that still can be divided by, in place of a length of zero.
+TINY = 1e-300
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FrfIdentification(Shown):
-    """A model fitted to a measured frequency response (F,), and how well it fits.
+    """A model fitted to a measured frequency response, and how well it fits.
 
-    posterior: tangent embedding on the same rows. residual (F,): measured minus fitted; distance (F,): its
-    length in units of the measurement's own ellipses. rss: chi-square; degrees_of_freedom: measured real
-    numbers minus unknowns. decay_std_per_s (R,), omega_std_rad_s (P,), zeta_std (P,): standard deviations of
-    the model's poles, to first order, times sqrt(rss / degrees_of_freedom) where that is above 1; known
-    poles (first of each type) have 0.
+    Attributes
+    ----------
+    model : GobfModel
+        R real poles and P pairs, coefficients, direct term, known integrators and delay.
+    posterior : ResponsePosterior
+        Tangent embedding on the same rows: ellipses at any frequency.
+    omega_rad_s : ndarray, shape (F,)
+        Measured frequencies.
+    residual : ndarray, shape (F,), complex
+        Measured minus fitted.
+    distance : ndarray, shape (F,)
+        Length of the residual in units of the measurement's own ellipses; up to 1 inside.
+    rss : float
+        Chi-square.
+    degrees_of_freedom : int
+        Measured real numbers minus unknowns.
+    decay_std_per_s : ndarray, shape (R,)
+        Standard deviations of the real poles' decays, 1/s, to first order, times sqrt(rss /
+        degrees_of_freedom) where that is above 1. Known poles (first of each type) have 0.
+    omega_std_rad_s, zeta_std : ndarray, shape (P,)
+        Those of the pairs' frequencies, rad/s, and damping ratios.
+    order_table : tuple of OrderStep
+        Every structure that was tried.
+    verdicts : tuple of Finding
+        Chi-square, what is assumed outside the band, and a direct term that was not stated.
+    search : SearchTrace
+        Searches, descents and warnings.
+    response : FrequencyUncertainty
+        The measurement.
     """
 
     model: GobfModel
@@ -55,6 +100,7 @@ class FrfIdentification(Shown):
     response: FrequencyUncertainty
 
     def __post_init__(self) -> None:
+        """Make the arrays read-only; raise ValueError where shapes do not agree or no freedom is left."""
         lock(self, "omega_rad_s", "distance", "decay_std_per_s", "omega_std_rad_s", "zeta_std")
         lock(self, "residual", dtype=np.complex128)
         if not (self.omega_rad_s.shape == self.residual.shape == self.distance.shape):
@@ -77,7 +123,7 @@ class FrfIdentification(Shown):
         return self.model.to_control()
 
     def save(self, path: str | Path) -> None:
-        """Write the model as `GobfModel.save`."""
+        """Write the model to a file, as `GobfModel.save` does."""
         self.model.save(path)
 
 
@@ -110,8 +156,8 @@ def identify_frf(
     Raises
     ------
     ValueError
-        For a frequency without covariance, too few frequencies for the given order, or an option for an
-        offset, an initial state or a relative degree.
+        A frequency has no covariance, there are too few frequencies for the given order, or an option asks
+        for an offset, an initial state or a relative degree.
 
     Notes
     -----
@@ -132,19 +178,23 @@ def identify_frf(
     # Is there enough for the order that was given?
     data = _prepared(response, options)
     fixed = options.fixed()
-    searched = (options.n_real or 0) + 2 * (options.n_pairs or 0)
-    needed = data.n_parameters(fixed.order + searched, fixed.order)
+    n_real = options.n_real or 0
+    n_pairs = options.n_pairs or 0
+    order = fixed.order + n_real + 2 * n_pairs
+    needed = data.n_parameters(order, fixed.order)
     if not data.n_samples > needed:
         raise ValueError(
-            f"{response.omega_rad_s.size} frequencies are too few for order {fixed.order + searched}, which "
+            f"{response.omega_rad_s.size} frequencies are too few for order {order}, which "
             f"has {needed} unknowns; expected at least {needed // 2 + 1}"
         )
 
     # Poles wherever they fit best; then only where the data show them, if that costs no more than chance.
     best_fit = _OrderFit.of(data, options)
+    # Bands (K, 2) in radians per sample: all up to the last frequency; the measured points; those and all
+    # below.
     angles_rad = response.omega_rad_s * response.dt_s
-    points = np.column_stack([angles_rad, angles_rad])
     to_last = np.array([[0.0, angles_rad[-1]]])
+    points = np.column_stack([angles_rad, angles_rad])
     points_and_below = np.vstack([[0.0, angles_rad[0]], points])
     # What lies above the last frequency first: the misfit that other poles follow may be gone with it.
     direct_term_helps = "feedthrough" not in options.model_fields_set
@@ -157,7 +207,9 @@ def identify_frf(
     poles = in_order(best_fit.end.poles, fixed)
     fit = fit_response(data, poles)
     freedom = data.n_samples - data.n_parameters(poles.order, fixed.order)
-    decay, omega, zeta = _pole_deviations(data, poles, fixed, max(1.0, fit.rss / freedom))
+    # A fit worse than its covariances has more error than they state, one that is better no less.
+    variance_factor = max(1.0, fit.rss / freedom)
+    pole_std = _pole_deviations(data, poles, fixed, variance_factor)
     model = GobfModel(
         poles=poles,
         coefficients=fit.coefficients,
@@ -169,7 +221,7 @@ def identify_frf(
     posterior = embed_response(data, model, fixed, embedding, shared_gain_std=shared_gain_std)
 
     # What the data say of the fit, and what the model assumes where there are none.
-    band_rad_s = float(response.omega_rad_s[0]), float(response.omega_rad_s[-1])
+    band_rad_s = (float(response.omega_rad_s[0]), float(response.omega_rad_s[-1]))
     verdicts = [
         finding(
             FindingKind.CHI_SQUARE,
@@ -182,6 +234,12 @@ def identify_frf(
     ]
     if data.feedthrough and not options.feedthrough:
         verdicts.append(finding(FindingKind.RESPONSE_AT_ONCE, direct_term=fit.feedthrough))
+    warnings = distinct(
+        [
+            *pole_warnings(model, fixed, search.bounds),
+            *pairs_outside(poles, fixed, response.dt_s, band_rad_s),
+        ]
+    )
     return FrfIdentification(
         model=model,
         posterior=posterior,
@@ -190,28 +248,19 @@ def identify_frf(
         distance=response.normalised_distance(fit.response),
         rss=fit.rss,
         degrees_of_freedom=freedom,
-        decay_std_per_s=decay,
-        omega_std_rad_s=omega,
-        zeta_std=zeta,
+        decay_std_per_s=pole_std.decay_per_s,
+        omega_std_rad_s=pole_std.omega_rad_s,
+        zeta_std=pole_std.zeta,
         order_table=best_fit.selection.table(best_fit.end),
         verdicts=tuple(verdicts),
-        search=SearchTrace(
-            tuple(search.stages),
-            tuple(search.minima),
-            distinct(
-                [
-                    *pole_warnings(model, fixed, search.bounds),
-                    *pairs_outside(poles, fixed, response.dt_s, band_rad_s),
-                ]
-            ),
-            search.evaluations,
-        ),
+        search=SearchTrace(tuple(search.stages), tuple(search.minima), warnings, search.evaluations),
         response=response,
     )
 
 
 def _prepared(response: FrequencyUncertainty, options: IdentOptions) -> FrfRegression:
-    """The whitened response with the known factors of the options."""
+    """Regression of the response, divided by its covariances, with integrators, delay and direct term of the
+    options as known factors."""
     return prepare_response(
         response,
         integrators=options.integrators,
@@ -222,7 +271,13 @@ def _prepared(response: FrequencyUncertainty, options: IdentOptions) -> FrfRegre
 
 @dataclass(frozen=True, eq=False)
 class _OrderFit:
-    """One order selection that has ended: its problem, its search, and the poles it chose."""
+    """An order selection that has ended.
+
+    data : the regression that was fitted, with or without a direct term
+    search : its pole search, with bounds and trace
+    selection : structures that were tried
+    end : the poles that were chosen, and their chi-square
+    """
 
     data: FrfRegression
     search: PoleSearch[FrfRegression]
@@ -239,16 +294,18 @@ class _OrderFit:
     ) -> _OrderFit:
         """Order and poles from the data.
 
-        measured_rad: (K, 2) bands that limit the poles (`Bounds.shown_by`). start: poles to go on from; None:
-        a global search.
+        `measured_rad` : (K, 2) bands, radians per sample, that limit the poles (`Bounds.shown_by`). `start` :
+        poles to go on from; None: a global search.
         """
         bounds = None
         if measured_rad is not None:
             bounds = Bounds.from_options(options, data.longest, data.dt_s).shown_by(measured_rad)
         search = PoleSearch(data, options, bounds)
         selection = OrderSelection(search)
-        end = selection.run(None if start is None else search.descend(start, "poles shown by the data"))
-        if None not in (options.n_real, options.n_pairs):
+        first = None if start is None else search.descend(start, "poles shown by the data")
+        end = selection.run(first)
+        if options.n_real is not None and options.n_pairs is not None:
+            # With given numbers a pair may stand where two real poles should.
             end = selection.exchanged(end)
         return cls(data, search, selection, end)
 
@@ -261,13 +318,15 @@ def _limited_to_data(
     *,
     also_direct_term: bool = False,
 ) -> _OrderFit:
-    """The fit, or one whose poles all have a band of measured_rad (K, 2) within their half-power width.
+    """Order fit whose poles the data show, or the given one where that is better beyond chance.
 
-    The limited fits compete by the criterion of the order selection. The best of them replaces the given fit
-    unless that is better by more than chance makes the unknowns of its poles without data; one with more
-    unknowns than the given fit has to be better. also_direct_term:
-    limited fits with a direct term compete, too, which does what poles near pi/dt do for a response without
-    the half sample of a hold.
+    `measured_rad` : bands (K, 2), radians per sample; a pole is shown if one of them meets its half-power
+    width. Fits that are limited to such poles compete by the criterion of the order selection. The best of
+    them replaces the given fit unless that is better by more than chance makes the unknowns of its poles
+    without data; one with more unknowns than the given fit has to be better.
+
+    `also_direct_term` : limited fits with a direct term compete, too, which does what poles near pi/dt do for
+    a response without the half sample of a hold.
     """
     unshown_poles = poles_without_data(fit.end.poles, fit.search.fixed, measured_rad)
     if unshown_poles.order == 0:
@@ -279,8 +338,8 @@ def _limited_to_data(
 
     # The criterion of every fit is read from the residual of the given one, so that they can be compared.
     worth = fit.search.colour(fit.end).effective_samples
-    scale_of = (fit.end.rss, fit.end.poles.order, worth)
-    given_criterion = fit.data.criterion(*scale_of)(fit.end.rss, fit.end.poles.order)
+    read_from = (fit.end.rss, fit.end.poles.order, worth)
+    given_criterion = fit.data.criterion(*read_from)(fit.end.rss, fit.end.poles.order)
     given_unknowns = fit.data.n_parameters(fit.end.poles.order)
     by_chance = float(chi2.ppf(TEST_LEVEL, unshown_poles.order))
     best_fit = fit
@@ -290,7 +349,7 @@ def _limited_to_data(
         start = None if also_direct_term else fit.end.poles
         limited_fit = _OrderFit.of(_prepared(response, structure), structure, measured_rad, start)
         end = limited_fit.end
-        criterion = limited_fit.data.criterion(*scale_of)(end.rss, end.poles.order)
+        criterion = limited_fit.data.criterion(*read_from)(end.rss, end.poles.order)
         more_unknowns = limited_fit.data.n_parameters(end.poles.order) > given_unknowns
         allowed = given_criterion if more_unknowns else given_criterion + by_chance
         # A pair is never damped beyond its largest ratio, not even where it should be wider.
@@ -302,16 +361,19 @@ def _limited_to_data(
 
 
 def _assumed_outside(model: GobfModel, band_rad_s: tuple[float, float]) -> Finding:
-    """Largest gains of the model below and above the measured band, and where the larger ones are."""
+    """Finding on the gains of the model below and above the measured band, where nothing was measured.
+
+    `band_rad_s` : first and last measured frequency. The finding has the gains at both ends of the band and
+    at the Nyquist frequency, and the largest ones below and above with the frequency of the one above.
+    """
     low_rad_s, high_rad_s = band_rad_s
     nyquist_rad_s = np.pi / model.dt_s
     # Two decades below the first frequency a model without integrators has its gain at rest.
-    below = np.geomspace(
-        max(low_rad_s, 1e-6 * nyquist_rad_s) / 100, max(low_rad_s, 1e-6 * nyquist_rad_s), 200
-    )
-    above = np.geomspace(min(high_rad_s, nyquist_rad_s), nyquist_rad_s, 2000)
-    gain_below = np.abs(model.frequency_response(below))
-    gain_above = np.abs(model.frequency_response(above))
+    start_rad_s = max(low_rad_s, LOWEST_SHARE * nyquist_rad_s)
+    below_rad_s = np.geomspace(start_rad_s / 100, start_rad_s, POINTS_BELOW)
+    above_rad_s = np.geomspace(min(high_rad_s, nyquist_rad_s), nyquist_rad_s, POINTS_ABOVE)
+    gain_below = np.abs(model.frequency_response(below_rad_s))
+    gain_above = np.abs(model.frequency_response(above_rad_s))
     highest = int(np.argmax(gain_above))
     return finding(
         FindingKind.ASSUMED_OUTSIDE,
@@ -323,35 +385,60 @@ def _assumed_outside(model: GobfModel, band_rad_s: tuple[float, float]) -> Findi
         largest_below=float(gain_below.max()),
         gain_at_high=float(gain_above[0]),
         largest_above=float(gain_above[highest]),
-        largest_above_rad_s=float(above[highest]),
+        largest_above_rad_s=float(above_rad_s[highest]),
         gain_at_nyquist=float(gain_above[-1]),
     )
 
 
+class _PoleDeviations(NamedTuple):
+    """Standard deviations of poles: decays (R,) in 1/s, frequencies (P,) in rad/s, damping ratios (P,)."""
+
+    decay_per_s: RealArray
+    omega_rad_s: RealArray
+    zeta: RealArray
+
+
 def _pole_deviations(
-    data: FrfRegression, poles: Poles, fixed: Poles, scale: float
-) -> tuple[RealArray, RealArray, RealArray]:
-    """Standard deviations of decay (R,) [1/s], omega (P,) [rad/s] and zeta (P,) from the Kaufman Jacobian."""
-    n_real, n_pairs = fixed.counts
-    decay = np.zeros(poles.real.size)
-    omega, zeta = np.zeros(poles.pairs.size), np.zeros(poles.pairs.size)
+    data: FrfRegression, poles: Poles, fixed: Poles, variance_factor: float
+) -> _PoleDeviations:
+    """Standard deviations of the poles from the Kaufman Jacobian, to first order; 0 for the fixed ones.
+
+    `variance_factor` : by which the covariances of the measurement are too small. The unknowns of the
+    Jacobian are 1 - a of a real pole a, and decay s and angle f per sample of a pair.
+    """
+    n_fixed_real, n_fixed_pairs = fixed.counts
+    deviations = _PoleDeviations(
+        decay_per_s=np.zeros(poles.real.size),
+        omega_rad_s=np.zeros(poles.pairs.size),
+        zeta=np.zeros(poles.pairs.size),
+    )
     normal, _ = pole_system(data.linearise(*poles.writable()), poles, fixed)
     if normal.size == 0:
-        return decay, omega, zeta
-    lengths = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    inverse = np.linalg.pinv(normal / np.outer(lengths, lengths), rcond=1e-14, hermitian=True)
-    covariance = scale * inverse / np.outer(lengths, lengths)
-    n_free = poles.real.size - n_real
-    real = np.abs(poles.real[n_real:])
+        return deviations
+
+    # Scaled to columns of one length, so that what counts as unseen has no units.
+    lengths = np.sqrt(np.maximum(np.diag(normal), TINY))
+    scale = np.outer(lengths, lengths)
+    inverse = np.linalg.pinv(normal / scale, rcond=SMALLEST_EIGENVALUE, hermitian=True)
+    covariance = variance_factor * inverse / scale
+
+    n_free_real = poles.real.size - n_fixed_real
+    variance = np.maximum(np.diag(covariance)[:n_free_real], 0.0)
+    modulus = np.abs(poles.real[n_fixed_real:])
     # d decay / d (1 - a) = 1 / (a dt): infinite at a = 0, where decay itself is.
     with np.errstate(divide="ignore"):
-        decay[n_real:] = np.sqrt(np.maximum(np.diag(covariance)[:n_free], 0.0)) / real / data.dt_s
-    for i in range(n_pairs, poles.pairs.size):
-        at = n_free + 2 * (i - n_pairs)
-        s, f = -np.log(np.abs(poles.pairs[i])), np.angle(poles.pairs[i])
-        size = np.hypot(s, f)
-        # omega = |s + jf|, zeta = s / omega.
-        slopes = np.array([[s / size, f / size], [f**2 / size**3, -s * f / size**3]])
-        spread = np.sqrt(np.maximum(np.diag(slopes @ covariance[at : at + 2, at : at + 2] @ slopes.T), 0.0))
-        omega[i], zeta[i] = spread[0] / data.dt_s, spread[1]
-    return decay, omega, zeta
+        deviations.decay_per_s[n_fixed_real:] = np.sqrt(variance) / modulus / data.dt_s
+    for index in range(n_fixed_pairs, poles.pairs.size):
+        first = n_free_real + 2 * (index - n_fixed_pairs)
+        block = covariance[first : first + 2, first : first + 2]
+        decay = -np.log(np.abs(poles.pairs[index]))
+        angle = np.angle(poles.pairs[index])
+        # omega = |decay + j angle|, zeta = decay / omega: their slopes with decay and angle.
+        omega = np.hypot(decay, angle)
+        omega_slopes = [decay / omega, angle / omega]
+        zeta_slopes = [angle**2 / omega**3, -decay * angle / omega**3]
+        slopes = np.array([omega_slopes, zeta_slopes])
+        omega_std, zeta_std = np.sqrt(np.maximum(np.diag(slopes @ block @ slopes.T), 0.0))
+        deviations.omega_rad_s[index] = omega_std / data.dt_s
+        deviations.zeta[index] = zeta_std
+    return deviations
