@@ -1,10 +1,10 @@
 """Identify a model from a measured frequency response whose errors have known covariances.
 
 The response is divided by its errors' size, so that the residual energy is chi-square where the model is
-right. Poles are searched and their number is chosen as for records (`_OrderFit`). Poles that no measured frequency
-shows are then replaced where fits without them are as good but for chance (`_limited_to_data`). What is left
-are the model, ellipses around it (`embed_response`), standard deviations of its poles, and what it assumes
-outside the measured band. Assumed: errors that are independent from frequency to frequency.
+right. Poles are searched and their number is chosen as for records (`_OrderFit`). Poles that no measured
+frequency shows are then replaced where fits without them are as good but for chance (`_limited_to_data`).
+What is left are the model, ellipses around it (`embed_response`), standard deviations of its poles, and what
+it assumes outside the measured band. Assumed: errors that are independent from frequency to frequency.
 """
 
 from __future__ import annotations

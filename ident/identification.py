@@ -1,4 +1,9 @@
-"""The result of an identification: model, residuals, order table, search, verdicts."""
+"""Results of an identification: a model, and everything needed to judge it.
+
+`FittedRecords` holds what all fits to records have; `Identification` adds a model of one input and one
+output, `MimoIdentification` one of several. They are made by `ident.one_input` and `ident.several_outputs`,
+stored in files, and shown in tables by `ident.data.shown`; nothing is computed here but the list of warnings.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +30,40 @@ from ident.search.pole_search import SearchTrace
 class FittedRecords(Shown):
     """How well a model with poles fits the K records it was made from.
 
-    structure: around the basis, after the data decided what was left to them. residuals: (T - delay,) each,
-    nuisances taken off. fit_percent (K,): 100 (1 - |residual| / |y - mean y|). rss; noise_std: sqrt(rss / (N
-    - unknowns)), output units. tangent_optimality: share of the residual (0..1) in the tangent space of the
-    free poles, 0 at an optimum. order_table: every structure tried. n_fixed: real poles and pairs that were
-    given (integrators counted), first of each type. verdicts: on each question left to the data and each
-    prior. noise_filter: A(q) behind which everything was fitted, [1.0] for white noise. advise: further
-    warnings, looked for when they are first asked for. records: what it was made from; order_given: nobody
-    left it to the data; neither is stored.
+    Attributes
+    ----------
+    structure : Structure
+        Around the basis, after the data decided what was left to them.
+    record_names : tuple of str
+        K names.
+    residuals : tuple of ndarray, shape (T - delay,) each
+        Measured minus fitted output of each record, nuisances (offset, initial state) taken off.
+    fit_percent : ndarray, shape (K,)
+        100 (1 - |residual| / |y - mean y|).
+    rss : float
+        Residual sum of squares over all records.
+    noise_std : float
+        sqrt(rss / (N - unknowns)), output units.
+    tangent_optimality : float
+        Share of the residual (0 .. 1) in the tangent space of the free poles, 0 at an optimum.
+    order_table : tuple of OrderStep
+        Every structure tried.
+    verdicts : tuple of Finding
+        On each question that was left to the data and each prior.
+    search : SearchTrace
+        Global searches and descents.
+    n_fixed : tuple of int
+        Real poles and pairs that were given (integrators counted), first of each type.
+    prior_tests : tuple of PriorTest
+        Tests behind the verdicts on priors.
+    noise_filter
+        A(q) behind which everything was fitted; of white noise 1.
+    advise : callable
+        Further warnings, looked for when they are first asked for.
+    records : tuple of Record
+        What it was made from; not stored.
+    order_given : bool
+        Nobody left the order to the data; not stored.
     """
 
     table_in_notebook = True
@@ -55,9 +86,11 @@ class FittedRecords(Shown):
     order_given: bool = field(default=False, compare=False, metadata=NOT_STORED)
 
     def __post_init__(self) -> None:
+        """Make arrays read-only; raise ValueError where numbers of records differ or sums are negative."""
         object.__setattr__(self, "residuals", tuple(readonly(item) for item in self.residuals))
         lock(self, "fit_percent", "noise_filter")
-        if not len(self.residuals) == len(self.record_names) == self.fit_percent.size:
+        n_records = len(self.record_names)
+        if not len(self.residuals) == n_records == self.fit_percent.size:
             raise ValueError("residuals, record_names and fit_percent must have one entry per record")
         if not (self.rss >= 0 and self.noise_std >= 0 and self.tangent_optimality >= 0):
             raise ValueError(
@@ -67,13 +100,13 @@ class FittedRecords(Shown):
 
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the model."""
+        """What to look at before trusting the model: warnings of the search, then advice; each once."""
         return distinct((*self.search.warnings, *self.advise()))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Identification(FittedRecords):
-    """A fitted model of one input, and how well it fits.
+    """A fitted model of one input and one output, and how well it fits: residuals (T - delay,).
 
     Examples
     --------
@@ -89,7 +122,7 @@ class Identification(FittedRecords):
         return self.model.to_control()
 
     def save(self, path: str | Path) -> None:
-        """Write the model as `GobfModel.save`."""
+        """Write the model to a file, as `GobfModel.save` does."""
         self.model.save(path)
 
 
@@ -97,10 +130,21 @@ class Identification(FittedRecords):
 class MimoIdentification(FittedRecords):
     """A fitted model of several inputs and outputs with shared poles, and how well it fits.
 
-    Residuals (T - delay, Y), in units of the outputs. rss, noise_std and the order table are those of outputs
-    made white, of noise one; noise_covariance (Y, Y) is that of the outputs' noise, output_fit_percent (K, Y)
-    is `fit_percent` by output. rank_one: the modes (of `MimoModel.residues`) that the records let have one
-    shape; rank_one_test: the chance that noise alone makes free residues fit so much better.
+    Residuals are (T - delay, Y), in units of the outputs. rss, noise_std and the order table are those of
+    outputs that were whitened to noise of one.
+
+    Attributes
+    ----------
+    model : MimoModel
+    noise_covariance : ndarray, shape (Y, Y)
+        Of the outputs' noise, in their units.
+    output_fit_percent : ndarray, shape (K, Y)
+        `fit_percent` by output.
+    rank_one : tuple of bool
+        Of each mode (of `MimoModel.residues`): the records let it have one shape; empty where every residue
+        was left free.
+    rank_one_test : float
+        Probability that noise alone makes free residues fit so much better than the shapes.
     """
 
     model: MimoModel

@@ -1,4 +1,9 @@
-"""Coefficients of basis functions that give responses which are known at frequencies."""
+"""Coefficients of basis functions that give responses which are known at frequencies.
+
+Real coefficients are fitted to complex responses by weighted linear least squares. `ident.command_timing` and
+`ident.resampling` write responses with it that they know only frequency by frequency. Directions in which the
+columns are alike but for rounding get no coefficient.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +11,9 @@ import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 
-# Singular values below this share of the largest are rounding: poles that nearly meet make columns that are
-# alike to many digits, which would get coefficients that cancel each other, and proofs between frequencies
-# would not get through. From 1e-12 to 1e-6 the responses stay.
+# Singular values below this share of the largest are taken for rounding: poles that nearly meet make columns
+# that are alike to many digits, which would get coefficients that cancel each other, and proofs between
+# frequencies would not get through. From 1e-12 to 1e-6 the responses do not change.
 SMALLEST_SINGULAR = 1e-8
 
 
@@ -18,21 +23,24 @@ def coefficients_of(rows: ComplexArray, wanted: ComplexArray, weight: RealArray)
     Parameters
     ----------
     rows : ndarray, shape (F, P), complex
-        Responses of the columns.
+        Responses of the P columns at F frequencies.
     wanted : ndarray, shape (F, N), complex
-        Responses that are to be given.
+        N responses that are to be given.
     weight : ndarray, shape (F,)
-        Of the errors at each frequency.
+        By which the errors at each frequency count.
 
     Returns
     -------
     ndarray, shape (P, N)
-        Least squares over real and imaginary parts, columns scaled to one length first.
+        Least squares over real and imaginary parts. A column of zeros gets a coefficient of zero.
     """
     weighted = rows * weight[:, None]
+    weighted_wanted = wanted * weight[:, None]
+    # Columns of one length, so that what counts as alike does not depend on their units.
     length = np.linalg.norm(weighted, axis=0)
-    length[length == 0] = 1.0
+    is_zero = length == 0
+    length[is_zero] = 1.0
     left = real_rows(np.asarray(weighted / length, dtype=np.complex128))
-    right = real_rows(np.asarray(wanted * weight[:, None], dtype=np.complex128))
-    solved = np.linalg.lstsq(left, right, rcond=SMALLEST_SINGULAR)[0]
-    return np.asarray(solved / length[:, None], dtype=np.float64)
+    right = real_rows(np.asarray(weighted_wanted, dtype=np.complex128))
+    solution, *_ = np.linalg.lstsq(left, right, rcond=SMALLEST_SINGULAR)
+    return np.asarray(solution / length[:, None], dtype=np.float64)

@@ -1,11 +1,17 @@
-"""Ellipses around an identified model, and what its residuals and its nominal model say about them."""
+"""Ellipses around an identified model, and what its residuals and its nominal model say about them.
+
+`uncertainty` embeds the response in a posterior around the identified poles (`tangent`), behind as long a
+noise model as the residuals ask for (`with_noise_model`). The result, `Uncertainty`, is that posterior with
+advice: what the tests of the residuals say, whether a nominal model with the identified poles lies inside the
+ellipses, and whether the data suspect a mode that is missing. Assumed: what `tangent` assumes, noise that an
+autoregression describes and a linear arm.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from operator import itemgetter
 from typing import TypeVar
 
 import numpy as np
@@ -30,21 +36,34 @@ from ident.identification import Identification
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import NominalAgreement, nominal_near
 
-# Largest orders of the noise model that are tried, until the residuals behind it are white.
+# Largest orders of the noise model that are tried, until the residuals behind it are white: the first holds
+# drift, friction and a sensor's filter, the second a hum or a mode in the noise as well.
 NOISE_ORDERS = (8, 32)
-# Factor on the odds: Bayes factor of "positive" evidence (Kass and Raftery, 1995).
-_POSITIVE = 3.0
-T = TypeVar("T")
+# Factor by which the data have to raise the odds of a missing mode before it is suspected: a Bayes factor of
+# "positive" evidence (Kass and Raftery, JASA 90(430), 1995).
+POSITIVE_EVIDENCE = 3.0
+# Level of the ellipses whose size at the modes is told.
+SHOWN_LEVEL = 0.95
+# Lowest frequency at which ellipses are shown, as a share of the Nyquist frequency: three decades.
+LOWEST_SHOWN_SHARE = 1e-3
+PosteriorT = TypeVar("PosteriorT")
 OptionsT = TypeVar("OptionsT", bound=EmbeddingOptions)
+# Tests of whiteness, and of what is left of the input in the residuals.
 Tests = tuple[ResidualTest, ResidualTest]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(ResponsePosterior):
-    """Response with ellipses at any frequency (`at`).
+    """Posterior of a response, with ellipses at any frequency (`at`) and what to think of them.
 
-    nominal_poles: of the identified model; prior_missed_mode: as it was stated; advice: what the residuals
-    say about the ellipses.
+    Attributes
+    ----------
+    nominal_poles : Poles
+        Of the identified model.
+    prior_missed_mode : float
+        Probability of a mode that the model lacks, as it was stated.
+    advice : tuple of Finding
+        What the residuals say about the ellipses.
 
     Examples
     --------
@@ -60,42 +79,70 @@ class Uncertainty(ResponsePosterior):
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
         """What to look at before trusting the ellipses: residuals, and a nominal outside most of them."""
-        return distinct((*self.advice, *self.agreement(self.nominal().frequency_response).doubt))
+        nominal_doubt = self.agreement(self.nominal().frequency_response).doubt
+        return distinct((*self.advice, *nominal_doubt))
 
     def agreement(
         self, response: Callable[[RealArray], ComplexArray], level: float = 0.95
     ) -> NominalAgreement:
-        """How far a response, rad/s (F,) to G (F,), is from the centres, in ellipses of a level."""
+        """How far a response lies from the centres, in ellipses of a level.
+
+        Parameters
+        ----------
+        response : callable
+            Frequencies (F,) in rad/s to G (F,).
+        level : float
+            Probability of the ellipses.
+
+        Returns
+        -------
+        NominalAgreement
+            On `shown_grid`; its `doubt` is empty where the response lies inside most ellipses.
+        """
         return NominalAgreement.of(self.at(self.shown_grid, level), response)
 
     def conditions(self, response: Callable[[RealArray], ComplexArray], level: float) -> list[Finding]:
-        """What a certificate for this nominal response over the ellipses stands or falls with."""
+        """What a certificate for a nominal response over the ellipses of a level stands or falls with.
+
+        `response` : frequencies (F,) in rad/s to G (F,). Doubts about the ellipses, then about the nominal.
+        """
         return [*conditions_of(self.advice), *self.agreement(response, level).doubt]
 
     @property
     def shown_grid(self) -> RealArray:
-        """Frequencies (F,) over three decades up to the Nyquist frequency."""
+        """Frequencies (F,), rad/s, over three decades up to the Nyquist frequency."""
         nyquist = np.pi / self.dt_s
-        return np.geomspace(1e-3 * nyquist, nyquist, FREQUENCIES)
+        return np.geomspace(LOWEST_SHOWN_SHARE * nyquist, nyquist, FREQUENCIES)
 
     @property
     def missed_mode_suspected(self) -> bool:
-        """The data themselves raise the odds that a mode is missing."""
-        now, before = getattr(self.report, "probability_missed_mode", 0.0), self.prior_missed_mode
-        return now * (1 - before) >= _POSITIVE * (1 - now) * before > 0
+        """Whether the data raise the odds that a mode is missing, by `POSITIVE_EVIDENCE` or more.
+
+        False where no such mode was thought possible.
+        """
+        before = self.prior_missed_mode
+        after = getattr(self.report, "probability_missed_mode", 0.0)
+        # Odds p / (1 - p) after against before, multiplied out: a probability of one would divide by zero.
+        in_favour = after * (1 - before)
+        needed = POSITIVE_EVIDENCE * (1 - after) * before
+        return in_favour >= needed > 0
 
     def nominal(self) -> GobfModel:
-        """Model on the identified poles, nearest to the centre in units of the ellipses."""
+        """Model on the identified poles that is nearest to the centre, in units of the ellipses."""
         return nominal_near(self, self.nominal_poles, self.shown_grid)
 
     def at_modes(self) -> list[tuple[float, float]]:
-        """(frequency [rad/s], major semi-axis of the 95 % ellipse over gain) at every mode."""
+        """Frequency, rad/s, of every mode, and the major semi-axis of its 95 % ellipse over the gain there.
+
+        Modes up to the Nyquist frequency, from low to high; empty without modes.
+        """
         omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
-        here = self.at(omega[omega < np.pi / self.dt_s]) if omega.size else None
-        if here is None:
+        if not omega.size:
             return []
-        share = here.ellipse(0.95).semi_major / np.abs(here.centre)
-        return list(zip(here.omega_rad_s.tolist(), share.tolist(), strict=True))
+        is_seen = omega < np.pi / self.dt_s
+        at_modes = self.at(omega[is_seen])
+        relative_size = at_modes.ellipse(SHOWN_LEVEL).semi_major / np.abs(at_modes.centre)
+        return list(zip(at_modes.omega_rad_s.tolist(), relative_size.tolist(), strict=True))
 
     def to_control(self) -> object:
         """`nominal` as `control.StateSpace`, without the ellipses."""
@@ -103,56 +150,96 @@ class Uncertainty(ResponsePosterior):
 
 
 def with_noise_model(
-    options: OptionsT, white: bool, found_with: Callable[[OptionsT], tuple[T, Tests]]
-) -> tuple[tuple[T, Tests], OptionsT]:
-    """What is found with as much of a noise model as the residuals ask for, and the settings with it.
+    options: OptionsT, white: bool, found_with: Callable[[OptionsT], tuple[PosteriorT, Tests]]
+) -> tuple[tuple[PosteriorT, Tests], OptionsT]:
+    """Posterior behind as long a noise model as the residuals ask for.
 
+    Parameters
+    ----------
+    options : EmbeddingOptions
+        A noise model that is stated (`coloured_noise` True or False) is used as it is.
+    white : bool
+        The residuals of the identification are white: no noise model is needed.
+    found_with : callable
+        Settings to a posterior and the tests of its residuals: of whiteness first.
+
+    Returns
+    -------
+    tuple
+        The posterior and the tests; of several orders those with the whitest residuals, the first of equals.
+    EmbeddingOptions
+        Settings with the noise model that was used.
+
+    Notes
+    -----
     White-noise bounds around coloured residuals are far too narrow, so the data decide unless it is stated.
     """
     if options.coloured_noise != "auto":
         return found_with(options), options
     if white:
-        plain = options.model_copy(update={"coloured_noise": False})
-        return found_with(plain), plain
-    tried = []
+        plain_options = options.model_copy(update={"coloured_noise": False})
+        return found_with(plain_options), plain_options
+    best = None
+    best_options = options
+    best_probability = -np.inf
     for order in NOISE_ORDERS:
-        asked = options.model_copy(update={"coloured_noise": True, "max_ar_order": order})
-        found = found_with(asked)
-        whiteness, _ = found[1]
-        tried.append((whiteness.probability, found, asked))
+        order_options = options.model_copy(update={"coloured_noise": True, "max_ar_order": order})
+        result = found_with(order_options)
+        whiteness, _ = result[1]
+        # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
+        if best is None or whiteness.probability > best_probability:
+            best = result
+            best_options = order_options
+            best_probability = whiteness.probability
         if whiteness.passed:
             break
-    # A longer noise model has to make the residuals whiter: inside a band it can also turn upon itself.
-    _, best, asked = max(tried, key=itemgetter(0))
-    return best, asked
+    assert best is not None
+    return best, best_options
 
 
 def uncertainty(
     records: Sequence[Record], identification: Identification, options: EmbeddingOptions
 ) -> Uncertainty:
-    """Posterior of the response around an identified model, as `tangent`, with what its residuals say.
+    """Posterior of the response around an identified model, with what its residuals say.
 
-    records: those of the identification. Raises ValueError as `tangent`, and where the output does not answer
-    to the input.
+    Parameters
+    ----------
+    records : sequence of Record
+        Those of the identification.
+    identification : Identification
+    options : EmbeddingOptions
+        Kernel, taps, noise model and the probability of a missing mode.
+
+    Returns
+    -------
+    Uncertainty
+
+    Raises
+    ------
+    ValueError
+        As `tangent`, and where the output does not answer to the input: a response of zero lies inside all
+        ellipses.
     """
 
-    def behind(asked: EmbeddingOptions) -> tuple[ResponsePosterior, Tests]:
-        found = tangent(records, identification.model, asked)
-        return found, residual_tests(found, records)
+    def posterior_with(step_options: EmbeddingOptions) -> tuple[ResponsePosterior, Tests]:
+        """Posterior behind this noise model, and the tests of its residuals."""
+        posterior = tangent(records, identification.model, step_options)
+        return posterior, residual_tests(posterior, records)
 
     try:
         white = whiteness_test(identification.residuals).passed
-        (found, tests), _ = with_noise_model(options, white, behind)
-        order = 0 if found.report is None else len(found.report.ar_coefficients)
-        advice = residual_advice(*tests, noise_order=order)
-    except ValueError:  # records too short for a test, or nothing left to test
+        (posterior, tests), _ = with_noise_model(options, white, posterior_with)
+        noise_order = 0 if posterior.report is None else len(posterior.report.ar_coefficients)
+        advice = residual_advice(*tests, noise_order=noise_order)
+    except ValueError:
+        # Records are too short for a test, or there is nothing left to test: a noise model only if it is
+        # stated.
         coloured = options.coloured_noise is True
-        found = tangent(
-            records, identification.model, options.model_copy(update={"coloured_noise": coloured})
-        )
+        untested_options = options.model_copy(update={"coloured_noise": coloured})
+        posterior = tangent(records, identification.model, untested_options)
         advice = []
     spread = Uncertainty(
-        **{each.name: getattr(found, each.name) for each in fields(found)},
+        **{field.name: getattr(posterior, field.name) for field in fields(posterior)},
         nominal_poles=identification.model.poles,
         prior_missed_mode=options.prior_missed_mode,
         advice=tuple(advice),
