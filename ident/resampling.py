@@ -1,4 +1,4 @@
-"""An identified response for a controller that runs at another rate than the log.
+"""Write an identified response for a controller that runs at another rate than the log.
 
 A model tells the output at its samples for a command that is held between them. Held for N of its steps and
 read at every N-th, the same arm has the response
@@ -8,6 +8,9 @@ read at every N-th, the same arm has the response
 whose poles are the N-th powers: that is exact. Held for an N-th of a step, it has to first order the response
 of the model over the mean S of N commands (`ident.command_timing`), on the N-th roots of the poles. Neglected
 there: what the log folds back from above its Nyquist frequency, where the ellipses are opened.
+
+`resampled` fits the new response by the basis of the new poles and a few taps; `resampled_poles` and
+`resampled_friction` do what their names say for poles and for an arm with friction.
 """
 
 from __future__ import annotations
@@ -29,28 +32,60 @@ SAME_RATIO = 1e-3
 # Steps of one rate in one of the other, at most: a log at 10 kHz beside a controller at 100 Hz. Beyond that a
 # log shows hardly any of the controller's band, and a computation takes minutes.
 MOST_STEPS = 100
-# Taps beyond those of the posterior: what a delay of a part of a step leaves behind the poles.
+# Taps beyond those of the posterior: what a delay of a part of a step leaves behind the poles. With 3 or 12
+# no test of resampling moves.
 TAPS = 6
 # Power of sin(w Td / 2) with which ellipses open towards the log's Nyquist frequency, where they are as wide
 # as the response: 1 % of it at .3 of that frequency. A filter of few taps; a steeper one ripples above, and
-# proofs between grid points do not get through.
+# proofs between grid points do not get through. With 2 or 8 no test of resampling moves.
 OPENING_POWER = 4
-# Ellipses hold so many times (w T / 2 pi)^2 of the response for what was folded back: an arm that falls with
-# 1/w has 1.4 of it at .3 of the log's Nyquist frequency.
+# Ellipses hold so many times (w T / pi)^2 of the response for what was folded back, T the step of the log. An
+# arm that falls with 1/w has .35 of it at .3 of the log's Nyquist frequency. Halved, no test of resampling
+# moves; doubled, ellipses are wider at low frequencies than a test allows.
 FOLDED_BACK = 1.5
-# Share of a response below which what was folded back does not count: a tenth of what most logs tell.
+# Share of a response below which what was folded back does not count: a tenth of what most logs tell. Halved
+# or doubled, no test of resampling moves.
 LEAST_FOLDED = 1e-4
 # Weight of a response of this size above the log's Nyquist frequency, beside relative errors below: it
-# decides only what the data leave open.
+# decides only what the data leave open. Halved or doubled, no test of resampling moves.
 FALLS_WEIGHT = 0.02
-# Lowest frequency that is fitted, times the longer step: a motion of a day in a log at 10 Hz.
+# Lowest frequency that is fitted, times the longer step: a motion of a week in a log at 10 Hz.
 LOWEST_ANGLE_RAD = 1e-6
+# Highest frequency that is fitted, as a share of pi over the longer step: at the Nyquist frequency itself
+# responses are real, so that a complex one may not be met.
+HIGHEST_SHARE = 0.99
+# Frequencies of a logarithmic grid from the lowest to the highest one: ninety in a decade.
+SLOW_POINTS = 600
+# Frequencies of a linear grid from zero to the highest one, beside those for the taps.
+EVEN_POINTS = 200
+# Further ones of that grid for each tap: the last tap then has eight of them in each of its turns.
+EVEN_POINTS_PER_TAP = 4
+# Frequencies around each mode: eight in its half-power width.
+MODE_POINTS = 33
+# They reach so many halves of that width to both sides.
+MODE_HALF_WIDTHS = 4
+# Frequencies above the log's Nyquist frequency for each multiple of it: about as dense as the linear grid.
+ABOVE_POINTS = 400
 # Taps at most: kernels decay within a hundred steps, and each tap costs the proofs between grid points.
 MOST_TAPS = 240
+# A delay that is a whole number of steps but for rounding stays that number.
+ROUNDING = 1e-9
 
 
 def ratio_of(model_dt_s: float, controller_dt_s: float) -> tuple[int, int]:
-    """Steps of the model in one of the controller, and the reverse; one of the two is 1.
+    """Steps of the model in one of the controller, and steps of the controller in one of the model.
+
+    Parameters
+    ----------
+    model_dt_s : float
+        Step of the log, s.
+    controller_dt_s : float
+        Period of the controller, s.
+
+    Returns
+    -------
+    tuple of int
+        (N, 1) for a controller N times as slow, (1, N) for one N times as fast.
 
     Raises
     ------
@@ -63,19 +98,42 @@ def ratio_of(model_dt_s: float, controller_dt_s: float) -> tuple[int, int]:
             f"controller_dt_s = {controller_dt_s:.6g} s beside a log every {model_dt_s:.6g} s: expected "
             f"{model_dt_s / MOST_STEPS:.6g} to {model_dt_s * MOST_STEPS:.6g}"
         )
-    if longer >= 1 and abs(longer - round(longer)) <= SAME_RATIO * longer:
-        return round(longer), 1
-    if longer < 1 and abs(1 / longer - round(1 / longer)) <= SAME_RATIO / longer:
-        return 1, round(1 / longer)
-    nearest = model_dt_s * round(longer) if longer >= 1 else model_dt_s / round(1 / longer)
+    if longer >= 1:
+        steps = round(longer)
+        nearest_s = model_dt_s * steps
+        if abs(longer - steps) <= SAME_RATIO * longer:
+            return steps, 1
+    else:
+        steps = round(1 / longer)
+        nearest_s = model_dt_s / steps
+        if abs(1 / longer - steps) <= SAME_RATIO / longer:
+            return 1, steps
     raise ValueError(
         f"controller_dt_s = {controller_dt_s:.6g} s beside a log every {model_dt_s:.6g} s: expected a whole "
-        f"multiple or a whole part of the log's step, such as {nearest:.6g}"
+        f"multiple or a whole part of the log's step, such as {nearest_s:.6g}"
     )
 
 
 def resampled_poles(poles: Poles, model_dt_s: float, controller_dt_s: float) -> Poles:
-    """The poles in z of a step that is a whole multiple or part of the model's."""
+    """Poles in z of a step that is a whole multiple or part of the model's.
+
+    Parameters
+    ----------
+    poles : Poles
+        Of the step `model_dt_s`.
+    model_dt_s, controller_dt_s : float
+        Both steps, s.
+
+    Returns
+    -------
+    Poles
+        Powers p^(controller_dt_s / model_dt_s), as many real ones and pairs as before.
+
+    Raises
+    ------
+    ValueError
+        Neither step is a whole multiple of the other (`ratio_of`).
+    """
     down, up = ratio_of(model_dt_s, controller_dt_s)
     real = []
     for pole in poles.real.tolist():
@@ -93,25 +151,32 @@ def resampled_poles(poles: Poles, model_dt_s: float, controller_dt_s: float) -> 
 
 
 def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponsePosterior:
-    """The posterior of the response that a controller with another period sees.
+    """Posterior of the response that a controller with another period sees.
 
     Parameters
     ----------
     posterior : ResponsePosterior
-        Of a command held from row to row of the log.
+        Of a command held from row to row of the log: poles, mean (P,) and covariance factor (P, P') of the
+        coefficients, taps, integrators and delay.
     controller_dt_s : float
         Period of the new controller, s: a whole multiple or part of the posterior's step.
 
     Returns
     -------
     ResponsePosterior
-        With dt_s = controller_dt_s. Of a faster controller the ellipses above the log's Nyquist frequency are
-        wider than the response, which continues as the modes do: nothing was measured there.
+        With dt_s = controller_dt_s; the posterior itself where the periods are the same. Of a faster
+        controller the ellipses above the log's Nyquist frequency are wider than the response, which continues
+        as the modes do: nothing was measured there.
 
     Raises
     ------
     ValueError
         Other ratios; unstable plants, whose all-pass has no root.
+
+    Notes
+    -----
+    Mean and every column of the covariance factor are responses (module's docstring). Their coefficients on
+    the new basis are fitted by least squares over frequency, errors relative to the response.
     """
     down, up = ratio_of(posterior.dt_s, controller_dt_s)
     if down == up:
@@ -121,13 +186,19 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
             "controller_dt_s: an arm with unstable poles is designed for at the rate of its log; leave "
             "controller_dt_s out"
         )
-    power = down / up
+    is_faster = up > 1
+
+    # The new basis: powers of the poles, as long a kernel in seconds, and the whole steps of the delay.
+    period_ratio = down / up
     delay_s = posterior.input_delay_samples * posterior.dt_s
-    delay = int(np.floor(delay_s / controller_dt_s * (1 + 1e-9)))
-    n_taps = int(np.ceil(posterior.fir_length / power)) + TAPS
-    # The last taps are left to what is not known of a faster controller's response: a filter of the rest.
-    n_left = OPENING_POWER + up if up > 1 else 0
-    n_taps = min(n_taps, MOST_TAPS) + n_left
+    delay_samples = int(np.floor(delay_s / controller_dt_s * (1 + ROUNDING)))
+    n_fitted_taps = min(int(np.ceil(posterior.fir_length / period_ratio)) + TAPS, MOST_TAPS)
+    # The last taps are left to what is not known of a faster controller's response: the fitted one times
+    # filters of up to so many taps (`_unknown_above`).
+    n_opening_taps = 0
+    if is_faster:
+        n_opening_taps = OPENING_POWER + up
+    n_taps = n_fitted_taps + n_opening_taps
     poles = resampled_poles(posterior.poles, posterior.dt_s, controller_dt_s)
     size = poles.order + int(posterior.has_feedthrough) + n_taps
     empty = ResponsePosterior(
@@ -138,109 +209,155 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
         fir_length=n_taps,
         has_feedthrough=posterior.has_feedthrough,
         integrators=posterior.integrators,
-        input_delay_samples=delay,
+        input_delay_samples=delay_samples,
         input_name=posterior.input_name,
         output_name=posterior.output_name,
         report=posterior.report,
     )
-    known = np.column_stack([posterior.mean, posterior.covariance_factor])
+
+    # Frequencies up to the lower of both Nyquist frequencies, dense where responses turn.
     slower_dt_s = max(posterior.dt_s, controller_dt_s)
-    slow = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, 600) / slower_dt_s
-    # Between two of these no tap turns round.
-    even = np.linspace(0.0, 0.99 * np.pi, 4 * n_taps + 200)[1:] / slower_dt_s
+    slow_angle = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, SLOW_POINTS)
+    slow = slow_angle / slower_dt_s
+    n_even = EVEN_POINTS_PER_TAP * n_taps + EVEN_POINTS
+    even_angle = np.linspace(0.0, HIGHEST_SHARE * np.pi, n_even)[1:]
+    even = even_angle / slower_dt_s
     omega = np.union1d(np.union1d(slow, even), _around_modes(posterior))
-    omega = omega[omega < 0.99 * np.pi / slower_dt_s]
-    if up == 1:
-        wanted = _held(posterior, omega, down) @ known
-    else:
+    is_below = omega < HIGHEST_SHARE * np.pi / slower_dt_s
+    omega = omega[is_below]
+
+    # What the controller sees there of the mean and of every column of the factor, (F, 1 + P').
+    known = np.column_stack([posterior.mean, posterior.covariance_factor])
+    if is_faster:
         # Held for a part of a step: its mean over the step is what the model was given.
-        shorter = Hold(1 / up).response(omega * posterior.dt_s)
-        wanted = (posterior.frequency_rows(omega) @ known) * shorter[:, None]
+        shorter_hold = Hold(1 / up).response(omega * posterior.dt_s)
+        wanted = (posterior.frequency_rows(omega) @ known) * shorter_hold[:, None]
         omega, wanted = _falling_above(omega, wanted, posterior.dt_s, up)
+    else:
+        wanted = _held(posterior, omega, down) @ known
     weight = 1 / np.abs(wanted[:, 0])
-    if up > 1:
+    if is_faster:
         # Exact where nothing was folded back; elsewhere as exact as what was.
-        weight /= np.maximum((omega * posterior.dt_s / (2 * np.pi)) ** 2, LEAST_FOLDED)
-        above = omega > np.pi / posterior.dt_s
-        weight[above] *= FALLS_WEIGHT
-        wanted[above] = 0.0
-    solved = coefficients_of(empty.frequency_rows(omega)[:, : size - n_left], wanted, weight)
-    solved = np.pad(solved, ((0, n_left), (0, 0)))
-    found = replace(empty, mean=solved[:, 0], covariance_factor=solved[:, 1:])
-    if up == 1:
-        return found
-    unknown = _unknown_above(found, posterior.dt_s, up)
-    return replace(found, covariance_factor=np.hstack([found.covariance_factor, unknown]))
+        turns_per_step = omega * posterior.dt_s / (2 * np.pi)
+        weight /= np.maximum(turns_per_step**2, LEAST_FOLDED)
+        is_above = omega > np.pi / posterior.dt_s
+        weight[is_above] *= FALLS_WEIGHT
+        wanted[is_above] = 0.0
+
+    rows = empty.frequency_rows(omega)[:, : size - n_opening_taps]
+    solution = coefficients_of(rows, wanted, weight)
+    solution = np.pad(solution, ((0, n_opening_taps), (0, 0)))
+    at_new_rate = replace(empty, mean=solution[:, 0], covariance_factor=solution[:, 1:])
+    if not is_faster:
+        return at_new_rate
+    unknown = _unknown_above(at_new_rate, posterior.dt_s, up)
+    return replace(at_new_rate, covariance_factor=np.hstack([at_new_rate.covariance_factor, unknown]))
 
 
 def _falling_above(
     omega: RealArray, wanted: ComplexArray, log_dt_s: float, up: int
 ) -> tuple[RealArray, ComplexArray]:
-    """Frequencies (F,) and responses (F, N) with more above the log's Nyquist frequency, of the size that an
-    inertia has there: it falls with 1/w^2."""
-    above = np.linspace(1.0, 0.99 * up, 400 * up)[1:] * np.pi / log_dt_s
-    last = np.abs(wanted[-1:, :1])
+    """Frequencies (F',) and responses (F', N) with further ones above the log's Nyquist frequency.
+
+    `omega` (F,), rad/s, and `wanted` (F, N) : those below it. There the mean, the first response, has the
+    size that an inertia has, which falls with 1/w^2 from the last one below; all others are zero.
+    """
+    multiples = np.linspace(1.0, HIGHEST_SHARE * up, ABOVE_POINTS * up)[1:]
+    above = multiples * np.pi / log_dt_s
+    last_size = np.abs(wanted[-1:, :1])
+    fall = (omega[-1] / above) ** 2
     falling = np.zeros((above.size, wanted.shape[1]), dtype=np.complex128)
-    falling[:, :1] = last * ((omega[-1] / above) ** 2)[:, None]
+    falling[:, :1] = last_size * fall[:, None]
     return np.concatenate([omega, above]), np.vstack([wanted, falling])
 
 
 def _around_modes(posterior: ResponsePosterior) -> RealArray:
-    """Frequencies at and beside the poles, where a response turns fastest."""
+    """Frequencies (F,), rad/s, at and beside the poles, where a response turns fastest; above zero."""
     rates = np.log(posterior.poles.pairs) / posterior.dt_s
-    beside = np.linspace(-4, 4, 33)
-    return np.abs((rates.imag[:, None] + beside * np.abs(rates.real[:, None])).ravel()) + 1e-12
+    half_widths = np.linspace(-MODE_HALF_WIDTHS, MODE_HALF_WIDTHS, MODE_POINTS)
+    around = rates.imag[:, None] + half_widths * np.abs(rates.real[:, None])
+    # A response of an integrator has no value at zero.
+    return np.abs(around.ravel()) + 1e-12
 
 
 def _held(posterior: ResponsePosterior, omega: RealArray, steps: int) -> ComplexArray:
-    """Rows (F, P) of the response to a command held for so many steps, read once in as many."""
+    """Rows (F, P) of the response to a command held for so many steps, read once in as many.
+
+    `omega` (F,), rad/s, up to the Nyquist frequency of the longer step. A sum over the frequencies that the
+    slower rate folds onto each other (module's docstring).
+    """
     total = np.zeros((omega.size, posterior.mean.size), dtype=np.complex128)
     nyquist = np.pi / posterior.dt_s
     for image in range(steps):
         angle = omega * posterior.dt_s + 2 * np.pi * image / steps
         # Rows are known from 0 to Nyquist; beyond it the response is the conjugate of its mirror image.
         folded = np.mod(angle + np.pi, 2 * np.pi) - np.pi
-        rows = posterior.frequency_rows(np.minimum(np.abs(folded) / posterior.dt_s, nyquist))
-        rows = np.where(folded[:, None] < 0, rows.conj(), rows)
-        commands = np.exp(-1j * np.outer(angle, np.arange(steps))).sum(axis=1)
+        folded_rad_s = np.minimum(np.abs(folded) / posterior.dt_s, nyquist)
+        rows = posterior.frequency_rows(folded_rad_s)
+        is_mirrored = folded < 0
+        rows = np.where(is_mirrored[:, None], rows.conj(), rows)
+        turns = np.outer(angle, np.arange(steps))
+        commands = np.exp(-1j * turns).sum(axis=1)
         total += rows * commands[:, None] / steps
     return total
 
 
 def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> RealArray:
-    """(P, 4) directions of what the log does not show of a faster controller's response.
+    """Directions (P, 4) of what the log does not show of a faster controller's response.
 
-    Two are as wide as the response at the log's Nyquist frequency, wider above, and close below. Two hold
-    what was folded back: at w the log has seen what the arm does at 2 pi / T - w, too, which is up to
-    (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a few taps lies in
-    the span of poles and taps; the same a sample later is the other direction of an ellipse.
+    `posterior` : of the new rate; `log_dt_s` : step of the log, s, of `up` periods. Columns for its
+    covariance factor. Two are as wide as the response at the log's Nyquist frequency, wider above, and close
+    below. Two hold what was folded back: at w the log has seen what the arm does at 2 pi / T - w, too, which
+    is up to (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a few taps
+    lies in the span of poles and taps; the same a sample later is the other direction of an ellipse.
     """
-    even = np.linspace(0.0, 0.99 * np.pi, 4 * posterior.fir_length + 200)[1:]
-    angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, 0.99 * np.pi, 600), even)
+    n_even = EVEN_POINTS_PER_TAP * posterior.fir_length + EVEN_POINTS
+    even = np.linspace(0.0, HIGHEST_SHARE * np.pi, n_even)[1:]
+    angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, HIGHEST_SHARE * np.pi, SLOW_POINTS), even)
     omega = angle / posterior.dt_s
-    later = np.exp(-1j * omega * posterior.dt_s)
-    opening = ((1 - later) / (2 * np.sin(np.pi / (2 * up)))) ** OPENING_POWER
-    folded = FOLDED_BACK * (up / np.pi) ** 2 * (1 - later) ** 2
-    wanted = np.column_stack([opening, opening * later, folded, folded * later**up]) / chi2_radius(LEVEL)
+    delay = np.exp(-1j * omega * posterior.dt_s)
+    change = 1 - delay
+    # One in size at the log's Nyquist frequency.
+    change_at_nyquist = 2 * np.sin(np.pi / (2 * up))
+    opening = (change / change_at_nyquist) ** OPENING_POWER
+    # |1 - delay| is w T / up at low frequency, T the step of the log.
+    folded = FOLDED_BACK * (up / np.pi) ** 2 * change**2
+    directions = np.column_stack([opening, opening * delay, folded, folded * delay**up])
+    wanted = directions / chi2_radius(LEVEL)
     centre = posterior.centre(omega)
     return coefficients_of(posterior.frequency_rows(omega), wanted * centre[:, None], 1 / np.abs(centre))
 
 
 def resampled_friction(found: FrictionFit, controller_dt_s: float) -> FrictionFit:
-    """The fit of an arm with friction, stepped at the rate of a controller.
+    """Fit of an arm with friction, stepped at the rate of a controller.
 
-    The arm is stepped in continuous time, so only its samples change. Dead time that is no whole number of
-    the controller's samples is rounded up; a lag of the drive is one of as many seconds.
+    Parameters
+    ----------
+    found : FrictionFit
+        An arm in continuous time with its sampling and its delay in samples; a lag of the drive in samples.
+    controller_dt_s : float
+        Period of the controller, s.
+
+    Returns
+    -------
+    FrictionFit
+        The arm is stepped in continuous time, so only its samples change. Dead time that is no whole number
+        of the controller's samples is rounded up; a lag of the drive is one of as many seconds.
+
+    Raises
+    ------
+    ValueError
+        Neither step is a whole multiple of the other (`ratio_of`).
     """
     arm = found.arm
     if abs(arm.dt_s - controller_dt_s) <= SAME_RATIO * arm.dt_s:
         return found
     ratio_of(arm.dt_s, controller_dt_s)
-    share = arm.dt_s / controller_dt_s
-    late = int(np.ceil(arm.structure.input_delay_samples * share - SAME_RATIO))
-    structure = replace(arm.structure, input_delay_samples=late)
+    periods_per_step = arm.dt_s / controller_dt_s
+    delay_samples = arm.structure.input_delay_samples * periods_per_step
+    structure = replace(arm.structure, input_delay_samples=int(np.ceil(delay_samples - SAME_RATIO)))
     return replace(
         found,
         arm=replace(arm, dt_s=controller_dt_s, structure=structure),
-        lag=found.lag * share,
+        lag=found.lag * periods_per_step,
     )

@@ -36,8 +36,9 @@ from ident.identification import Identification
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.nominal import NominalAgreement, nominal_near
 
-# Largest orders of the noise model that are tried, until the residuals behind it are white: the first holds
-# drift, friction and a sensor's filter, the second a hum or a mode in the noise as well.
+# Largest orders of the noise model that are tried, one after the other, until the residuals behind it are
+# white. The criterion takes 1 to 6 of the first for drift and friction beside sensor noise; the second, four
+# times as long, is for noise that is not white behind that. Chosen: every order takes one more embedding.
 NOISE_ORDERS = (8, 32)
 # Factor by which the data have to raise the odds of a missing mode before it is suspected: a Bayes factor of
 # "positive" evidence (Kass and Raftery, JASA 90(430), 1995).
