@@ -34,10 +34,12 @@ from ident.fit.least_squares import project
 from ident.fit.several_outputs import OutputRegressions
 
 # Evaluations of one refit at most: a limit of work. A refit begins at the best free residues, near its end,
-# and takes two or three; of two modes at one place, which have no common shape and are refused, twenty.
+# and takes two or three; of two modes at one place, which have no common shape and are refused, twenty. With
+# 20 no test of several outputs moves.
 MOST_EVALUATIONS = 40
 # A refit ends when the residual's power, or its numbers, change by a smaller share: a thousandth of a degree
-# of freedom in 10 000 samples, far below what the likelihood ratio decides by.
+# of freedom in 10 000 samples, far below what the likelihood ratio decides by. With 1e-5 no test of several
+# outputs moves.
 LEAST_CHANGE = 1e-7
 # Lowest logarithm of a pole's decay per sample: a time constant of 7e10 samples. It keeps poles inside the
 # unit circle; no pole that records show comes near it.

@@ -1,4 +1,4 @@
-"""The control law that made the logs of a loop, read off its records, and whether it repeats what was logged.
+"""Read the control law that made the logs of a loop off its records, and whether it repeats what was logged.
 
 A linear controller that runs once a row makes its command of its own past, the reference and the output:
 
@@ -7,6 +7,10 @@ A linear controller that runs once a row makes its command of its own past, the 
 Least squares finds the coefficients. What they leave is the rounding of the log, if the controller ran at
 the log's step; a controller that ran faster used rows that were never logged, and leaves more. Where every
 signal is smooth from row to row, the rows in between can be guessed, and neither can be told.
+
+`law_of` tries laws of rising complexity. What rounding leaves of each is computed from the steps to which the
+columns were written (`_decimal_step`), and whether a faster controller would have left more is seen by taking
+rows away (`_tells_period`).
 """
 
 from __future__ import annotations
@@ -41,6 +45,20 @@ MOST_DECIMALS = 9
 MOST_COUNTS = 2**24
 # Significant digits that are looked for: "%.4g" to "%.10g".
 SIGNIFICANT_DIGITS = range(4, 11)
+# Reference and output enter alike, as their difference, if their coefficients cancel to this share: those of
+# least squares on rounded columns are known to 1e-3 or so, those of a law of the error are equal.
+CANCELS_SHARE = 1e-6
+# The output of a row counts for its command if its coefficient is at least this share of the largest:
+# rounding leaves less.
+ACTS_SHARE = 1e-3
+# Values are multiples of a step if they are so near to whole numbers of it, in steps, and a few roundings of
+# doubles: decimals that were read from text are right to half a unit of the last place.
+DECIMAL_SLACK = 1e-6
+# The same for decimals that were scaled to another unit: the step is a difference of two of them, which has
+# fewer right digits.
+SCALED_SLACK = 1e-3
+# Roundings of doubles in the sums of a law: a few in each of its up to fifteen terms.
+DOUBLE_ROUNDINGS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +68,7 @@ class RecordedLaw:
     Attributes
     ----------
     own : ndarray, shape (n + 1,)
-        1, a_1 .. a_n: denominator in z, highest power first.
+        1, a_1 .. a_n, by which the command's own past counts: denominator in z, highest power first.
     of_reference, of_output : ndarray, shape (n + 1,)
         b_0 .. b_n and c_0 .. c_n, in units of the input per unit of the output.
     residual : float
@@ -78,12 +96,13 @@ class RecordedLaw:
 
     @property
     def on_error(self) -> tuple[RealArray, RealArray] | None:
-        """Numerator and denominator in z, highest power first, of K in u = K (r - y).
+        """Numerator and denominator in z (n + 1,), highest power first, of K in u = K (r - y).
 
         None where reference and output enter differently.
         """
         size = np.linalg.norm(self.of_reference)
-        if np.linalg.norm(self.of_reference + self.of_output) > 1e-6 * size:
+        difference = np.linalg.norm(self.of_reference + self.of_output)
+        if difference > CANCELS_SHARE * size:
             return None
         return self.of_reference, self.own
 
@@ -91,11 +110,11 @@ class RecordedLaw:
     def acts_at_once(self) -> bool:
         """Whether the command of a row depends on the output of the same row."""
         largest = float(np.max(np.abs(self.of_output)))
-        return bool(abs(self.of_output[0]) > 1e-3 * largest)
+        return bool(abs(self.of_output[0]) > ACTS_SHARE * largest)
 
 
 def law_of(records: Sequence[Record]) -> RecordedLaw | None:
-    """The simplest law that explains the command of SISO records as well as any of a few states.
+    """Simplest law that explains the command of SISO records as well as any of a few states.
 
     Parameters
     ----------
@@ -105,7 +124,8 @@ def law_of(records: Sequence[Record]) -> RecordedLaw | None:
     Returns
     -------
     RecordedLaw or None
-        None where a record has no reference, or the records are too short to tell a law.
+        The first structure that repeats the command; where none does, the law with the least residual. None
+        where a record has no reference column, or several, or the records are too short to tell a law.
 
     Notes
     -----
@@ -131,38 +151,50 @@ def law_of(records: Sequence[Record]) -> RecordedLaw | None:
 def _tells_period(columns: _Columns, structure: _Structure, law: RecordedLaw) -> bool:
     """Whether a law of half the period would have left more than this one, which repeats the command.
 
-    Its log would look as every second row of this one does, but for a factor that the steps from every second
-    to every fourth and eighth row show: the errors of guessing the rows in between grow with a power of the
-    step, and with a higher one where the signals are smooth over a step. Steps of the reference may fall on
-    every fourth row, which leaves little to guess there, so even and odd rows are judged by themselves, and
-    the smaller answer counts. A reference that the controller got as it was written has no rounding error,
-    though it has decimals, so what this law leaves beyond that of the other two columns may be an excess.
+    The log of such a law would look as every second row of this one does, but for a factor that the steps
+    from every second to every fourth and eighth row show: the errors of guessing the rows in between grow
+    with a power of the step, and with a higher one where the signals are smooth over a step. Steps of the
+    reference may fall on every fourth row, which leaves little to guess there, so even and odd rows are
+    judged by themselves, and the smaller answer counts. A reference that the controller got as it was written
+    has no rounding error, though it has decimals, so what this law leaves beyond that of the other two
+    columns may be an excess.
     """
-    least = np.inf
+    least_excess = np.inf
     for parity in range(2):
         second = columns.least_residual(structure, 2, parity)
         fourth = columns.least_residual(structure, 4, parity)
         eighth = columns.least_residual(structure, 8, parity)
         if second is None or fourth is None or eighth is None:
             return False
-        falls = max(fourth, law.rounding) / second
-        fell_before = max(eighth, law.rounding) / max(fourth, law.rounding)
-        least = min(least, second / (falls * max(falls / fell_before, 1.0)))
+        # What half a step would leave: by the fall from fourth to second rows, and by its growth since the
+        # fall from eighth to fourth ones.
+        fall = max(fourth, law.rounding) / second
+        fall_before = max(eighth, law.rounding) / max(fourth, law.rounding)
+        growth_of_fall = max(fall / fall_before, 1.0)
+        least_excess = min(least_excess, second / (fall * growth_of_fall))
+    # Without the rounding of the reference, which the controller may have got as it was.
     certain_rounding = columns.rounding(law.own, np.zeros_like(law.of_reference), law.of_output)
-    shown = np.sqrt(max(law.residual**2 - certain_rounding**2, 0.0))
-    return bool(least >= LEAST_EXCESS * law.rounding and shown <= SHOWN_SHARE * least)
+    shown_excess = np.sqrt(max(law.residual**2 - certain_rounding**2, 0.0))
+    would_show = least_excess >= LEAST_EXCESS * law.rounding
+    does_not_show = shown_excess <= SHOWN_SHARE * least_excess
+    return bool(would_show and does_not_show)
 
 
 @dataclass(frozen=True)
 class _Structure:
-    """Form of a law: of the error, or of reference and output; its states; whether one is an integrator."""
+    """Form of a law.
+
+    of_error : it makes the command of r - y, not of reference and output by themselves
+    n_states : rows of the past that it uses
+    integrates : one state is an integrator, a pole at z = 1
+    """
 
     of_error: bool
     n_states: int
     integrates: bool
 
 
-# Simplest first.
+# Laws that are tried, simplest first.
 STRUCTURES = tuple(
     _Structure(of_error, n_states, integrates)
     for of_error in (True, False)
@@ -173,7 +205,14 @@ STRUCTURES = tuple(
 
 @dataclass(frozen=True, eq=False)
 class _Columns:
-    """Command, reference and output of some records, and the steps of their decimals."""
+    """Command, reference and output of some records, and the steps of their decimals.
+
+    signals : of each record, the three columns (T,) as logged command_step, reference_step, output_step : to
+    which the columns were rounded, in their units, in root mean
+        square over records or rows; 0: not rounded
+    largest : size of the largest command
+    dt_s : step of the rows, s
+    """
 
     signals: tuple[tuple[RealArray, RealArray, RealArray], ...]
     command_step: float
@@ -184,16 +223,18 @@ class _Columns:
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> _Columns:
+        """Columns of records with one input, reference and output each, `MOST_ROWS` rows of all together."""
         signals = []
         for record in records:
             rows = slice(0, MOST_ROWS // len(records))
             reference = np.asarray(record.reference)[rows, 0]
             signals.append((record.input[rows, 0], reference, record.output[rows, 0]))
         commands, references, outputs = zip(*signals, strict=True)
+        # Of the command its own steps count, whether they come from the log or from a converter.
+        squared_steps = [_decimal_step(command) ** 2 for command in commands]
         return cls(
             tuple(signals),
-            # Of the command its own steps count, whether they come from the log or from a converter.
-            command_step=float(np.sqrt(np.mean([_decimal_step(command) ** 2 for command in commands]))),
+            command_step=float(np.sqrt(np.mean(squared_steps))),
             reference_step=_rounding_step(references),
             output_step=_rounding_step(outputs),
             largest=max(float(np.max(np.abs(command))) for command in commands),
@@ -201,59 +242,79 @@ class _Columns:
         )
 
     def least_residual(self, structure: _Structure, thinned: int, parity: int) -> float | None:
-        """Of the laws of every `thinned`-th even or odd row, the least residual; None: too few rows."""
-        laws = [self.fitted(structure, thinned, start) for start in range(parity, thinned, 2)]
-        return min((law.residual for law in laws if law is not None), default=None)
+        """Least residual, input units, of the laws of every `thinned`-th even (`parity` 0) or odd (1) row.
+
+        None where there are too few rows.
+        """
+        residuals = []
+        for start in range(parity, thinned, 2):
+            law = self.fitted(structure, thinned, start)
+            if law is not None:
+                residuals.append(law.residual)
+        return min(residuals, default=None)
 
     def fitted(self, structure: _Structure, thinned: int = 1, start: int = 0) -> RecordedLaw | None:
-        """The law of a structure, by least squares over every row, or every `thinned`-th one from `start`.
+        """Law of a structure, by least squares over every row, or every `thinned`-th one from `start`.
 
         None where there are too few rows.
         """
         limit = LIMIT_SHARE * self.largest
-        parts = []
+        row_parts = []
+        target_parts = []
         for command, reference, output in self.signals:
             if command.size <= thinned * (structure.n_states + 2):
                 continue
             every = slice(start, None, thinned)
-            parts.append(_regression(command[every], reference[every], output[every], structure, limit))
-        if not parts:
+            rows, target = _regression(command[every], reference[every], output[every], structure, limit)
+            row_parts.append(rows)
+            target_parts.append(target)
+        if not row_parts:
             return None
-        rows = np.concatenate([part[0] for part in parts])
-        target = np.concatenate([part[1] for part in parts])
+        rows = np.concatenate(row_parts)
+        target = np.concatenate(target_parts)
         if len(rows) < MOST_STATES * rows.shape[1]:
             return None
-        # Of columns that stand at zero, as those of a reference that nobody moved, the law has nothing.
+        # A column that stands at zero, as that of a reference that nobody moved, gets a coefficient of zero.
         length = np.linalg.norm(rows, axis=0)
-        length[length == 0] = 1.0
-        solved = np.linalg.lstsq(rows / length, target, rcond=None)[0] / length
+        is_zero = length == 0
+        length[is_zero] = 1.0
+        solution = np.linalg.lstsq(rows / length, target, rcond=None)[0] / length
 
         # From coefficients of the columns to those of the law.
-        n_own = structure.n_states - 1 if structure.integrates else structure.n_states
-        own = np.append(1.0, -solved[:n_own])
+        n_past = structure.n_states
         if structure.integrates:
-            own = np.convolve(own, [1.0, -1.0])
-        of_reference = solved[n_own : n_own + structure.n_states + 1]
-        of_output = -of_reference if structure.of_error else solved[n_own + structure.n_states + 1 :]
+            n_past -= 1
+        n_driving = structure.n_states + 1
+        of_command = np.append(1.0, -solution[:n_past])
+        if structure.integrates:
+            of_command = np.convolve(of_command, [1.0, -1.0])
+        of_reference = solution[n_past : n_past + n_driving]
+        of_output = solution[n_past + n_driving :]
+        if structure.of_error:
+            of_output = -of_reference
         return RecordedLaw(
-            own,
+            of_command,
             of_reference,
             of_output,
-            residual=float(np.std(target - rows @ solved)),
-            rounding=self.rounding(own, of_reference, of_output),
+            residual=float(np.std(target - rows @ solution)),
+            rounding=self.rounding(of_command, of_reference, of_output),
             dt_s=self.dt_s * thinned,
             tells_period=False,
         )
 
-    def rounding(self, own: RealArray, of_reference: RealArray, of_output: RealArray) -> float:
-        """Root mean square of what the decimals of the columns leave of an exact law."""
+    def rounding(self, of_command: RealArray, of_reference: RealArray, of_output: RealArray) -> float:
+        """Root mean square, input units, of what the decimals of the columns leave of an exact law.
+
+        `of_command`, `of_reference`, `of_output` (n + 1,) : coefficients as in `RecordedLaw`. Errors of
+        rounding are independent and uniform over a step: their variance is a twelfth of its square.
+        """
         variance = (
-            own @ own * self.command_step**2
+            of_command @ of_command * self.command_step**2
             + of_reference @ of_reference * self.reference_step**2
             + of_output @ of_output * self.output_step**2
         ) / 12
         # Sums of doubles are themselves rounded, a few times per term.
-        of_doubles = 100 * np.finfo(np.float64).eps * self.largest
+        of_doubles = DOUBLE_ROUNDINGS * np.finfo(np.float64).eps * self.largest
         return float(np.sqrt(variance)) + of_doubles
 
 
@@ -264,68 +325,90 @@ def _regression(
     structure: _Structure,
     limit: float,
 ) -> tuple[RealArray, RealArray]:
-    """Rows (M, P) and target (M,): newest sample of each signal first, rows at the limit left out."""
-    windows = [
-        sliding_window_view(signal, structure.n_states + 1)[:, ::-1]
-        for signal in (command, reference, output)
-    ]
-    inside = np.all(np.abs(windows[0]) < limit, axis=1)
-    own, of_reference, of_output = (window[inside] for window in windows)
+    """Regression of a law: rows (M, P) of past commands and driving signals, and target (M,).
+
+    `command`, `reference`, `output` (T,) : columns of one record. Newest sample of each signal first; rows of
+    which a command is at the `limit`, in units of the input, are left out.
+    """
+    n_samples = structure.n_states + 1
+    commands = sliding_window_view(command, n_samples)[:, ::-1]
+    references = sliding_window_view(reference, n_samples)[:, ::-1]
+    outputs = sliding_window_view(output, n_samples)[:, ::-1]
+    is_inside = np.all(np.abs(commands) < limit, axis=1)
+    commands = commands[is_inside]
+    references = references[is_inside]
+    outputs = outputs[is_inside]
     if structure.integrates:
         # With its pole at z = 1 the law makes the change of the command.
-        own = own[:, :-1] - own[:, 1:]
-    driving = [of_reference - of_output] if structure.of_error else [of_reference, of_output]
-    return np.hstack([own[:, 1:], *driving]), own[:, 0]
+        commands = commands[:, :-1] - commands[:, 1:]
+    driving = [references, outputs]
+    if structure.of_error:
+        driving = [references - outputs]
+    return np.hstack([commands[:, 1:], *driving]), commands[:, 0]
 
 
 def _rounding_step(signals: Sequence[RealArray]) -> float:
-    """Step of the rounding errors of a column, in the mean over its rows; 0 where its values are exact.
+    """Step of the rounding errors of a column, in root mean square over its rows; 0 where values are exact.
 
-    Steps of a reference are written in full where a chirp is rounded, so the finest step of all records
-    counts. Multiples of a step that is no power of ten (an encoder of 3 micrometres written with three
-    decimals of a millimetre) were not rounded by the log. A value that stands has one rounding error, which
-    a law with integral action does not see.
+    `signals` : the column (T,) of each record. Steps of a reference are written in full where a chirp is
+    rounded, so the finest step of all records counts. Multiples of a step that is no power of ten (an encoder
+    of 3 micrometres written with three decimals of a millimetre) were not rounded by the log. A value that
+    stands has one rounding error, which a law with integral action does not see.
     """
     finest = min(_decimal_step(signal) for signal in signals)
     if finest == 0.0:
         return 0.0
-    multiples = np.unique(np.concatenate([np.asarray(signal / finest) for signal in signals]))
+    in_steps = np.concatenate([np.asarray(signal / finest) for signal in signals])
+    multiples = np.unique(in_steps)
     counts = np.round(multiples)
     # What is no multiple has a step that differs from value to value (significant digits).
-    if np.all(np.abs(multiples - counts) < 1e-3):
+    if np.all(np.abs(multiples - counts) < SCALED_SLACK):
         steps = counts.astype(np.int64)
         if np.gcd.reduce(steps - steps[0]) > 1:
             return 0.0
-    moving = np.concatenate([np.diff(signal) != 0 for signal in signals])
-    return finest * float(np.sqrt(np.mean(moving)))
+    is_moving = np.concatenate([np.diff(signal) != 0 for signal in signals])
+    moving_share = np.mean(is_moving)
+    return finest * float(np.sqrt(moving_share))
 
 
 def _decimal_step(signal: RealArray) -> float:
-    """Step to which a column was rounded, in the mean over its values; 0 where there is none.
+    """Step to which a column (T,) was rounded, in its units, in root mean square; 0 where there is none.
 
     A power of ten; or the smallest difference, where all values are multiples of it, as of decimals that were
     scaled to another unit; or that of so many significant digits, or of a number of 32 bits, at each value.
     """
     values = np.unique(signal)
     eps = np.finfo(np.float64).eps
+
+    # Decimals as they were written: the largest power of ten of which every value is a multiple.
     for decimals in range(MOST_DECIMALS + 1):
         scaled = values * 10.0**decimals
-        if np.all(np.abs(scaled - np.round(scaled)) <= 1e-6 + 4 * eps * np.abs(scaled)):
+        slack = DECIMAL_SLACK + 4 * eps * np.abs(scaled)
+        if np.all(np.abs(scaled - np.round(scaled)) <= slack):
             return float(10.0**-decimals)
 
+    # Decimals that were scaled to another unit: multiples of the smallest difference.
     if values.size > 1:
-        least = float(np.min(np.diff(values)))
-        counts = values / least
+        smallest_difference = float(np.min(np.diff(values)))
+        counts = values / smallest_difference
         # Counts beyond this are not told from neighbours by doubles that were multiplied once.
-        if np.max(np.abs(counts)) < MOST_COUNTS and np.all(np.abs(counts - np.round(counts)) < 1e-3):
-            return least
+        are_told_apart = np.max(np.abs(counts)) < MOST_COUNTS
+        if are_told_apart and np.all(np.abs(counts - np.round(counts)) < SCALED_SLACK):
+            return smallest_difference
 
-    size = np.abs(values[values != 0])
+    # Significant digits: a power of ten for each value, by its size.
+    is_nonzero = values != 0
+    size = np.abs(values[is_nonzero])
     exponent = np.floor(np.log10(size))
     for digits in SIGNIFICANT_DIGITS:
         step = 10.0 ** (exponent + 1 - digits)
-        if np.all(np.abs(size / step - np.round(size / step)) <= 1e-6 + 4 * eps * size / step):
+        counts = size / step
+        slack = DECIMAL_SLACK + 4 * eps * size / step
+        if np.all(np.abs(counts - np.round(counts)) <= slack):
             return float(np.sqrt(np.mean(step**2)))
+
+    # Numbers of 32 bits: the distance to the next one, for each value.
     if np.array_equal(values, values.astype(np.float32)):
-        return float(np.sqrt(np.mean(np.spacing(size.astype(np.float32)).astype(np.float64) ** 2)))
+        distance = np.spacing(size.astype(np.float32)).astype(np.float64)
+        return float(np.sqrt(np.mean(distance**2)))
     return 0.0
