@@ -1,4 +1,4 @@
-"""What the command of a log does between two rows, and what that makes of the records and of the ellipses.
+"""Tell what the command of a log does between two rows, and correct records and ellipses for it.
 
 A model of records takes the command as held from row to row. A drive that controls faster than it logs holds
 its command for its own period Tc and logs every T / Tc-th value; with w the frequency, such a command moves
@@ -9,6 +9,10 @@ the arm as
 times the logged command held for T would (H(h) = (1 - e^{-jwh}) / (jwh): zero-order hold; S is the mean over
 the N commands of a step). The logged command is filtered with 1 / S, and everything after it may take it as
 held from row to row. A drive that logs the mean of the N commands adds a second factor 1 / S.
+
+`timing_of` reads the period of the controller from what was stated, from a command that repeats, or from a
+law that made every command (`ident.recorded_law`). `with_equivalent_command` corrects the records for what is
+known, `with_unknown_timing` widens the ellipses for what is not.
 
 Neglected: what the command has above the Nyquist frequency of the log, which the rows do not show.
 """
@@ -38,6 +42,16 @@ FITTED_UP_TO_RAD = 2.0
 HIGHEST_ANGLE_RAD = 3.14
 # Taps by which an ellipse follows a phase that grows with frequency.
 TAPS = 8
+# Frequencies at which the filter of the command is fitted: forty for each of its taps.
+FILTER_POINTS = 400
+# Lowest frequency times step at which an ellipse is fitted, rad: a motion of two hours in a log at 100 Hz.
+LOWEST_ANGLE_RAD = 1e-5
+# Frequencies of a logarithmic grid from the lowest to the highest: ninety in a decade.
+SLOW_POINTS = 500
+# Frequencies of a linear grid beside those for the taps.
+EVEN_POINTS = 200
+# Further ones of that grid for each tap: the last tap then has eight of them in each of its turns.
+EVEN_POINTS_PER_TAP = 4
 # Ellipses of noise and timing add as variances, but an interval of the timing has ends that are as likely as
 # its middle: with 1.5 times its half width the sum of both is held while the noise is up to .6 of it.
 BEYOND_ENDS = 1.5
@@ -52,12 +66,22 @@ GAIN_OF_PHASE = 0.1
 NEARLY_ALL = 0.99
 # Gaps between changes of a command from which its period is read.
 FEWEST_GAPS = 10
+# Up to so many commands in a step a stated period need not be a whole part of it. Chosen; with 1, so that
+# every period is checked, no test of the timing moves.
+MOST_UNCHECKED = 2
 # A stated period agrees with whole rows within this share.
 SAME_PERIOD = 1e-3
 
 
 class TimingSource(Enum):
-    """How the period of the controller is known."""
+    """How the period of the controller is known.
+
+    STATED : somebody gave it
+    LAW : a linear law made every command from the rows, and a faster one would have shown
+    REPEATS : the command changes every few rows only
+    OPEN_LOOP : there is no controller; the command is taken as held from row to row
+    UNKNOWN : it is not
+    """
 
     STATED = "stated"
     LAW = "law"
@@ -82,13 +106,20 @@ class Hold:
     averaged: bool = False
 
     def response(self, angle_rad: RealArray) -> ComplexArray:
-        """1 / S, or its square where averaged, at w T (F,), 0 < w T <= pi."""
+        """Response (F,) of the command's own hold over that of a hold for the whole step: 1 / S.
+
+        `angle_rad` : w T (F,), 0 < w T <= pi. The square of 1 / S where averaged.
+        """
         step = -np.expm1(-1j * angle_rad)
         if self.share > 0:
             mean = self.share * step / -np.expm1(-1j * angle_rad * self.share)
         else:
+            # The limit of many commands in a step: their sum becomes an integral.
             mean = step / (1j * angle_rad)
-        return np.asarray(mean ** (-2 if self.averaged else -1), dtype=np.complex128)
+        power = -1
+        if self.averaged:
+            power = -2
+        return np.asarray(mean**power, dtype=np.complex128)
 
 
 # A command that is held from row to row.
@@ -132,20 +163,23 @@ class CommandTiming:
 
     @property
     def known(self) -> bool:
+        """Whether there is one possibility only, which the records are corrected for."""
         return not self.possible
 
     @property
     def offered_dt_s(self) -> float:
-        """The known period, s, where a new controller may have it; else the step of the rows in use."""
+        """Period for a new controller, s: the known one where it is a whole part of the step of the rows in
+        use; else that step."""
         used_step_s = self.row_step_s * self.rows_per_command
         if self.period_s is None:
             return used_step_s
         parts = used_step_s / self.period_s
-        return self.period_s if abs(parts - round(parts)) <= SAME_PERIOD * parts else used_step_s
+        is_whole = abs(parts - round(parts)) <= SAME_PERIOD * parts
+        return self.period_s if is_whole else used_step_s
 
     @property
     def acts_at_once(self) -> bool:
-        """The rows tell that the command of a row was made of the output of the same row."""
+        """Whether the rows tell that the command of a row was made of the output of the same row."""
         return self.law is not None and self.law.tells_period and self.law.acts_at_once
 
 
@@ -156,7 +190,7 @@ def timing_of(
     stated_period_s: float | None = None,
     averaged: bool = False,
 ) -> CommandTiming:
-    """What the command of SISO records does between two rows.
+    """Timing of the command of records with one input and one output, as far as it is known.
 
     Parameters
     ----------
@@ -181,6 +215,8 @@ def timing_of(
     """
     step_s = records[0].dt_s
     rows_per_command = rows_per_command_of(records)
+
+    # Somebody stated the period.
     if stated_period_s is not None:
         usual_gap = min(_usual_gaps(records), default=1)
         _refuse_contradiction(records[0], stated_period_s, usual_gap)
@@ -199,6 +235,8 @@ def timing_of(
             # A law of rows between which the command changed is not the one that ran.
             return replace(stated, taken=Hold(stated_period_s / used_step_s, averaged), law=None)
         return stated
+
+    # An experiment in open loop: nobody computed the command from the rows.
     if not in_loop:
         if averaged:
             raise ValueError(
@@ -206,13 +244,16 @@ def timing_of(
                 "--controller-period SECONDS (controller_period_s)"
             )
         return CommandTiming(TimingSource.OPEN_LOOP, step_s, None)
+
+    # The command repeats: it changes every few rows, while the output goes on.
     if rows_per_command > 1:
-        found = CommandTiming(TimingSource.REPEATS, step_s, rows_per_command * step_s)
-        of_controller = _with_rows(found, records, rows_per_command)
+        every_row = CommandTiming(TimingSource.REPEATS, step_s, rows_per_command * step_s)
+        of_controller = _with_rows(every_row, records, rows_per_command)
         # Without a law it may be an experiment in open loop that was taken for a loop: then every row counts,
         # and held from row to row is what the rows say.
-        return found if of_controller.law is None else of_controller
+        return every_row if of_controller.law is None else of_controller
 
+    # A law that made every command from the rows, and would have left more had it run faster.
     law = law_of(records)
     if law is None or not law.repeats_command:
         # Logs of several controllers have a law each, and none in common.
@@ -230,7 +271,7 @@ def timing_of(
 
 
 def rows_per_command_of(records: Sequence[Record]) -> int:
-    """Rows after which the command of records changes while the output goes on.
+    """Number of rows after which the command of records changes while the output goes on.
 
     Parameters
     ----------
@@ -244,40 +285,49 @@ def rows_per_command_of(records: Sequence[Record]) -> int:
         two clocks drift apart. Held from row to row is then what the rows say.
     """
     gaps = _usual_gaps(records)
-    least = min(gaps, default=1)
+    smallest_gap = min(gaps, default=1)
     for record in records:
         changes = _changes(record)
-        if changes.size and np.mean(changes % least == _phase(changes, least)) <= NEARLY_ALL:
+        if not changes.size:
+            continue
+        is_in_phase = changes % smallest_gap == _phase(changes, smallest_gap)
+        if np.mean(is_in_phase) <= NEARLY_ALL:
             return 1
-    return least
+    return smallest_gap
 
 
 def _usual_gaps(records: Sequence[Record]) -> list[int]:
-    """Rows after which the command changes, of each record where it changes often; 1 where gaps differ."""
+    """Number of rows after which the command changes, of each record where it changes often; 1 where gaps
+    differ."""
     usual_gaps = []
     for record in records:
         gaps = np.diff(_changes(record))
         if gaps.size < FEWEST_GAPS:
             continue
         usual = int(np.median(gaps))
-        if np.mean(gaps % usual == 0) <= NEARLY_ALL:
+        is_multiple = gaps % usual == 0
+        if np.mean(is_multiple) <= NEARLY_ALL:
             usual = 1
         usual_gaps.append(usual)
     return usual_gaps
 
 
 def _changes(record: Record) -> IntArray:
-    """Rows (N,) whose command is another than that of the row before."""
-    return 1 + np.flatnonzero(np.any(np.diff(record.input, axis=0) != 0, axis=1))
+    """Indices (N,) of the rows whose command is another than that of the row before."""
+    is_new = np.any(np.diff(record.input, axis=0) != 0, axis=1)
+    return 1 + np.flatnonzero(is_new)
 
 
 def _phase(changes: IntArray, rows: int) -> int:
-    """First row of a record, of `rows`, at which its command usually changes."""
+    """Index 0 .. rows - 1 at which a command that stands for `rows` rows usually changes.
+
+    `changes` (N,) : indices of the rows at which it changed.
+    """
     return int(np.bincount(changes % rows, minlength=rows).argmax())
 
 
 def _with_rows(timing: CommandTiming, records: Sequence[Record], rows: int) -> CommandTiming:
-    """The timing with the rows that are used, of which the command stands for so many, and with their law."""
+    """Timing with the rows that are used and with their law, of a command that stands for `rows` rows."""
     first = tuple(_phase(_changes(record), rows) for record in records)
     used = [_every(record, start, rows) for record, start in zip(records, first, strict=True)]
     law = law_of(used)
@@ -287,6 +337,7 @@ def _with_rows(timing: CommandTiming, records: Sequence[Record], rows: int) -> C
 
 
 def _every(record: Record, start: int, rows: int) -> Record:
+    """Record of every `rows`-th row, from the row `start` on."""
     thinned = record.each(lambda signal: signal[start::rows])
     return replace(thinned, dt_s=record.dt_s * rows)
 
@@ -295,18 +346,19 @@ def _refuse_contradiction(record: Record, period_s: float, usual_gap: int) -> No
     """Raise ValueError where the log shows that the stated period is not that of its controller."""
     step_s = record.dt_s
     option = "controller_period_s, --controller-period"
-    share = step_s / period_s
-    if share > 2 and abs(share - round(share)) > SAME_PERIOD * share:
+    commands_per_step = step_s / period_s
+    off_whole = abs(commands_per_step - round(commands_per_step))
+    if commands_per_step > MOST_UNCHECKED and off_whole > SAME_PERIOD * commands_per_step:
+        nearest_s = step_s / round(commands_per_step)
         raise ValueError(
             f"{record.label}: a controller every {period_s:.6g} s does not meet the rows every "
-            f"{step_s:.6g} s: expected a whole part of the log's step, such as "
-            f"{step_s / round(share):.6g} ({option})"
+            f"{step_s:.6g} s: expected a whole part of the log's step, such as {nearest_s:.6g} ({option})"
         )
-    longest = usual_gap * step_s
-    if period_s > longest * (1 + SAME_PERIOD):
+    longest_s = usual_gap * step_s
+    if period_s > longest_s * (1 + SAME_PERIOD):
         raise ValueError(
-            f"{record.label}: the command changes every {longest:.6g} s, more often than a controller every "
-            f"{period_s:.6g} s could: expected at most {longest:.6g} ({option})"
+            f"{record.label}: the command changes every {longest_s:.6g} s, more often than a controller "
+            f"every {period_s:.6g} s could: expected at most {longest_s:.6g} ({option})"
         )
 
 
@@ -321,7 +373,7 @@ def _refuse_law_at_rows(record: Record, period_s: float, used_step_s: float, law
 
 
 def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) -> list[Record]:
-    """The records with a command that, held from row to row, moves the arm as the one that was logged did.
+    """Records with a command that, held from row to row, moves the arm as the one that was logged did.
 
     Parameters
     ----------
@@ -336,9 +388,10 @@ def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) ->
         (module's docstring) where the controller was faster than the log. A note says what is not known.
     """
     changed = []
-    for place, record in enumerate(records):
+    for index, record in enumerate(records):
         if timing.rows_per_command > 1:
-            start = timing.first_row[place] if place < len(timing.first_row) else 0
+            # Records that the timing has not seen, as of a validation, begin at their first row.
+            start = timing.first_row[index] if index < len(timing.first_row) else 0
             record = _every(record, start, timing.rows_per_command)
         if timing.taken != HELD:
             record = replace(record, input=filtered(record.input, timing.taken))
@@ -355,20 +408,25 @@ def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) ->
 
 
 def filtered(command: RealArray, hold: Hold) -> RealArray:
-    """Commands (T, U) filtered with 1 / S forwards and backwards in time; the ends are repeated."""
-    angle = np.linspace(0.0, FITTED_UP_TO_RAD, 400)[1:]
+    """Commands (T, U) filtered with the response 1 / S of a hold, which looks forwards and backwards in time.
+
+    `command` (T, U) : as logged; its first and last values are repeated before and after.
+    """
+    angle = np.linspace(0.0, FITTED_UP_TO_RAD, FILTER_POINTS)[1:]
     lags = np.arange(-ROWS_BESIDE, ROWS_BESIDE + 1)
     # Where the motion is large, at low frequency, the filter has to be exact; a constant stays one.
     rows = np.exp(1j * np.outer(angle, lags)) - 1
-    taps = coefficients_of(rows, (hold.response(angle) - 1)[:, None], 1 / angle)[:, 0]
-    taps[ROWS_BESIDE] = 1 - (taps.sum() - taps[ROWS_BESIDE])
+    wanted = hold.response(angle) - 1
+    taps = coefficients_of(rows, wanted[:, None], 1 / angle)[:, 0]
+    sum_beside = taps.sum() - taps[ROWS_BESIDE]
+    taps[ROWS_BESIDE] = 1 - sum_beside
     padded = np.pad(command, ((ROWS_BESIDE, ROWS_BESIDE), (0, 0)), mode="edge")
     columns = [np.convolve(column, taps[::-1], mode="valid") for column in padded.T]
     return np.column_stack(columns)
 
 
 def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> ResponsePosterior:
-    """The posterior with ellipses that hold the response whatever the command did between two rows.
+    """Posterior with ellipses that hold the response whatever the command did between two rows.
 
     Parameters
     ----------
@@ -393,12 +451,15 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     """
     if timing.known or not np.any(posterior.mean):
         return posterior
+
     # Slow motions, and points between which no tap of the kernel turns round.
-    n_linear = 4 * (posterior.fir_length + TAPS) + 200
-    angle = np.union1d(
-        np.geomspace(1e-5, HIGHEST_ANGLE_RAD, 500), np.linspace(0.0, HIGHEST_ANGLE_RAD, n_linear)[1:]
-    )
+    slow = np.geomspace(LOWEST_ANGLE_RAD, HIGHEST_ANGLE_RAD, SLOW_POINTS)
+    n_even = EVEN_POINTS_PER_TAP * (posterior.fir_length + TAPS) + EVEN_POINTS
+    even = np.linspace(0.0, HIGHEST_ANGLE_RAD, n_even)[1:]
+    angle = np.union1d(slow, even)
     omega = angle / posterior.dt_s
+
+    # S of the middle, and the largest differences of what is possible from it along phase and gain, (F,).
     middle = 1 / timing.middle.response(angle)
     ratios = [1 / hold.response(angle) / middle for hold in timing.possible]
     phase = np.max([np.abs(ratio.imag) for ratio in ratios], axis=0)
@@ -408,34 +469,36 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
 
     # Taps stand behind the basis and before what unstable poles add, which stays as it is.
     n_stable = posterior.mean.size - posterior.unstable.order
-    more = max(TAPS - posterior.fir_length, 0)
+    n_added = max(TAPS - posterior.fir_length, 0)
+    n_fitted = n_stable + n_added
     wider = replace(
         posterior,
-        mean=np.insert(posterior.mean, [n_stable] * more, 0.0),
-        covariance_factor=np.insert(posterior.covariance_factor, [n_stable] * more, 0.0, axis=0),
-        fir_length=posterior.fir_length + more,
+        mean=np.insert(posterior.mean, [n_stable] * n_added, 0.0),
+        covariance_factor=np.insert(posterior.covariance_factor, [n_stable] * n_added, 0.0, axis=0),
+        fir_length=posterior.fir_length + n_added,
     )
-    rows = wider.frequency_rows(omega)[:, : n_stable + more]
+    rows = wider.frequency_rows(omega)[:, :n_fitted]
     centre = posterior.centre(omega)
     # A response may be zero somewhere, where no share of it is an error.
     size = np.maximum(np.abs(centre), SMALLEST_RESPONSE * np.max(np.abs(centre)))
 
     # Errors count as a share of what they are held against, and less above the data.
-    above = 1 / (1 + (angle / FITTED_UP_TO_RAD) ** 4)
-    late = middle[:, None] * rows
-    mean = coefficients_of(rows, late @ wider.mean[: n_stable + more, None], above / (phase * size))
-    factor = coefficients_of(rows, late @ wider.covariance_factor[: n_stable + more], above / size)
-    ends = BEYOND_ENDS / chi2_radius(LEVEL) * middle * centre
-    along_phase = coefficients_of(rows, (1j * phase * ends)[:, None], above / (phase * size))
-    along_gain = coefficients_of(rows, (gain * ends)[:, None], above / (gain * size))
+    count = 1 / (1 + (angle / FITTED_UP_TO_RAD) ** 4)
+    through_middle = middle[:, None] * rows
+    mean_response = through_middle @ wider.mean[:n_fitted, None]
+    factor_response = through_middle @ wider.covariance_factor[:n_fitted]
+    mean = coefficients_of(rows, mean_response, count / (phase * size))
+    factor = coefficients_of(rows, factor_response, count / size)
+    # A column of the factor is one standard deviation: the ellipse of the level is chi2_radius of them.
+    end = BEYOND_ENDS / chi2_radius(LEVEL) * middle * centre
+    along_phase = coefficients_of(rows, (1j * phase * end)[:, None], count / (phase * size))
+    along_gain = coefficients_of(rows, (gain * end)[:, None], count / (gain * size))
+    widening = np.hstack([along_phase, along_gain])
     nothing = np.zeros((posterior.unstable.order, 2))
+    known_columns = np.vstack([factor, posterior.covariance_factor[n_stable:]])
+    added_columns = np.vstack([widening, nothing])
     return replace(
         wider,
         mean=np.append(mean[:, 0], posterior.mean[n_stable:]),
-        covariance_factor=np.hstack(
-            [
-                np.vstack([factor, posterior.covariance_factor[n_stable:]]),
-                np.vstack([np.hstack([along_phase, along_gain]), nothing]),
-            ]
-        ),
+        covariance_factor=np.hstack([known_columns, added_columns]),
     )
