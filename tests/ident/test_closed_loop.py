@@ -98,7 +98,7 @@ def test_a_known_controller_tells_the_reference():
     np.testing.assert_array_equal(found.input, record.input[1:])
     late = with_controller(record, num, [1.0, -1.0, 0.0])  # the same controller a sample later
     np.testing.assert_allclose(np.diff(u)[1:] + np.convolve(y, num)[1:499], late.reference[:, 0])
-    with pytest.raises(ValueError, match="at least the numerator's degree"):
+    with pytest.raises(ValueError, match=r"controller.*degree"):
         with_controller(record, [1.0, 2.0], [1.0])
 
 
@@ -144,5 +144,5 @@ def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind):
 def test_records_without_reference_are_refused():
     record = log(np.random.default_rng(4), n=100)
     bare = Record("b", record.input, record.output, DT, ("u",), ("y",))
-    with pytest.raises(ValueError, match="exactly one reference"):
+    with pytest.raises(ValueError, match=r"'b'.*reference"):
         two_stage([bare], OPTIONS)

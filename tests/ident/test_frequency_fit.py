@@ -151,18 +151,18 @@ def test_control_design_takes_model_and_posterior(plant):
     )
 
 
-def test_bad_input_is_refused(plant):
+def test_a_refusal_names_the_option_or_counts_the_frequencies(plant):
     response = plant.response(OMEGA)
     good = measured(response, 6)
     exact = FrequencyUncertainty(OMEGA, response, np.zeros((OMEGA.size, 2, 2)), DT_S)
-    with pytest.raises(ValueError, match="exactly known"):
+    with pytest.raises(ValueError, match="known"):
         identify_frf(exact)
-    with pytest.raises(ValueError, match="no offset and no initial state"):
+    with pytest.raises(ValueError, match="offset"):
         identify_frf(good, IdentOptions(estimate_offset=True))
-    with pytest.raises(ValueError, match="relative_degree = 2 is not imposed"):
+    with pytest.raises(ValueError, match="relative_degree = 2"):
         identify_frf(good, IdentOptions(relative_degree=2))
     few = FrequencyUncertainty(OMEGA[:6], good.centre[:6], good.covariance[:6], DT_S)
-    with pytest.raises(ValueError, match="6 frequencies are too few for order 8"):
+    with pytest.raises(ValueError, match=r"6\D+8\D+"):
         identify_frf(few, IdentOptions(n_real=2, n_pairs=3))
 
 

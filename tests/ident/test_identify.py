@@ -179,20 +179,19 @@ def test_bad_options_are_refused_by_name(options, message):
         IdentOptions(**options)
 
 
-def test_constant_signals_are_refused():
+def test_a_constant_signal_is_refused_by_record_column_and_value():
     k = np.arange(100.0)
-    with pytest.raises(ValueError, match=r"record 'test': input column 'u' is constant \(2\)"):
+    with pytest.raises(ValueError, match=r"'test'.*'u'.*2"):
         identify([plants.as_record(np.full(100, 2.0), k)])
-    with pytest.raises(ValueError, match="output column 'y' is constant"):
+    with pytest.raises(ValueError, match=r"'test'.*'y'"):
         identify([plants.as_record(k, np.full(100, 2.0))])
 
 
 def test_too_few_samples_for_the_order_are_refused():
     rng = np.random.default_rng(0)
     record = plants.as_record(rng.normal(size=12), rng.normal(size=12))
-    with pytest.raises(
-        ValueError, match=r"record 'test': 12 samples are too few for order 8, which has 17 unknowns"
-    ):
+    # Samples, order and unknowns.
+    with pytest.raises(ValueError, match=r"'test'\D+12\D+8\D+17"):
         identify([record], IdentOptions(n_real=2, n_pairs=3))
 
 

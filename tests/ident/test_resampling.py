@@ -106,14 +106,14 @@ def test_the_same_rate_leaves_everything_as_it_is():
 
 @pytest.mark.parametrize("period_s", [0.003, 0.0013, 0.0045])
 def test_periods_that_do_not_meet_are_refused_in_one_line(period_s):
-    with pytest.raises(ValueError, match="a whole multiple or a whole part of the log's step") as refused:
+    with pytest.raises(ValueError, match=r"0\.002") as refused:
         ratio_of(STEP_S, period_s)
     assert "controller_dt_s" in str(refused.value)
 
 
 @pytest.mark.parametrize("times", [1000, 0.001])
 def test_rates_too_far_apart_are_refused_in_one_line(times):
-    with pytest.raises(ValueError, match=r"controller_dt_s = .* beside a log every 0\.002 s: expected 2e-05"):
+    with pytest.raises(ValueError, match=r"controller_dt_s.*0\.002.*2e-05.*0\.2"):
         ratio_of(STEP_S, times * STEP_S)
 
 

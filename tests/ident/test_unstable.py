@@ -106,9 +106,9 @@ def test_zeros_and_several_inputs_are_those_of_the_states():
 
 
 def test_an_unstable_pole_without_its_image_and_free_runs_are_refused():
-    with pytest.raises(ValueError, match="not among the poles"):
+    with pytest.raises(ValueError, match="poles"):
         replace(model(REAL), unstable=PAIR)
-    with pytest.raises(ValueError, match="no free run"):
+    with pytest.raises(ValueError, match="free run"):
         model(REAL).simulate(np.ones(5))
     with pytest.raises(ValueError, match="inside the unit circle"):
         IdentOptions(unstable_poles=((0.9, 0.0),))
