@@ -35,15 +35,17 @@ from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
 from ident.unstable import quick_poles
 
-# A first stage that explains less of the command than this, percent, has gone wrong: more than half of what
-# the command does then comes from noise, or from a reference that is not the one that was recorded.
+# Percent of a command that the first stage has to explain. Below half, most of what the command does comes
+# from noise, or from a reference that is not the one that was recorded; a case that leaves the way of
+# identification to the data is then not fitted in two stages.
 EXPLAINED_PERCENT = 50.0
 # Percent of the commands that the first stage has to explain for balls of several inputs and outputs. Where
 # it explained 89 %, 95 % balls held the true response at 90 % of the frequencies, at 70 % at 40 % of them.
 EXPLAINED_PERCENT_FOR_BALLS = 90.0
-# Fit from reference to command. Behind a noise model: what noise of high frequency moved at a low one would
-# pass for excitation there. Only the fit is used, no ellipse, so no mode is taken for missed; and the poles
-# are a fit's own, so one tap beside them is enough.
+# Settings of the fit from reference to command. Behind a noise model: what noise of high frequency moved at a
+# low one would pass for excitation there. With a mode that may be missing (a prior of .5) the fit follows
+# noise, and u_hat is further from the true one than a test allows. One tap is the fewest there may be; with
+# 20 no test of two stages moves.
 FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
 # Standard deviation of a command that stands still, in place of zero.
 TINY = 1e-300

@@ -186,7 +186,7 @@ class ShapedMode:
             if self.is_pair:
                 pole_numbers.append(logit(np.angle(self.pole) / np.pi))
         if self.rank_one:
-            # The nearest c b; its scale goes into c, so that the largest of b is one.
+            # The nearest c b. Its scale goes into c, so that the entry of b is one for the largest input.
             left, size, right = np.linalg.svd(self.residue * input_sizes)
             drive = right[0] / input_sizes
             fixed = self.largest_input()
@@ -199,7 +199,10 @@ class ShapedMode:
         return np.concatenate([pole_numbers, numbers.real])
 
     def at(self, numbers: RealArray) -> _ModeValue:
-        """Pole, residue and the residue's slopes at free numbers (P,)."""
+        """Pole, residue and the residue's slopes at free numbers (P,), laid out as `pack` does.
+
+        Which entry of b is one, and the sign of a real pole, are those of the start.
+        """
         pole = self.pole
         if self.moves:
             modulus = np.exp(-np.exp(np.clip(numbers[0], LOWEST_LOG_DECAY, HIGHEST_LOG_DECAY)))
