@@ -10,6 +10,9 @@ an open-loop record with input u_hat (an instrumental variable; Gilson and Van d
 Schrama (Automatica 29(6), 1993), where it counts in full. G0 is fitted first to the logs as they are, then
 again to the records that it opened (`two_stage`, `two_stage_several`). Where no reference was recorded, a
 known controller makes one (`with_controller`). Assumed: a linear loop, and references without noise.
+
+A `Record` has an input (T, U), an output (T, Y) and where it was logged a reference (T, R), with their names,
+and its sampling time dt_s.
 """
 
 from __future__ import annotations
@@ -322,8 +325,10 @@ def _opened(records: Sequence[Record], unexplained: Sequence[RealArray], plant: 
 
 
 def _reference_to_input(record: Record) -> Record:
-    """Record whose input is the reference and whose output is the input; raises ValueError where a record has
-    not exactly one of each."""
+    """Record whose input is the reference and whose output is the input, both (T, 1).
+
+    Raises ValueError where a record has not exactly one of each.
+    """
     if record.reference is None or record.reference.shape[1] != 1:
         raise ValueError(f"{record.label}: closed-loop identification needs exactly one reference column")
     if record.input.shape[1] != 1:

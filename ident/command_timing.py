@@ -168,8 +168,10 @@ class CommandTiming:
 
     @property
     def offered_dt_s(self) -> float:
-        """Period for a new controller, s: the known one where it is a whole part of the step of the rows in
-        use; else that step."""
+        """Period, s, that a new controller may have.
+
+        The known one where it is a whole part of the step of the rows in use; else that step.
+        """
         used_step_s = self.row_step_s * self.rows_per_command
         if self.period_s is None:
             return used_step_s
@@ -297,8 +299,10 @@ def rows_per_command_of(records: Sequence[Record]) -> int:
 
 
 def _usual_gaps(records: Sequence[Record]) -> list[int]:
-    """Number of rows after which the command changes, of each record where it changes often; 1 where gaps
-    differ."""
+    """Usual number of rows between changes of the command, of each record where it changes often.
+
+    1 where the gaps are no multiples of one number. Records with few changes are left out.
+    """
     usual_gaps = []
     for record in records:
         gaps = np.diff(_changes(record))

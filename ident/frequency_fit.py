@@ -5,6 +5,10 @@ right. Poles are searched and their number is chosen as for records (`_OrderFit`
 frequency shows are then replaced where fits without them are as good but for chance (`_limited_to_data`).
 What is left are the model, ellipses around it (`embed_response`), standard deviations of its poles, and what
 it assumes outside the measured band. Assumed: errors that are independent from frequency to frequency.
+
+Types of other files that travel here: `FrequencyUncertainty`, a response (F,) at frequencies with covariances
+(F, 2, 2) of its real and imaginary parts; `FrfRegression`, its rows divided by these; `PoleSearch`, a search
+on them with fixed poles, bounds and trace; `Refined`, the end of a descent (poles, chi-square rss).
 """
 
 from __future__ import annotations
@@ -134,7 +138,7 @@ def identify_frf(
     *,
     shared_gain_std: float = 0.0,
 ) -> FrfIdentification:
-    """A GOBF model fitted to a measured frequency response, each frequency weighted by its covariance.
+    """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
 
     Parameters
     ----------
@@ -259,8 +263,11 @@ def identify_frf(
 
 
 def _prepared(response: FrequencyUncertainty, options: IdentOptions) -> FrfRegression:
-    """Regression of the response, divided by its covariances, with integrators, delay and direct term of the
-    options as known factors."""
+    """Regression of the response, divided by the size of its errors.
+
+    Integrators, delay and direct term are those of the options. Raises ValueError for a frequency without
+    covariance.
+    """
     return prepare_response(
         response,
         integrators=options.integrators,

@@ -9,6 +9,10 @@ shape first. Each trial is refitted by nonlinear least squares (`ModalFit`), wit
 its decay and the logistic number of its angle. The caller refuses a trial by the likelihood ratio of both
 fits, which is chi-squared with (Y - 1)(U - 1) degrees for a real pole and twice as many for a pair.
 
+`OutputRegressions`, of another file, holds a regression for each output (`each`) of the same inputs u (U, N),
+with `y` (N,), `segments` (rows of each record) and `take_out_local`, which projects rows off nuisance
+columns.
+
 `ModalFit` also says how uncertain the numbers are and how they change the response, to first order. Assumed:
 poles that differ, and outputs whitened to independent noise of power 1.
 """
@@ -370,6 +374,7 @@ class ModalFit:
     """
 
     def __init__(self, data: OutputRegressions, modes: Sequence[ShapedMode]) -> None:
+        """Take the modes as they are, and the residual and Jacobian there."""
         first = data.each[0]
         self.data = data
         self.modes = modes
@@ -414,15 +419,18 @@ class ModalFit:
         last: dict[bytes, tuple[RealArray, RealArray]] = {}
 
         def linearised(x: RealArray) -> tuple[RealArray, RealArray]:
+            """Residual and Jacobian at x, from memory where they were asked for last."""
             if x.tobytes() not in last:
                 last.clear()
                 last[x.tobytes()] = self._linearised(x)
             return last[x.tobytes()]
 
         def residual_at(x: RealArray) -> RealArray:
+            """Residual (Y N,) at x."""
             return linearised(x)[0]
 
         def jacobian_at(x: RealArray) -> RealArray:
+            """Jacobian (Y N, P) at x."""
             return linearised(x)[1]
 
         solution = least_squares(
@@ -465,8 +473,11 @@ class ModalFit:
         return rows[0], rows[1:].T
 
     def _local_q(self, poles: Sequence[complex]) -> RealArray:
-        """Nuisance columns (Ql, N), orthonormal within each record: polynomials, and free responses of the
-        poles where records may begin in motion."""
+        """Nuisance columns (Ql, N), orthonormal within each record.
+
+        Polynomials (offset, drift of integrators), and free responses of the poles where records may begin in
+        motion.
+        """
         first = self.data.each[0]
         if not self.structure.estimate_initial_state:
             return first.polynomials_q
@@ -688,8 +699,10 @@ class ModalFit:
         )
 
     def _linear_coefficients(self, unexplained: RealArray, poles: list[complex]) -> RealArray:
-        """Coefficients (Y, Q) of the linear rows in what the modes leave of the outputs (Y, N), nuisances
-        beside them."""
+        """Coefficients (Y, Q) of the linear rows, by least squares beside the nuisances.
+
+        `unexplained` (Y, N) : what the modes leave of the outputs; `poles` : those of the free responses.
+        """
         n_outputs = len(unexplained)
         if not len(self.linear_rows):
             return np.zeros((n_outputs, 0))
@@ -700,7 +713,12 @@ class ModalFit:
 
 
 class _ResponseChange(NamedTuple):
-    """Change of the response with one free number: a residue (Y, U) at a state (two for a pair)."""
+    """Change of the response with one free number of a mode.
+
+    state : index of the state of one input that it is seen from, for a pair of that and the next one
+    residue (Y, U) : by which outputs see that state of each input
+    is_pair : with the conjugate
+    """
 
     state: int
     residue: ComplexArray

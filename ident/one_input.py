@@ -6,6 +6,11 @@ where what was left to the data is decided: initial state and offset (`fitted_on
 as known is tested by likelihood ratios, and a relative degree is imposed (`_priors_judged`). At the end the
 model and what describes its fit are read off (`description`). All noise is taken as white here;
 `ident.coloured_noise` runs the same path on records that were whitened.
+
+Types of other files that travel here: `Regression`, records made ready for a fit (inputs u (1, N), outputs y
+(N,) of all records, and their structure); `PoleSearch`, a search on one of them, with its options, its fixed
+poles and its trace (minima, stages, evaluations); `Refined`, the end of a descent (poles, residual sum of
+squares rss); `Fitted`, a search and such an end; `SearchOutcome`, a `Fitted` with the selection of its order.
 """
 
 from __future__ import annotations
@@ -103,6 +108,7 @@ def part_of(report: Progress, begin: float, length: float) -> Progress:
     """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole."""
 
     def report_step(share: float, message: str) -> None:
+        """Report a share of the step as one of the whole."""
         report(begin + length * share, message)
 
     return report_step
@@ -544,8 +550,11 @@ def _advice(
     residuals: tuple[RealArray, ...],
     refused: tuple[Finding, ...],
 ) -> list[Finding]:
-    """Everything that `Identification.warnings` has to say beside the search: whether there is an answer at
-    all, doubts about records and poles, and the priors that were refused."""
+    """Findings of `Identification.warnings` beside those of the search.
+
+    Whether there is an answer to the input at all, doubts about the records, doubts about the poles, and the
+    priors that were refused. `residuals` (T - delay,) of each record.
+    """
     data = fitted.data
     fixed = fitted.search.fixed
     longest_s = data.longest * data.dt_s

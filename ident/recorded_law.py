@@ -27,6 +27,9 @@ from ident.data.record import Record
 # States of a law that are tried: integral action, a filtered derivative, and a second-order filter. The
 # controllers of drives have no more; a law of higher order explains any smooth command by its own past.
 MOST_STATES = 4
+# Rows for each coefficient of a law, at least: with fewer, least squares explains part of the rounding, and
+# the residual is no measure of it.
+ROWS_PER_COEFFICIENT = 4
 # A row whose command stands within this share of the largest one is at the limit, where no linear law holds.
 LIMIT_SHARE = 0.999
 # Residual over what the rounding of the columns leaves of a true law, up to which the law is the one that
@@ -262,6 +265,7 @@ class _Columns:
         row_parts = []
         target_parts = []
         for command, reference, output in self.signals:
+            # Two windows of past rows have to fit in.
             if command.size <= thinned * (structure.n_states + 2):
                 continue
             every = slice(start, None, thinned)
@@ -272,7 +276,7 @@ class _Columns:
             return None
         rows = np.concatenate(row_parts)
         target = np.concatenate(target_parts)
-        if len(rows) < MOST_STATES * rows.shape[1]:
+        if len(rows) < ROWS_PER_COEFFICIENT * rows.shape[1]:
             return None
         # A column that stands at zero, as that of a reference that nobody moved, gets a coefficient of zero.
         length = np.linalg.norm(rows, axis=0)

@@ -7,6 +7,11 @@ of the covariance are repeated. At the end each mode gets one shape, a residue o
 ratio does not refuse it (`ident.mode_shapes`), and the result is written in the outputs' units.
 
 Assumed: the noise is white in time. Its covariance between outputs is estimated.
+
+Types of other files that travel here: `OutputRegressions`, a regression for each output (`each`) of the same
+inputs u (U, N), with `y` (N,), `segments` (rows of each record) and numbers of all outputs together;
+`PoleSearch`, a search on them with its fixed poles, bounds and trace; `Refined`, the end of a descent (poles,
+residual sum of squares rss).
 """
 
 from __future__ import annotations
@@ -270,6 +275,7 @@ def _identification(
         return float(chi2.sf(loss / noise_power * effective_share, saved_numbers))
 
     def refused(shaped_rss: float, saved_numbers: int) -> bool:
+        """Whether noise alone hardly makes free residues fit so much better."""
         return chance_of(shaped_rss, saved_numbers) < SHAPE_REFUSAL_LEVEL
 
     shaped = None
@@ -346,7 +352,11 @@ def _identification(
 def _advice(
     records: Sequence[Record], search: PoleSearch[OutputRegressions], model: MimoModel, residual: RealArray
 ) -> list[Finding]:
-    """What to look at before trusting the model; `residual` (Y, N) is that of the whitened outputs."""
+    """Findings to look at before trusting the model; `residual` (Y, N) is that of the whitened outputs.
+
+    Doubtful poles, outputs that do not answer to the inputs, few samples, inputs that move together, and a
+    residual that is not white.
+    """
     data = search.data
     findings = pole_warnings(model.outputs[0], search.fixed, search.bounds)
     if model.order:

@@ -11,6 +11,9 @@ The poles of the basis start at those zeros, mirrored into the circle, over and 
 IEEE TAC 10(4), 1965); then a descent moves them to the least squares of e, and the criterion of the order
 chooses how many there are. A zero counts as an unstable pole where it lies outside the circle beyond doubt,
 to first order in the noise. Neglected: friction in the input, which `ident.friction` takes off first.
+
+`Regression`, of another file, holds the records made ready for a fit: inputs u (2, N), outputs y (N,) of all
+records; `project` fits a basis to it; `Refined` is the end of a descent (poles, residual sum of squares rss).
 """
 
 from __future__ import annotations
