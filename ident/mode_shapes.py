@@ -9,12 +9,12 @@ shape first. Each trial is refitted by nonlinear least squares (`ModalFit`), wit
 its decay and the logistic number of its angle. The caller refuses a trial by the likelihood ratio of both
 fits, which is chi-squared with (Y - 1)(U - 1) degrees for a real pole and twice as many for a pair.
 
+`ModalFit` also says how uncertain the numbers are and how they change the response, to first order. Assumed:
+poles that differ, and outputs whitened to independent noise of power 1.
+
 `OutputRegressions`, of another file, holds a regression for each output (`each`) of the same inputs u (U, N),
 with `y` (N,), `segments` (rows of each record) and `take_out_local`, which projects rows off nuisance
 columns.
-
-`ModalFit` also says how uncertain the numbers are and how they change the response, to first order. Assumed:
-poles that differ, and outputs whitened to independent noise of power 1.
 """
 
 from __future__ import annotations
