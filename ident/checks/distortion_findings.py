@@ -1,155 +1,330 @@
-"""What noise, distortion and repeats at several amplitudes say: linear, and how far, or distorted, and
-how."""
+"""Whether a machine is linear as far as its records show, and if not, how the distortion looks.
+
+Two kinds of experiments tell it without a model. Periodic records separate noise, distortion at odd and
+distortion at even lines (`ident.data.distortion`, after Pintelon and Schoukens); repeats at several
+amplitudes show whether the response depends on the amplitude (`ident.data.repeats`). Of all other records the
+coherence bounds noise and distortion together. This file turns these numbers into findings: which verdict,
+over which band, in per cent of the response. `distortion_findings` asks all three sources,
+`amplitude_effects` the repeats alone. Records have one input and one output.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from operator import attrgetter
 
 import numpy as np
 
 from ident.checks.early_checks import clipped
-from ident.data.distortion import BandLevel, Distortion
+from ident.data.arrays import RealArray
+from ident.data.distortion import BandLevel, Distortion, LineLevels
 from ident.data.finding import Finding, FindingKind, Value, finding
 from ident.data.nonparametric import coherence
 from ident.data.record import Record
 from ident.data.repeats import AmplitudeBand, Repeats, repeats_of
 
-# Distortion above this share of the response is told where it is; a linear design need not mind less.
-_WORTH_TELLING = 0.01
-# A band in which noise would hide this much says nothing.
-_HIDDEN = 0.05
-# One kind is told where its power is this many times the other's; a trend where the level changes so much.
-_CLEARLY, _TREND = 4.0, 1.25
-# A change of the gain, or of resonances, is named where it explains this much of a difference.
-_NAMED = 0.3
+# Share of the response (RMS). Significant distortion below it is not called distortion, as loop shaping with
+# usual margins (gain errors of tens of per cent) need not mind 1 %. Chosen.
+LEAST_DISTORTION = 0.01
+# Share of the response (RMS). A band in which noise would hide so much distortion says nothing about
+# linearity; in records that are not periodic, noise and distortion together are asked to stay below it.
+# Chosen.
+MOST_HIDDEN = 0.05
+# Ratio of powers (6 dB). Distortion is called odd, or even, where the power at lines of that parity is so
+# many times the power at the others. Chosen.
+PARITY_POWER_RATIO = 4.0
+# Ratio of shares of the response. Distortion is said to fall or grow with the amplitude where its share
+# changes by so much. Chosen; Coulomb friction halves its share where the amplitude doubles.
+TREND_RATIO = 1.25
+# Share of a difference's power. A change of the gain, or a shift of resonances, is named in a band where it
+# explains so much of what differs between amplitudes. Chosen.
+LEAST_EXPLAINED = 0.3
+# Coherence that stands for zero: keeps 1 / coherence finite at lines without any answer.
+LEAST_COHERENCE = 1e-12
 
 
 def distortion_findings(
-    records: Sequence[Record], found: Sequence[Distortion], repeated: Sequence[Repeats] = ()
+    records: Sequence[Record], distortions: Sequence[Distortion], repeated: Sequence[Repeats] = ()
 ) -> list[Finding]:
-    """Verdicts about records with one input and output, from `distortion_of` them and `repeats_of` them.
+    """Findings on linearity, from all that records show without a model.
 
-    Of records that are neither periodic nor repeats: noise and distortion together, by their coherence.
+    Parameters
+    ----------
+    records : sequence of Record
+        One input and one output each.
+    distortions : sequence of Distortion
+        `distortion_of(records)`: one for each amplitude of periodic records, lowest amplitude first.
+    repeated : sequence of Repeats
+        `repeats_of(records)`: one for each experiment that was repeated.
+
+    Returns
+    -------
+    list of Finding
+        In this order: for each amplitude the findings of `_amplitude_verdict`; for each repeated experiment
+        those of `_repeat_findings`; one NOT_PERIODIC where records are neither periodic nor repeats; one
+        CLIPPED for each clipped output where there are periodic records. Empty without records.
     """
-    periodic = {name for levels in found for name in levels.names}
-    periodic |= {name for each in repeated for names in each.names for name in names}
-    rest = [record for record in records if record.name not in periodic]
-    unit = "".join(records[0].input_units[:1]) if records else ""
-    told = [item for levels in found for item in _verdict(levels, found, unit)]
-    told += [item for each in repeated for item in _of_repeats(each)]
-    if rest:
-        omega, coherent = (np.concatenate(part) for part in zip(*(coherence([r]) for r in rest), strict=True))
-        seen = omega[np.sqrt(1 / np.clip(coherent, 1e-12, 1.0) - 1) < _HIDDEN] / (2 * np.pi)
-        values = {"from_Hz": seen.min(), "to_Hz": seen.max()} if seen.size else {"from_Hz": 0.0, "to_Hz": 0.0}
-        told.append(finding(FindingKind.NOT_PERIODIC, n_records=len(rest), percent=100 * _HIDDEN, **values))
-    if found:
-        told += [item for item in clipped(records) if item.values["signal"] == "output"]
-    return told
+    unit = ""
+    if records and records[0].input_units:
+        unit = records[0].input_units[0]
+    findings: list[Finding] = []
+    for distortion in distortions:
+        findings += _amplitude_verdict(distortion, distortions, unit)
+    for repeats in repeated:
+        findings += _repeat_findings(repeats)
+
+    # Records that neither method could use.
+    used_names = {name for distortion in distortions for name in distortion.names}
+    for repeats in repeated:
+        for names in repeats.names:
+            used_names |= set(names)
+    unused = [record for record in records if record.name not in used_names]
+    if unused:
+        findings.append(_coherent_band(unused))
+
+    # A clipped output distorts like a machine that saturates: whoever reads of distortion has to know.
+    if distortions:
+        findings += [item for item in clipped(records) if item.values["signal"] == "output"]
+    return findings
 
 
 def amplitude_effects(records: Sequence[Record]) -> list[Finding]:
-    """What a linear model of records at several amplitudes is not: for those who look at no distortion."""
-    told = (item for each in repeats_of(records) for item in _of_repeats(each))
-    return [item for item in told if item.kind is FindingKind.AMPLITUDE_EFFECT]
+    """Findings AMPLITUDE_EFFECT on repeated experiments: what a linear model of these records cannot be.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        One input and one output each; those without a repeat at the same amplitude tell nothing.
+
+    Returns
+    -------
+    list of Finding
+        One for each experiment whose response depends on the amplitude beyond chance; often empty.
+
+    Raises
+    ------
+    ValueError
+        A record has several inputs or outputs.
+    """
+    findings: list[Finding] = []
+    for repeats in repeats_of(records):
+        findings += _repeat_findings(repeats)
+    return [item for item in findings if item.kind is FindingKind.AMPLITUDE_EFFECT]
 
 
-def _of_repeats(repeats: Repeats) -> list[Finding]:
-    """What scatters, and what differs between the smallest and the largest amplitude."""
-    scatter = [100 * repeats.scatter(k) for k in range(len(repeats.rms))]
+def _coherent_band(records: Sequence[Record]) -> Finding:
+    """Finding NOT_PERIODIC with the band, Hz, in which noise and distortion together are small.
+
+    Small: below `MOST_HIDDEN` of the response, by the coherence of each record. The band reaches from the
+    lowest to the highest such frequency; 0 to 0 Hz where there is none.
+    """
+    omegas: list[RealArray] = []
+    coherences: list[RealArray] = []
+    for record in records:
+        omega_rad_s, squared_coherence = coherence([record])
+        omegas.append(omega_rad_s)
+        coherences.append(squared_coherence)
+    coherent = np.clip(np.concatenate(coherences), LEAST_COHERENCE, 1.0)
+    # With coherence c, the power of what is no response over that of the response is (1 - c) / c.
+    unexplained_share = np.sqrt(1 / coherent - 1)
+    seen_Hz = np.concatenate(omegas)[unexplained_share < MOST_HIDDEN] / (2 * np.pi)
+    from_Hz = 0.0
+    to_Hz = 0.0
+    if seen_Hz.size:
+        from_Hz = float(seen_Hz.min())
+        to_Hz = float(seen_Hz.max())
+    return finding(
+        FindingKind.NOT_PERIODIC,
+        n_records=len(records),
+        percent=100 * MOST_HIDDEN,
+        from_Hz=from_Hz,
+        to_Hz=to_Hz,
+    )
+
+
+def _repeat_findings(repeats: Repeats) -> list[Finding]:
+    """Findings on one repeated experiment: its scatter, then what differs between amplitudes.
+
+    REPEATED always; then AMPLITUDE_EFFECT where the responses of the smallest and the largest amplitude
+    differ beyond chance, or AMPLITUDE_HIDDEN where two amplitudes or more show no such difference.
+    Frequencies in Hz, sizes in per cent of the response (RMS over a band).
+    """
+    scatter_percent = [100 * repeats.scatter(index) for index in range(len(repeats.rms))]
     about: dict[str, Value] = {
         "times": repeats.rms[-1] / repeats.rms[0],
         "n_records": min(len(names) for names in repeats.names),
         "n_amplitudes": len(repeats.rms),
-        "least_percent": min(scatter),
-        "most_percent": max(scatter),
+        "least_percent": min(scatter_percent),
+        "most_percent": max(scatter_percent),
         "from_Hz": repeats.omega_rad_s[0] / (2 * np.pi),
         "to_Hz": repeats.omega_rad_s[-1] / (2 * np.pi),
     }
-    told = [finding(FindingKind.REPEATED, **about)]
+    findings = [finding(FindingKind.REPEATED, **about)]
     effects = repeats.amplitude_effects
     if effects:
-        most = max(effects, key=lambda band: band.difference)
+        strongest = max(effects, key=lambda band: band.difference)
+        # The band is that of the effects here, not that of the whole experiment.
         values: dict[str, Value] = {
             **about,
             "from_Hz": effects[0].from_rad_s / (2 * np.pi),
             "to_Hz": effects[-1].to_rad_s / (2 * np.pi),
-            "most_from_Hz": most.from_rad_s / (2 * np.pi),
-            "most_to_Hz": most.to_rad_s / (2 * np.pi),
-            "percent": 100 * most.difference,
-            "chance_percent": 100 * most.chance,
+            "most_from_Hz": strongest.from_rad_s / (2 * np.pi),
+            "most_to_Hz": strongest.to_rad_s / (2 * np.pi),
+            "percent": 100 * strongest.difference,
+            "chance_percent": 100 * strongest.chance,
         }
-        told.append(finding(FindingKind.AMPLITUDE_EFFECT, **values, **_looks(effects)))
+        explained = _explanations(effects)
+        findings.append(finding(FindingKind.AMPLITUDE_EFFECT, **values, **explained))
     elif len(repeats.rms) > 1:
-        told.append(finding(FindingKind.AMPLITUDE_HIDDEN, **about))
-    return told
+        findings.append(finding(FindingKind.AMPLITUDE_HIDDEN, **about))
+    return findings
 
 
-def _looks(effects: Sequence[AmplitudeBand]) -> dict[str, Value]:
-    """Where a shift of resonances, and where a change of the whole band, explains most; 0 where none does."""
-    named: dict[str, Value] = {}
-    for what, share in (("shift", attrgetter("shift_share")), ("gain", attrgetter("level_share"))):
-        like = [band for band in effects if share(band) > _NAMED]
-        band = max(like, key=lambda band: share(band) * band.difference / band.chance, default=None)
-        named |= {
-            f"{what}_percent": 0.0 if band is None else 100 * getattr(band, what),
-            f"{what}_from_Hz": 0.0 if band is None else band.from_rad_s / (2 * np.pi),
-            f"{what}_to_Hz": 0.0 if band is None else band.to_rad_s / (2 * np.pi),
-        }
-    return named
+def _explanations(effects: Sequence[AmplitudeBand]) -> dict[str, Value]:
+    """Size and band of two simple explanations of an amplitude effect, a shift of resonances and a gain.
+
+    Keys shift_percent, shift_from_Hz, shift_to_Hz and the same three of gain, each of the band where the
+    explanation counts most (share explained times difference over chance); zeros where it explains less than
+    `LEAST_EXPLAINED` of every band.
+    """
+
+    def shift_share(band: AmplitudeBand) -> float:
+        return band.shift_share
+
+    def gain_share(band: AmplitudeBand) -> float:
+        return band.level_share
+
+    explained: dict[str, Value] = {}
+    for name, share_of in (("shift", shift_share), ("gain", gain_share)):
+        percent = 0.0
+        from_Hz = 0.0
+        to_Hz = 0.0
+        bands = [band for band in effects if share_of(band) > LEAST_EXPLAINED]
+        if bands:
+            weights = [share_of(band) * band.difference / band.chance for band in bands]
+            clearest = bands[weights.index(max(weights))]
+            percent = 100 * float(getattr(clearest, name))
+            from_Hz = clearest.from_rad_s / (2 * np.pi)
+            to_Hz = clearest.to_rad_s / (2 * np.pi)
+        explained[f"{name}_percent"] = percent
+        explained[f"{name}_from_Hz"] = from_Hz
+        explained[f"{name}_to_Hz"] = to_Hz
+    return explained
 
 
-def _verdict(levels: Distortion, all_levels: Sequence[Distortion], unit: str) -> list[Finding]:
-    told: list[Finding] = []
-    about: dict[str, Value] = {"rms": levels.rms, "unit": unit}
-    if levels.realisations < 2:
-        detection = [lines.omega_rad_s.size for lines in (levels.odd, levels.even) if lines is not None]
-        told.append(finding(FindingKind.ONE_REALISATION, **about, lines=sum(detection)))
-    if levels.noise_std is None:
-        told.append(finding(FindingKind.ONE_PERIOD, **about))
-    # Distortion in every band: between realisations, or at the odd detection lines where there is one.
-    lines = levels.excited or levels.odd
-    found = [] if lines is None else [lines.within(*band) for band in levels.bands_rad_s]
-    bands = [band for band in found if band is not None]
-    usable = [band for band in bands if band.significant or band.interval[1] <= _HIDDEN]
-    if not bands or levels.noise_std is None:
-        return told
+def _amplitude_verdict(
+    distortion: Distortion, all_amplitudes: Sequence[Distortion], unit: str
+) -> list[Finding]:
+    """Findings on periodic records of one amplitude: what they cannot tell, then at most one verdict.
+
+    Not to be told: ONE_REALISATION (no scatter between realisations), ONE_PERIOD (no noise). Verdict:
+    NOISE_HIDES where every band is lost in noise, DISTORTED where a band has significant distortion above
+    `LEAST_DISTORTION`, else LINEAR with the largest distortion that the records leave possible; none without
+    noise level. Levels in per cent of the response, band in Hz; rms of the input in `unit`. `all_amplitudes`:
+    of the same experiment, ascending, for the trend.
+    """
+    findings: list[Finding] = []
+    about: dict[str, Value] = {"rms": distortion.rms, "unit": unit}
+    if distortion.realisations < 2:
+        detection = [lines for lines in (distortion.odd, distortion.even) if lines is not None]
+        n_lines = sum(lines.omega_rad_s.size for lines in detection)
+        findings.append(finding(FindingKind.ONE_REALISATION, **about, lines=n_lines))
+    if distortion.noise_std is None:
+        findings.append(finding(FindingKind.ONE_PERIOD, **about))
+
+    # Levels by half decades: from the scatter between realisations, or at the odd detection lines where there
+    # is one realisation. Even lines tell nothing of what distorts a model that is fitted at odd ones.
+    bands = _levels_in_bands(distortion.excited or distortion.odd, distortion.bands_rad_s)
+    if not bands or distortion.noise_std is None:
+        return findings
+
+    # Bands in which something can be said: distortion is shown, or an upper limit is small.
+    usable = [band for band in bands if band.significant or band.interval[1] <= MOST_HIDDEN]
     if not usable:
-        return [*told, finding(FindingKind.NOISE_HIDES, **about, percent=100 * _HIDDEN)]
-    distorted = [band for band in usable if band.significant and band.distortion > _WORTH_TELLING]
-    where = distorted or usable
-    ends = {"from_Hz": where[0].from_rad_s / (2 * np.pi), "to_Hz": where[-1].to_rad_s / (2 * np.pi)}
+        findings.append(finding(FindingKind.NOISE_HIDES, **about, percent=100 * MOST_HIDDEN))
+        return findings
+
+    distorted = [band for band in usable if band.significant and band.distortion > LEAST_DISTORTION]
+    told_bands = distorted or usable
+    ends = {
+        "from_Hz": told_bands[0].from_rad_s / (2 * np.pi),
+        "to_Hz": told_bands[-1].to_rad_s / (2 * np.pi),
+    }
     if not distorted:
-        limit = 100 * max(band.interval[1] for band in usable)
-        return [*told, finding(FindingKind.LINEAR, **about, percent=limit, **ends)]
-    percent = 100 * max(band.distortion for band in distorted)
-    kind, trend = _kind(levels, distorted), _trend(levels, all_levels, distorted)
-    return [*told, finding(FindingKind.DISTORTED, **about, percent=percent, parity=kind, trend=trend, **ends)]
-
-
-def _kind(levels: Distortion, distorted: Sequence[BandLevel]) -> str:
-    """odd, even or both, by the detection lines; unknown without them."""
-    if levels.odd is None or levels.even is None:
-        return "unknown"
-    found = (
-        [lines.within(band.from_rad_s, band.to_rad_s) for band in distorted]
-        for lines in (levels.odd, levels.even)
+        limit_percent = 100 * max(band.interval[1] for band in usable)
+        findings.append(finding(FindingKind.LINEAR, **about, percent=limit_percent, **ends))
+        return findings
+    findings.append(
+        finding(
+            FindingKind.DISTORTED,
+            **about,
+            percent=100 * max(band.distortion for band in distorted),
+            parity=_parity(distortion, distorted),
+            trend=_trend(distortion, all_amplitudes, distorted),
+            **ends,
+        )
     )
-    odd, even = (sum(one.distortion**2 for one in each if one is not None) for each in found)
-    # Even lines are the only place of even distortion where only odd lines are excited.
-    return "odd" if odd > _CLEARLY * even else "even" if even > _CLEARLY * odd else "both"
+    return findings
 
 
-def _trend(levels: Distortion, every: Sequence[Distortion], distorted: Sequence[BandLevel]) -> str:
-    """How its share of the response changes when the amplitude grows: falls, grows, same, or unknown."""
-    other = every[0] if levels is every[-1] else every[-1]
-    if other is levels:
+def _levels_in_bands(lines: LineLevels | None, bands_rad_s: Sequence[tuple[float, float]]) -> list[BandLevel]:
+    """Distortion levels of lines in each band (low, high) in rad/s; bands without a line are left out.
+
+    Empty where there are no lines at all (None).
+    """
+    if lines is None:
+        return []
+    levels = [lines.within(low, high) for low, high in bands_rad_s]
+    return [level for level in levels if level is not None]
+
+
+def _parity(distortion: Distortion, distorted: Sequence[BandLevel]) -> str:
+    """Parity of the distortion in some bands: "odd", "even", "both" or "unknown".
+
+    Told by the lines without excitation: where only odd lines are excited, odd distortion (a cube, dry
+    friction) stands at odd lines, even distortion (a square) at even ones. "unknown" without detection lines
+    of both parities.
+    """
+    if distortion.odd is None or distortion.even is None:
+        return "unknown"
+    bands_rad_s = [(band.from_rad_s, band.to_rad_s) for band in distorted]
+    odd_power = sum(level.distortion**2 for level in _levels_in_bands(distortion.odd, bands_rad_s))
+    even_power = sum(level.distortion**2 for level in _levels_in_bands(distortion.even, bands_rad_s))
+    if odd_power > PARITY_POWER_RATIO * even_power:
+        return "odd"
+    if even_power > PARITY_POWER_RATIO * odd_power:
+        return "even"
+    return "both"
+
+
+def _trend(
+    distortion: Distortion, all_amplitudes: Sequence[Distortion], distorted: Sequence[BandLevel]
+) -> str:
+    """How the share of distortion changes when the amplitude grows: "falls", "grows", "same" or "unknown".
+
+    Median over the distorted bands of the ratio between this amplitude and the one farthest from it: the
+    largest, or the smallest for the largest itself. "unknown" with one amplitude, or where the other one
+    shows no distortion in any of these bands.
+    """
+    other = all_amplitudes[-1]
+    if distortion is other:
+        other = all_amplitudes[0]
+    if distortion is other:
         return "unknown"
     lines = other.excited or other.odd
-    there = [] if lines is None else [lines.within(one.from_rad_s, one.to_rad_s) for one in distorted]
-    both = zip(there, distorted, strict=False)
-    ratios = [found.distortion / band.distortion for found, band in both if found and found.distortion > 0]
+    if lines is None:
+        return "unknown"
+    ratios = []
+    for band in distorted:
+        level = lines.within(band.from_rad_s, band.to_rad_s)
+        if level is not None and level.distortion > 0:
+            ratios.append(level.distortion / band.distortion)
     if not ratios:
         return "unknown"
-    ratio = float(np.median(ratios)) if other.rms > levels.rms else 1 / float(np.median(ratios))
-    return "falls" if ratio < 1 / _TREND else "grows" if ratio > _TREND else "same"
+    growth = float(np.median(ratios))
+    if other.rms <= distortion.rms:
+        growth = 1 / growth
+    if growth < 1 / TREND_RATIO:
+        return "falls"
+    if growth > TREND_RATIO:
+        return "grows"
+    return "same"
