@@ -1,19 +1,25 @@
-"""Tests of what the user says is known: integrators, fixed poles, input delay, relative degree;
-and whether the data ask for a nuisance: an unknown initial state, an offset.
+"""Tests of what the user states as known, and of nuisances that the data may ask for.
 
-Generalised likelihood ratios Ne ln(J with the prior / J without) against a chi-square quantile, Ne the
-independent samples the residual is worth. A pole at z = 1 lies on the edge of the stable ones: a true prior
-is refused in less than 1 % of all records. A refused prior is kept, and the finding says so; `relative_degree
-= "auto"` is imposed as far as the data agree.
+Stated are integrators, fixed poles, an input delay, a relative degree. Each is held against a fit without it
+by a generalised likelihood ratio, Ne ln(J with the prior / J without), J the residual sum of squares and Ne
+the independent samples that the residual without it is worth, against the chi-square quantile at 99 %
+(`TEST_LEVEL`). The alternative is searched anew, so that a wrong prior cannot hide behind the poles found
+under it. A pole at z = 1 lies on the edge of the stable ones: a true integrator is refused in less than 1 %
+of all records. A refused prior is kept, and the finding says so; only `relative_degree = "auto"` is imposed
+as far as the data agree.
 
-Far from its limit a nuisance is judged by the first step of a descent alone (Rao's score test): J - g^T H^-1
-g on the linearisation with its columns, at the poles found without them.
+Nuisances are an unknown initial state and an offset. Far from its limit a nuisance is judged by the first
+step of a descent alone (Rao's score test): J - g^T H^-1 g on the linearisation with its columns, at the poles
+found without them.
+
+Neglected: the noise is taken as stationary, its colour counts through Ne only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -24,126 +30,249 @@ from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
 from ident.data.finding import TEST_LEVEL, Finding, FindingKind, PriorTest, Value, finding
 from ident.data.record import Record
-from ident.fit.least_squares import Regression
+from ident.fit.least_squares import EXPLAINED, Regression
 from ident.fit.refinement import Refined, free_optimality
 from ident.fit.regression import prepare
 from ident.fit.structured_fit import UnderRelativeDegree, structured_fit
 from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import Fitted, PoleSearch
 
-# Descents that only compare starts stop when this fraction of J is left to gain.
+# Share of J that is left to gain when a descent ends that only compares starts: at 1000 independent samples
+# the statistic is then known to 0.1, its limit being 6.6. Ten times as much or as little moves no test of
+# priors.
 ROUGH = 1e-4
-# Slow poles that freed integrators start from, as decays over the whole record.
-_SLOW_STARTS = {
+# Slow poles from which freed integrators start, by number of integrators: distances from one times the
+# samples of the longest record, from a pole that hardly decays (0.1) to one that has settled after a
+# twentieth (20).
+SLOW_STARTS = {
     1: ((0.1,), (1.0,), (5.0,), (20.0,)),
     2: ((0.1, 1.0), (0.3, 5.0), (1.0, 20.0), (10.0, 30.0)),
     3: ((0.1, 0.5, 2.0), (0.3, 2.0, 10.0), (2.0, 10.0, 30.0)),
 }
-# Two freed integrators may also have become a slow oscillation: turns over the whole record.
-_SLOW_TURNS = (0.3, 1.0, 3.0)
-# A score below this part of the limit, every sample counted as independent, leaves the descent out.
-_CLEARLY_BELOW = 0.6
+# Two freed integrators may also have become a slow oscillation: its turns over the longest record.
+SLOW_TURNS = (0.3, 1.0, 3.0)
+# Decay of such a pair as a share of its angle: a damping ratio of 0.29, in the middle of what a search
+# allows.
+SLOW_PAIR_DECAY = 0.3
+# Decay over the longest record of the real pole that a third integrator starts as, beside such a pair.
+SLOW_BESIDE_PAIR = 0.3
+# Largest change of the logarithm of a decay or frequency (15 %) up to which two ends of a search are one
+# start.
+SAME_START = 0.15
+# Starts of a descent under a relative degree: the optimum without it and the next two others. A wrong start
+# can lose a mode.
+STARTS_UNDER_DEGREE = 3
+# A score below this part of the limit, every sample counted as independent, leaves the descent out. The score
+# is a first step; the rest of the way would have to gain two thirds as much again. Halved, or at the limit
+# itself, no test of priors moves.
+CLEARLY_BELOW = 0.6
+# Keeps ratios of residual sums of squares finite where one is zero.
+TINY = 1e-300
 
 
 def statistic(rss_with_prior: float, without: Fitted) -> float:
-    """Ne ln(J with the prior / J without); not below 0, where only descents that ended early can bring it."""
-    ratio = max(rss_with_prior, 1e-300) / max(without.end.rss, 1e-300)
-    # Residuals at rounding level (noise-free data) decide nothing.
-    if rss_with_prior <= 1e-18 * float(without.data.y @ without.data.y):
+    """Ne ln(J with the prior / J without), not below 0: large where the data contradict the prior.
+
+    Parameters
+    ----------
+    rss_with_prior : float
+        Residual sum of squares J of the fit under the prior.
+    without : Fitted
+        The fit without it: its J, and Ne, the independent samples that its residual is worth.
+
+    Returns
+    -------
+    float
+        0 also where the residual under the prior is rounding (noise-free data): that decides nothing.
+
+    Notes
+    -----
+    Negative values would mean that the fit with more freedom ended early.
+    """
+    ratio = max(rss_with_prior, TINY) / max(without.end.rss, TINY)
+    if rss_with_prior <= EXPLAINED * float(without.data.y @ without.data.y):
         return 0.0
     return max(0.0, float(without.worth() * np.log(ratio)))
 
 
 def limit(degrees_of_freedom: int) -> float:
-    """Chi-square quantile that a statistic of a true prior stays below in 99 % of the records."""
+    """Chi-square quantile that the statistic of a true prior stays below in 99 % of the records."""
     return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
 
 
 def judged(
     kind: FindingKind, prior: str, value: float, degrees_of_freedom: int, **details: Value
 ) -> PriorTest:
-    """`details`: further numbers of the sentence of this kind."""
+    """Verdict on a prior that the model keeps: refused where the statistic `value` exceeds its limit.
+
+    prior: the setting in words, such as "integrators = 2". details: further numbers of the sentence of this
+    kind of finding.
+    """
     bound = limit(degrees_of_freedom)
-    return PriorTest(kind, prior, value > bound, True, value, bound, degrees_of_freedom, details)
+    return PriorTest(
+        kind=kind,
+        prior=prior,
+        refused=value > bound,
+        imposed=True,
+        statistic=value,
+        limit=bound,
+        degrees_of_freedom=degrees_of_freedom,
+        details=details,
+    )
 
 
 def fixed_poles_test(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> PriorTest:
-    """Poles fixed by the user against as many free ones, from where they are and searched anew."""
-    k, fixed, poles = given.data.structure.integrators, given.search.fixed, given.poles
-    options = given.search.options.model_copy(
-        update={"fixed_poles": (), "n_real": poles.real.size - k, "n_pairs": poles.pairs.size}
-    )
+    """Verdict on poles fixed by the user, against as many free ones.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All records of the fit; not used, as the alternative is fitted on the rows of `given`.
+    searched : (records, Structure)
+        The part of the records that is searched (`thinned`), and its structure.
+    given : Fitted
+        The fit with the fixed poles, on all records.
+
+    Returns
+    -------
+    PriorTest
+        One degree of freedom for each fixed real number; `free_poles` names where free poles end.
+
+    Notes
+    -----
+    Free poles are sought from where the fixed ones are, by a search anew with the same numbers of real poles
+    and pairs, and, with two real poles or more, by a search with pairs in their place: no number of real
+    poles makes a mode.
+    """
+    n_integrators = given.data.structure.integrators
+    fixed = given.search.fixed
+    poles = given.poles
+    n_real = poles.real.size - n_integrators
+    n_pairs = poles.pairs.size
+    as_many_free = {"fixed_poles": (), "n_real": n_real, "n_pairs": n_pairs}
+    options = given.search.options.model_copy(update=as_many_free)
+
     small = PoleSearch(prepare(*searched), options)
-    ends = [small.descend(poles, "fixed poles freed", ROUGH), OrderSelection(small).run()]
-    n_real = poles.real.size - k
-    if n_real > 1:  # no number of real poles makes a mode: two of them may be a pair
-        turned = {"n_real": n_real % 2, "n_pairs": min(poles.pairs.size + n_real // 2, options.max_pairs)}
-        ends.append(OrderSelection(PoleSearch(small.data, options.model_copy(update=turned))).run())
+    ends = [small.descend(poles, "fixed poles freed", ROUGH)]
+    ends.append(OrderSelection(small).run())
+    if n_real > 1:
+        pairs_instead = min(n_pairs + n_real // 2, options.max_pairs)
+        turned = options.model_copy(update={"n_real": n_real % 2, "n_pairs": pairs_instead})
+        ends.append(OrderSelection(PoleSearch(small.data, turned)).run())
     best = min(ends, key=lambda end: end.rss)
     search = PoleSearch(given.data, options)
     freed = Fitted(search, search.descend(best.poles, "fixed poles freed"))
-    real = ", ".join(f"{a:.6g}" for a in np.sort(freed.poles.real[k:]))
-    pairs = ", ".join(f"{p.real:.6g} +- {p.imag:.6g}j" for p in freed.poles.pairs)
+
+    real_words = [f"{pole:.6g}" for pole in np.sort(freed.poles.real[n_integrators:])]
+    pair_words = [f"{pole.real:.6g} +- {pole.imag:.6g}j" for pole in freed.poles.pairs]
     return judged(
         FindingKind.FIXED_POLES,
         "fixed_poles",
         statistic(given.end.rss, freed),
-        fixed.real.size - k + 2 * fixed.pairs.size,
-        free_poles=", ".join(part for part in (real, pairs) if part),
+        fixed.real.size - n_integrators + 2 * fixed.pairs.size,
+        free_poles=", ".join(real_words + pair_words),
     )
 
 
 def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -> PriorTest:
-    """The input delay against one sample less and one more, on the rows that all three explain, under the
-    relative degree that the model keeps. The models are not nested; under a true delay the statistic is
-    mostly negative (shown as 0), so one degree of freedom is on the safe side."""
+    """Verdict on the input delay, against one sample less and one more.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        All records of the fit.
+    given : Fitted
+        The fit with the stated delay.
+    relative_degree : int
+        That the model keeps; below 2 it asks nothing of the poles.
+
+    Returns
+    -------
+    PriorTest
+        `other_delay`: the better of the two, in samples.
+
+    Notes
+    -----
+    Compared on the rows that both models explain. They are not nested; under a true delay the statistic is
+    mostly negative (shown as 0), so one degree of freedom is on the safe side.
+    """
     if relative_degree > 1:
         given = replace(given, end=best_under_relative_degree(given, relative_degree))
     structure = given.data.structure
     delay = structure.input_delay_samples
-    best, chosen = 0.0, delay + 1
-    for other in (delay - 1, delay + 1) if delay else (1,):
-        shifted = given.refitted(records, given.poles, input_delay_samples=other)
+    residual = _residual_under(given, relative_degree)
+    least_power = EXPLAINED * float(given.data.y @ given.data.y)
+
+    largest = 0.0
+    other_delay = delay + 1
+    trials = [1] if delay == 0 else [delay - 1, delay + 1]
+    for trial in trials:
+        shifted = given.refitted(records, given.poles, input_delay_samples=trial)
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
-        residuals = [
-            item.residual
-            if structure.feedthrough  # which a relative degree of 1, the least there is, would refuse
-            else structured_fit(item.data, item.poles, relative_degree).residual
-            for item in (given, shifted)
-        ]
-        common = max(delay, other)
-        ours = _power_from(residuals[0], given.data, common - delay)
-        theirs = _power_from(residuals[1], shifted.data, common - other)
-        worth = shifted.data.colour(residuals[1]).effective_samples
-        seen = ours > 1e-18 * float(given.data.y @ given.data.y)
-        value = worth * float(np.log(max(ours, 1e-300) / max(theirs, 1e-300))) if seen else 0.0
-        if value > best:
-            best, chosen = value, other
-    return judged(FindingKind.DELAY, f"input_delay_samples = {delay}", best, 1, other_delay=chosen)
+        shifted_residual = _residual_under(shifted, relative_degree)
+        # A record has no rows before its delay: the later one of both starts the common rows.
+        common_delay = max(delay, trial)
+        power = _power_from(residual, given.data, common_delay - delay)
+        shifted_power = _power_from(shifted_residual, shifted.data, common_delay - trial)
+        worth = shifted.data.colour(shifted_residual).effective_samples
+        value = 0.0
+        if power > least_power:
+            value = worth * float(np.log(max(power, TINY) / max(shifted_power, TINY)))
+        if value > largest:
+            largest = value
+            other_delay = trial
+    prior = f"input_delay_samples = {delay}"
+    return judged(FindingKind.DELAY, prior, largest, 1, other_delay=other_delay)
+
+
+def _residual_under(fitted: Fitted, relative_degree: int) -> RealArray:
+    """Residual (N,) of a fit with its coefficients under a relative degree.
+
+    Those without a condition where there is a direct term: even a relative degree of 1, the least there is,
+    would refuse it.
+    """
+    if fitted.data.structure.feedthrough:
+        return fitted.residual
+    return structured_fit(fitted.data, fitted.poles, relative_degree).residual
 
 
 def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
-    parts = [residual[here][skip:] for here in data.segments]
+    """Sum of squares of a residual (N,) without the first `skip` rows of each record."""
+    parts = [residual[rows][skip:] for rows in data.segments]
     return float(sum(part @ part for part in parts))
 
 
 def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
-    """Relative degree 1 (no direct term) against a model with one."""
+    """Verdict on relative degree 1 (no direct term), against a model with a direct term.
+
+    records: all records of the fit `given`, which has none. One degree of freedom.
+    """
     free = given.refitted(records, given.poles, feedthrough=True)
     return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(given.end.rss, free), 1)
 
 
 def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Refined]:
-    """Relative degree r >= 2 against 1 (`free`), and the best fit under it, from there and from further
-    optima of the search: a wrong start can lose a mode."""
+    """Verdict on a relative degree r >= 2, and the end of the best descent under it.
+
+    Parameters
+    ----------
+    free : Fitted
+        The fit of relative degree 1, with further optima in the trace of its search.
+    relative_degree : int
+        r; r - 1 degrees of freedom.
+
+    Returns
+    -------
+    (PriorTest, Refined)
+    """
     constrained = best_under_relative_degree(free, relative_degree)
     # Nested models: the free fit is at least as good as one that starts from the constrained optimum.
-    again = free.search.descend(constrained.poles, "relative degree released")
-    if again.rss < free.end.rss:
-        free = replace(free, end=again)
+    released = free.search.descend(constrained.poles, "relative degree released")
+    if released.rss < free.end.rss:
+        free = replace(free, end=released)
     test = judged(
         FindingKind.RELATIVE_DEGREE,
         f"relative_degree = {relative_degree}",
@@ -155,146 +284,237 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
 
 
 def too_few_poles(relative_degree: int, order: int) -> PriorTest:
-    """A relative degree above the number of poles that the data showed."""
-    prior = f"relative_degree = {relative_degree}"
-    free = relative_degree - 1
-    return PriorTest(FindingKind.TOO_FEW_POLES, prior, True, False, 0.0, limit(free), free, {"order": order})
+    """Verdict "refused, not imposed" on a relative degree above the number of poles `order` of the fit."""
+    return PriorTest(
+        kind=FindingKind.TOO_FEW_POLES,
+        prior=f"relative_degree = {relative_degree}",
+        refused=True,
+        imposed=False,
+        statistic=0.0,
+        limit=limit(relative_degree - 1),
+        degrees_of_freedom=relative_degree - 1,
+        details={"order": order},
+    )
 
 
 def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:
-    """Best descent under the relative degree from the free optimum and the next two other ones."""
-    search, poles = free.search, free.poles
-    starts = [poles]
-    for minimum in sorted(search.minima, key=lambda item: item.rss):
+    """End of the best descent under a relative degree.
+
+    Parameters
+    ----------
+    free : Fitted
+        The fit without it. Descents start from its poles and from the two lowest ends in the trace of its
+        search that are other optima with the same numbers of real poles and pairs.
+    relative_degree : int
+
+    Returns
+    -------
+    Refined
+    """
+    search = free.search
+    starts = [free.poles]
+    for minimum in sorted(search.minima, key=lambda end: end.rss):
         other = minimum.poles
-        if other.counts != poles.counts:
+        if other.counts != free.poles.counts:
             continue
-        if all(_distance(other, start) > 0.15 for start in starts):
+        if all(_distance(other, start) > SAME_START for start in starts):
             starts.append(other)
-        if len(starts) == 3:
+        if len(starts) == STARTS_UNDER_DEGREE:
             break
     constrained = UnderRelativeDegree(free.data, relative_degree, search.fixed)
-    ends = (constrained.refine(start, search.bounds, ROUGH) for start in starts)
-    return constrained.refine(min(ends, key=lambda end: end.rss).poles, search.bounds)
+    ends = [constrained.refine(start, search.bounds, ROUGH) for start in starts]
+    best = min(ends, key=lambda end: end.rss)
+    return constrained.refine(best.poles, search.bounds)
 
 
-def _distance(one: Poles, other: Poles) -> float:
-    """Largest change of a pole in natural logarithm of decay, or of frequency and decay of a pair."""
-    real = np.abs(np.log(np.sort(1 - one.real) / np.sort(1 - other.real)))
-    first, second = np.sort_complex(np.log(one.pairs)), np.sort_complex(np.log(other.pairs))
-    return float(
-        max(
-            np.max(real, initial=0.0),
-            np.max(np.abs(np.log(first.real / second.real)), initial=0.0),
-            np.max(np.abs(np.log(first.imag / second.imag)), initial=0.0),
-        )
-    )
+def _distance(first: Poles, second: Poles) -> float:
+    """Largest change between two sets of as many poles, in natural logarithms.
+
+    Of the distance 1 - a of real poles, compared in order; of decay and of angle per sample of pairs,
+    compared by decay. 0 without poles.
+    """
+    decays = np.sort(1 - first.real)
+    other_decays = np.sort(1 - second.real)
+    pairs = np.sort_complex(np.log(first.pairs))
+    other_pairs = np.sort_complex(np.log(second.pairs))
+    of_real = np.abs(np.log(decays / other_decays))
+    of_pair_decay = np.abs(np.log(pairs.real / other_pairs.real))
+    of_pair_angle = np.abs(np.log(pairs.imag / other_pairs.imag))
+    changes = np.concatenate([of_real, of_pair_decay, of_pair_angle])
+    return float(np.max(changes, initial=0.0))
 
 
 def integrators_test(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> tuple[PriorTest, Fitted]:
-    """Integrators against as many free slow poles, order and numerator the same; also the fit with them free.
+    """Verdict on integrators, against as many free slow poles; and the fit with these.
 
-    `searched`: the records that are searched (`thinned`) and their structure, where the alternative is
-    searched anew. An integrator that a zero of the model cancels is refused as well: one integrator and zero
-    less are as good, while no other pole can be spared; it has to gain 2 ln Ne as any pole.
+    Parameters
+    ----------
+    records : sequence of Record
+        All records of the fit.
+    searched : (records, Structure)
+        The part of them that is searched (`thinned`), and its structure; the alternative is searched anew
+        there.
+    given : Fitted
+        The fit with k integrators.
+
+    Returns
+    -------
+    (PriorTest, Fitted)
+        INTEGRATORS with k degrees of freedom and the largest number of integrators that is accepted; or,
+        where that is not refused, SPARE_INTEGRATORS where fewer are enough (`_spare_integrators`). The fit
+        without integrators has the same order and numerator.
+
+    Notes
+    -----
+    An integrator that a zero of the model cancels is refused as well: one integrator and zero less are as
+    good, while no other pole can be spared; it has to gain 2 ln Ne as any pole.
     """
-    k = given.data.structure.integrators
+    n_integrators = given.data.structure.integrators
     free = _without_integrators(records, searched, given)
-    accepted = next(
-        fewer
-        for fewer in range(k - 1, -1, -1)
-        if fewer == 0 or _fewer_integrators_value(records, free, fewer) <= limit(fewer)
-    )
+    accepted = 0
+    for fewer in range(n_integrators - 1, 0, -1):
+        if _fewer_integrators_value(records, free, fewer) <= limit(fewer):
+            accepted = fewer
+            break
+    prior = f"integrators = {n_integrators}"
     value = statistic(given.end.rss, free)
-    name = f"integrators = {k}"
-    test = judged(FindingKind.INTEGRATORS, name, value, k, accepted=accepted)
-    if not test.refused:
-        spare = _spare_integrators(records, given)
-        if spare is not None:
-            fewer, needless, price = spare
-            test = PriorTest(
-                FindingKind.SPARE_INTEGRATORS, name, True, True, needless, price, k - fewer, {"enough": fewer}
-            )
+    test = judged(FindingKind.INTEGRATORS, prior, value, n_integrators, accepted=accepted)
+    if test.refused:
+        return test, free
+
+    spare = _spare_integrators(records, given)
+    if spare is None:
+        return test, free
+    test = PriorTest(
+        kind=FindingKind.SPARE_INTEGRATORS,
+        prior=prior,
+        refused=True,
+        imposed=True,
+        statistic=spare.statistic,
+        limit=spare.price,
+        degrees_of_freedom=n_integrators - spare.enough,
+        details={"enough": spare.enough},
+    )
     return test, free
 
 
 def _without_integrators(
     records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
 ) -> Fitted:
-    k, fixed = given.data.structure.integrators, given.search.fixed
-    plain = given.poles
-    others = Poles(plain.real[k:], plain.pairs)
-    n_real = plain.real.size - fixed.real.size + k
-    n_pairs = plain.pairs.size - fixed.pairs.size
+    """Best fit of all records with free poles in place of the integrators of `given`.
+
+    Starts are compared on the part that is searched: the other poles of `given` with slow real poles, or a
+    slow pair, in place of the integrators; and a search anew. The best goes on with all samples.
+    """
+    n_integrators = given.data.structure.integrators
+    fixed = given.search.fixed
+    # The integrators stand first among the real poles, the fixed ones.
+    others = Poles(given.poles.real[n_integrators:], given.poles.pairs)
     options = given.search.options.model_copy(
-        update={"integrators": 0, "n_real": n_real, "n_pairs": n_pairs, "decay_min_per_s": None}
+        update={
+            "integrators": 0,
+            "n_real": given.poles.real.size - fixed.real.size + n_integrators,
+            "n_pairs": given.poles.pairs.size - fixed.pairs.size,
+            "decay_min_per_s": None,
+        }
     )
 
     def prepared(chosen: Sequence[Record], structure: Structure) -> Regression:
-        # The polynomials that integrators leave free belong to both sides of the comparison.
+        """The records without integrators, with the polynomials that integrators leave free: they belong to
+        both sides of the comparison."""
         polynomials = prepare(chosen, structure).polynomials
         return replace(prepare(chosen, replace(structure, integrators=0)), polynomials=polynomials)
 
-    # Starts are compared on the part that is searched, the best goes on with all samples.
     small = PoleSearch(prepared(*searched), options)
     longest = small.data.longest
-    starts = [others.appended(Poles(1 - np.array(decays) / longest)) for decays in _SLOW_STARTS[k]]
-    if k >= 2:
-        rest = 1 - np.array([0.3] * (k - 2)) / longest
-        for turns in _SLOW_TURNS:
-            pair = np.exp(2 * np.pi * turns / longest * np.array([-0.3 + 1j]))
-            starts.append(others.appended(Poles(rest, pair)))
+    starts = []
+    for decays in SLOW_STARTS[n_integrators]:
+        starts.append(others.appended(Poles(1 - np.array(decays) / longest)))
+    if n_integrators >= 2:
+        further = 1 - np.array([SLOW_BESIDE_PAIR] * (n_integrators - 2)) / longest
+        for turns in SLOW_TURNS:
+            pair = np.exp(2 * np.pi * turns / longest * np.array([-SLOW_PAIR_DECAY + 1j]))
+            starts.append(others.appended(Poles(further, pair)))
     ends = [small.descend(start, "integrators freed", ROUGH) for start in starts]
     ends.append(OrderSelection(small).run())
     best = min(ends, key=lambda end: end.rss)
+
     search = PoleSearch(prepared(records, given.data.structure), options)
     search.evaluations = small.evaluations
     return Fitted(search, search.descend(best.poles, "integrators freed"))
 
 
 def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
-    """Statistic of `fewer` integrators against none: the slowest real poles of the free fit become theirs."""
+    """Statistic of `fewer` integrators against none; infinite without so many searched real poles.
+
+    free: the fit without integrators; its slowest searched real poles become the integrators.
+    """
     n_fixed = free.search.fixed.real.size
-    own = np.sort(free.poles.real[n_fixed:])
-    if own.size < fewer:
+    searched_real = np.sort(free.poles.real[n_fixed:])
+    n_left = searched_real.size - fewer
+    if n_left < 0:
         return np.inf
-    start = Poles(
-        np.concatenate([np.zeros(fewer), free.poles.real[:n_fixed], own[: own.size - fewer]]),
-        free.poles.pairs,
-    )
+    # Integrators come first among the fixed poles; the zeros only hold their places.
+    real = np.concatenate([np.zeros(fewer), free.poles.real[:n_fixed], searched_real[:n_left]])
+    start = Poles(real, free.poles.pairs)
     return statistic(free.refitted(records, start, integrators=fewer).end.rss, free)
 
 
-def _spare_integrators(records: Sequence[Record], given: Fitted) -> tuple[int, float, float] | None:
-    """How few integrators are enough beside the same other poles, with statistic and price; None: all."""
-    k = given.data.structure.integrators
-    one = 2 * float(np.log(given.worth()))
-    others = Poles(given.poles.real[k:], given.poles.pairs)
-    found: tuple[int, float, float] | None = None
-    for fewer in range(k - 1, -1, -1):
+class SpareIntegrators(NamedTuple):
+    """How many integrators are enough; the statistic of the others, and the price they would have to gain."""
+
+    enough: int
+    statistic: float
+    price: float
+
+
+def _spare_integrators(records: Sequence[Record], given: Fitted) -> SpareIntegrators | None:
+    """How few integrators are enough beside the same other poles of `given`; None where all are needed.
+
+    Each integrator has to gain 2 ln Ne. None also where a searched pole, or a pair at twice the price, can be
+    spared as well: that one can take the place of an integrator.
+    """
+    n_integrators = given.data.structure.integrators
+    price_of_one = 2 * float(np.log(given.worth()))
+    others = Poles(given.poles.real[n_integrators:], given.poles.pairs)
+    spare: SpareIntegrators | None = None
+    for fewer in range(n_integrators - 1, -1, -1):
         if others.order + fewer == 0:
             break
         start = Poles(np.concatenate([np.zeros(fewer), others.real]), others.pairs)
         value = statistic(given.refitted(records, start, integrators=fewer).end.rss, given)
-        if value > (k - fewer) * one:
+        price = (n_integrators - fewer) * price_of_one
+        if value > price:
             break
-        found = fewer, value, (k - fewer) * one
-    if found is not None:
-        # As good without one of the searched poles, or pairs (twice the price): that one can take the place
-        # of an integrator, or a pair that of two.
-        poles, fixed = given.poles, given.search.fixed
-        less = [(poles.without_real(i), one) for i in range(fixed.real.size, poles.real.size)]
-        less += [(poles.without_pair(i), 2 * one) for i in range(fixed.pairs.size, poles.pairs.size)]
-        if any(statistic(given.search.descend(start, "one less").rss, given) <= most for start, most in less):
+        spare = SpareIntegrators(fewer, value, price)
+    if spare is None:
+        return None
+
+    poles = given.poles
+    fixed = given.search.fixed
+    reduced = [(poles.without_real(i), price_of_one) for i in range(fixed.real.size, poles.real.size)]
+    reduced += [(poles.without_pair(i), 2 * price_of_one) for i in range(fixed.pairs.size, poles.pairs.size)]
+    for start, price in reduced:
+        if statistic(given.search.descend(start, "one less").rss, given) <= price:
             return None
-    return found
+    return spare
 
 
 @dataclass(frozen=True)
 class NuisanceTest:
-    """Verdict of the data on one nuisance of so many columns."""
+    """Verdict of the data on one nuisance.
+
+    Attributes
+    ----------
+    name : str
+        "initial state" or "offset".
+    columns : int
+        Free real numbers that it adds to a fit; the degrees of freedom.
+    statistic : float
+        Ne ln(J without / J with it).
+    """
 
     name: str
     columns: int
@@ -302,14 +522,17 @@ class NuisanceTest:
 
     @property
     def limit(self) -> float:
+        """Chi-square quantile at 99 % that the statistic of a nuisance that is not there stays below."""
         return float(chdtri(self.columns, 1 - TEST_LEVEL))
 
     @property
     def needed(self) -> bool:
+        """The data ask for the nuisance."""
         return self.statistic > self.limit
 
     @property
     def finding(self) -> Finding:
+        """The verdict as a finding, for the sentence."""
         return finding(
             FindingKind.NUISANCE,
             name=self.name,
@@ -322,22 +545,44 @@ class NuisanceTest:
 
 
 def nuisance_test(name: str, without: Fitted, with_it: Fitted) -> NuisanceTest:
-    """Likelihood ratio of two optima."""
-    ratio = max(without.end.rss, 1e-300) / max(with_it.end.rss, 1e-300)
-    return NuisanceTest(name, _columns(without, with_it.data), float(with_it.worth() * np.log(ratio)))
+    """Verdict on a nuisance by the likelihood ratio of two optima, `without` and `with_it`."""
+    ratio = max(without.end.rss, TINY) / max(with_it.end.rss, TINY)
+    value = float(with_it.worth() * np.log(ratio))
+    return NuisanceTest(name, _columns(without, with_it.data), value)
 
 
 def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> NuisanceTest | None:
-    """The score test if the nuisance is not needed even if each of the N samples counted, else None: descend
-    and compare. The statistic shown counts what the residual without it is worth."""
-    poles, search = without.poles, without.search
+    """Verdict "not needed" by the score test; None where only a descent can decide.
+
+    Parameters
+    ----------
+    name : str
+        Of the nuisance.
+    without : Fitted
+        The optimum without it.
+    with_it : Regression
+        The same rows with its columns.
+
+    Returns
+    -------
+    NuisanceTest or None
+        Where the gain of the first step stays clearly below the limit even if each of the N samples counted
+        as independent. The statistic shown counts what the residual without the nuisance is worth.
+    """
+    poles = without.poles
+    search = without.search
     here = with_it.linearise(*poles.writable())
-    promised = here.rss * (1 - free_optimality(here, poles, search.bounds, search.fixed) ** 2)
-    gain = float(np.log(max(without.end.rss, 1e-300) / max(promised, 1e-300)))
+    # |P r| / |r| over the directions in which the poles are free: their first step takes away this share.
+    optimality = free_optimality(here, poles, search.bounds, search.fixed)
+    promised = here.rss * (1 - optimality**2)
+    gain = float(np.log(max(without.end.rss, TINY) / max(promised, TINY)))
     test = NuisanceTest(name, _columns(without, with_it), without.worth() * gain)
-    return test if with_it.n_samples * gain < _CLEARLY_BELOW * test.limit else None
+    if with_it.n_samples * gain < CLEARLY_BELOW * test.limit:
+        return test
+    return None
 
 
 def _columns(without: Fitted, with_it: Regression) -> int:
+    """Free real numbers that the data `with_it` have more in a fit than those of `without`, at its order."""
     order = without.poles.order
     return with_it.n_parameters(order) - without.data.n_parameters(order)
