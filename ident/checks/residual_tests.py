@@ -1,4 +1,13 @@
-"""Is anything left in the residuals? Whiteness and independence from the input, with bands."""
+"""Is anything left in the residuals that a model should have explained?
+
+Two tests on residuals of one output. `whiteness_test` asks whether they predict themselves (Ljung and Box,
+Biometrika 65(2), 1978); `independence_test` whether the input still explains some of them (Soederstroem and
+Stoica, System Identification, 1989, ch. 11.2, with the variance of each lag for coloured signals). Both pool
+records and keep their level over all lags together. `residual_tests` runs them on what a posterior's mean
+leaves of its records, `residual_advice` says what is wrong where one fails, and `fed_back` measures what
+input and residual still have in common in radii of the ellipses: where a loop feeds noise back that is
+noncausal, which neither test counts. Signals are taken as stationary.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +27,40 @@ from ident.data.finding import TEST_LEVEL, WHITE_LAGS, Finding, FindingKind, fin
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 
-# Frequencies at which feedback is looked for, and bands over which it is averaged.
-_RESOLVED, _BANDS = 60, 6
-# Standard deviations of chance that are taken off: with six bands, one in a hundred logs goes beyond.
-_SURE = 3.0
+# Frequencies at which feedback is looked for: ten in each of the bands below. Chosen.
+RESOLVED_FREQUENCIES = 60
+# Lines to each side that are averaged for one frequency at least: eleven lines scatter by a third.
+FEWEST_LINES_BESIDE = 5
+# Bands over which feedback is averaged, equally wide on a logarithmic axis from the first line to Nyquist.
+FEEDBACK_BANDS = 6
+# Standard deviations of chance that are taken off in each band: with six bands one in a hundred logs without
+# feedback goes beyond (6 x 0.13 %).
+SURE_DEVIATIONS = 3.0
+# Keeps the logarithm of 1 - p finite where no lag is correlated at all (p = 1): rounding of doubles.
+BELOW_ONE = 1 - 1e-16
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualTest:
-    """One correlation test.
+    """Outcome of one correlation test over K lags.
 
-    lags (K,) in samples, correlation (K,) in -1..1; band (K,): |correlation| stays below it with probability
-    `level` at each lag alone if the hypothesis holds. probability: of correlations as large as these, all
-    lags together; passed: it is at least 1 - level. precedes_input: the residual is found again in a later
-    input, as in closed loop.
+    Attributes
+    ----------
+    name : str
+        "whiteness" or "independence".
+    lags : (K,) array
+        In samples; negative where the residual comes before the input.
+    correlation : (K,) array
+        In -1..1.
+    band : (K,) array
+        |correlation| stays below it with probability `level` at each lag alone if the hypothesis holds.
+    level : float
+    probability : float
+        Of correlations as large as these, all lags together, if the hypothesis holds.
+    passed : bool
+        The probability is at least 1 - level.
+    precedes_input : bool
+        The residual is found again in a later input, as in closed loop.
     """
 
     name: str
@@ -44,25 +73,32 @@ class ResidualTest:
     precedes_input: bool = False
 
     def __post_init__(self) -> None:
+        """Locked arrays; ValueError where they are not of one length."""
         lock(self, "lags", "correlation", "band")
         if not (self.lags.shape == self.correlation.shape == self.band.shape and self.lags.ndim == 1):
             raise ValueError("lags, correlation and band must be (K,) arrays")
 
     @property
     def largest(self) -> tuple[int, float]:
-        """Lag (not negative) and value of the largest correlation."""
-        at = int(np.argmax(np.where(self.lags >= 0, np.abs(self.correlation), 0)))
+        """Lag (not negative, in samples) and value of the largest correlation in size."""
+        size = np.where(self.lags >= 0, np.abs(self.correlation), 0)
+        at = int(np.argmax(size))
         return int(self.lags[at]), float(self.correlation[at])
 
     @property
     def predictable_share(self) -> float:
-        """Of the residual's power, what its own past over all lags predicts (Yule-Walker), by the
-        autocorrelation at lags 1..K of a whiteness test: 0 of white noise."""
+        """Share of the residual's power that its own past over all lags predicts, 0 to 1; 0 of white noise.
+
+        Of a whiteness test. By the Yule-Walker equations of its autocorrelation r at lags 1..K: r^T R^-1 r, R
+        the Toeplitz matrix of r at lags 0..K-1.
+        """
         first_row = np.append(1.0, self.correlation[:-1])
-        return float(np.clip(self.correlation @ solve_toeplitz(first_row, self.correlation), 0.0, 1.0))
+        predictor = solve_toeplitz(first_row, self.correlation)
+        return float(np.clip(self.correlation @ predictor, 0.0, 1.0))
 
     @property
     def finding(self) -> Finding:
+        """The outcome as a finding WHITENESS or INDEPENDENCE, for the sentence."""
         lag, correlation = self.largest
         return finding(
             FindingKind[self.name.upper()],
@@ -76,32 +112,76 @@ class ResidualTest:
 
 
 def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS) -> ResidualTest:
-    """Autocorrelation of residuals, one (T,) array per record, at lags 1..max_lag, pooled; Ljung-Box over all
-    lags.
+    """Autocorrelation of residuals at lags 1..max_lag, pooled over records, with the test of Ljung and Box.
 
-    Fitted parameters are not taken off the degrees of freedom. Records of at most 2 max_lag samples are left
-    out. Raises ValueError when none is longer, or the residuals are zero.
+    Parameters
+    ----------
+    residuals : sequence of (T,) array
+        One for each record. Those of at most 2 max_lag samples are left out beside longer ones.
+    max_lag : int
+        In samples.
+
+    Returns
+    -------
+    ResidualTest
+
+    Raises
+    ------
+    ValueError
+        No residual is longer than 2 max_lag, or all are constant.
+
+    Notes
+    -----
+    Q = n (n + 2) sum_k r_k^2 / (n - k) is chi-square with max_lag degrees of freedom for white noise. Fitted
+    parameters are not taken off the degrees of freedom.
     """
     centred = _centred(residuals, max_lag)
-    n = sum(e.size for e in centred)
+    n = sum(residual.size for residual in centred)
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
-    probability = float(chi2.sf(n * (n + 2) * float(np.sum(correlation**2 / (n - lags))), max_lag))
-    passed = probability >= 1 - TEST_LEVEL
-    band = np.full(max_lag, norm.ppf(0.5 + TEST_LEVEL / 2) / np.sqrt(n))
+    ljung_box = n * (n + 2) * float(np.sum(correlation**2 / (n - lags)))
+    probability = float(chi2.sf(ljung_box, max_lag))
+    # At a single lag the correlation of white noise is normal with variance 1 / n.
+    half_width = norm.ppf(0.5 + TEST_LEVEL / 2) / np.sqrt(n)
     return ResidualTest(
-        "whiteness", lags.astype(np.float64), correlation, band, TEST_LEVEL, probability, passed
+        name="whiteness",
+        lags=lags.astype(np.float64),
+        correlation=correlation,
+        band=np.full(max_lag, half_width),
+        level=TEST_LEVEL,
+        probability=probability,
+        passed=probability >= 1 - TEST_LEVEL,
     )
 
 
 def independence_test(
     inputs: Sequence[RealArray], residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS
 ) -> ResidualTest:
-    """Cross-correlation of past input and residual at lags -max_lag..max_lag (residual after input: lag > 0).
+    """Cross-correlation of input and residual at lags -max_lag..max_lag, pooled over records.
 
-    Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, so that colour alone does not fail.
-    Records of at most 2 max_lag samples are left out. The verdict rests on lags >= 0, the level shared over
-    them (Sidak); negative lags show feedback.
+    Parameters
+    ----------
+    inputs, residuals : sequence of (T,) array
+        One of each for every record, of equal length. Records of at most 2 max_lag samples are left out
+        beside longer ones.
+    max_lag : int
+        In samples; at a positive lag the residual comes after the input.
+
+    Returns
+    -------
+    ResidualTest
+        The verdict rests on lags >= 0, the level shared over them (Sidak); negative lags show feedback.
+
+    Raises
+    ------
+    ValueError
+        Numbers or lengths of inputs and residuals differ, no record is longer than 2 max_lag, or all signals
+        are constant.
+
+    Notes
+    -----
+    Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, r_e and r_u the autocorrelations, so
+    that colour alone does not fail.
     """
     if len(inputs) != len(residuals) or any(
         u.size != e.size for u, e in zip(inputs, residuals, strict=False)
@@ -111,29 +191,52 @@ def independence_test(
     u = _centred(inputs, max_lag)
     n = sum(part.size for part in e)
     correlation = _pooled_correlation(e, u, max_lag)
+
+    # Standard deviation of a lag. A Bartlett taper keeps the sum of sample correlations positive.
     longest = min(part.size for part in e) // 2
     memory = _pooled_correlation(e, e, longest) * _pooled_correlation(u, u, longest)
-    # Bartlett taper keeps the sum of sample correlations positive.
     taper = 1 - np.abs(np.arange(-longest, longest + 1)) / (longest + 1)
-    deviation = np.sqrt(max(float(np.sum(taper * memory)), 1.0 / n) / n)
-    # 2 Phi(-x), all of max_lag + 1 lags below x with probability (1 - that)^(max_lag + 1).
+    common_memory = max(float(np.sum(taper * memory)), 1.0 / n)
+    deviation = np.sqrt(common_memory / n)
+
+    # Probability 2 Phi(-x) of the largest lag alone, then that one of max_lag + 1 lags is so large:
+    # 1 - (1 - p)^(max_lag + 1).
+    n_tested = max_lag + 1
     single = 2 * norm.sf(np.abs(correlation[max_lag:]) / deviation)
-    probability = float(-np.expm1((max_lag + 1) * np.log1p(-min(float(single.min()), 1 - 1e-16))))
-    passed = probability >= 1 - TEST_LEVEL
-    band = np.full(correlation.size, norm.ppf(0.5 + TEST_LEVEL / 2) * deviation)
-    lags = np.arange(-max_lag, max_lag + 1)
-    before = np.abs(correlation[:max_lag]).max() if max_lag else 0.0
-    precedes = bool(before > deviation * norm.ppf(1 - (1 - TEST_LEVEL) / (2 * max(max_lag, 1))))
+    least_single = min(float(single.min()), BELOW_ONE)
+    probability = float(-np.expm1(n_tested * np.log1p(-least_single)))
+
+    # Feedback: one of the max_lag negative lags is beyond what one of them reaches by chance.
+    largest_before = 0.0
+    if max_lag:
+        largest_before = np.abs(correlation[:max_lag]).max()
+    limit_before = deviation * norm.ppf(1 - (1 - TEST_LEVEL) / (2 * max(max_lag, 1)))
+
+    half_width = norm.ppf(0.5 + TEST_LEVEL / 2) * deviation
     return ResidualTest(
-        "independence", lags.astype(np.float64), correlation, band, TEST_LEVEL, probability, passed, precedes
+        name="independence",
+        lags=np.arange(-max_lag, max_lag + 1).astype(np.float64),
+        correlation=correlation,
+        band=np.full(correlation.size, half_width),
+        level=TEST_LEVEL,
+        probability=probability,
+        passed=probability >= 1 - TEST_LEVEL,
+        precedes_input=bool(largest_before > limit_before),
     )
 
 
 def conditions_of(advice: Iterable[Finding]) -> list[Finding]:
-    """What a certificate over ellipses stands or falls with, of the findings about these. Where an observer's
-    prediction errors are not white, the ellipses were widened for it."""
+    """Findings that a certificate over ellipses stands or falls with, out of those about the ellipses.
+
+    Left out where an observer's prediction errors are not white: the ellipses were widened for it.
+    """
     kinds = {FindingKind.NOT_WHITE, FindingKind.NOMINAL_OUTSIDE, FindingKind.UNTRIED_FRICTION}
-    return [each for each in advice if each.kind in kinds and not each.values.get("observer")]
+    conditions = []
+    for item in advice:
+        widened_for = item.values.get("observer")
+        if item.kind in kinds and not widened_for:
+            conditions.append(item)
+    return conditions
 
 
 def residual_advice(
@@ -144,57 +247,98 @@ def residual_advice(
     friction: bool = False,
     observer: bool = False,
 ) -> list[Finding]:
-    """What is wrong where a test fails. noise_order: of the noise model behind which whiteness was tested.
-    friction: nobody has looked for it, and it could be identified. observer: whiteness is that of its
-    prediction errors."""
-    found = []
+    """Findings on what is wrong where a test fails: NOT_INDEPENDENT, then NOT_WHITE; empty where both pass.
+
+    Parameters
+    ----------
+    whiteness, independence : ResidualTest
+    noise_order : int
+        Order of the noise model behind which whiteness was tested; 0: none.
+    friction : bool
+        Nobody has looked for friction, and it could be identified.
+    observer : bool
+        Whiteness is that of an observer's prediction errors.
+    """
+    findings = []
     if not independence.passed:
-        found.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
+        findings.append(finding(FindingKind.NOT_INDEPENDENT, lag=independence.largest[0]))
     if not whiteness.passed:
-        told = {"noise_order": noise_order, "independent": independence.passed, "friction": friction}
-        share = whiteness.predictable_share
-        found.append(finding(FindingKind.NOT_WHITE, **told, observer=observer, predictable_share=share))
-    return found
+        findings.append(
+            finding(
+                FindingKind.NOT_WHITE,
+                noise_order=noise_order,
+                independent=independence.passed,
+                friction=friction,
+                observer=observer,
+                predictable_share=whiteness.predictable_share,
+            )
+        )
+    return findings
 
 
 def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
-    """How far what the residuals still have in common with the input would move the response at least, in
-    radii of its ellipses: root mean square over a band, chance taken off, of all bands the largest.
+    """How far feedback in the residuals would move the response at least, in radii of its ellipses.
 
-    records: those of the posterior, one input and one output. Where a loop feeds noise back, that part is
-    noncausal, of the size of what feedback moves a direct fit by. Bands that the records say nothing of are
-    left out.
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        Mean and ellipses of a response that was fitted to the records.
+    records : sequence of Record
+        Those of the posterior, one input and one output each.
+
+    Returns
+    -------
+    float
+        Root mean square over a band, chance taken off, of all bands the largest; 0 where nothing is sure.
+
+    Notes
+    -----
+    G_r = S_eu / S_uu, e the residual, by averaged spectra. Where a loop feeds noise back, G_r is noncausal,
+    of the size of what feedback moves a direct fit by. In a band, mean(|G_r|^2 - its chance) less three
+    standard deviations, over the squared radius, is what is surely there. Frequencies that the records say
+    nothing of are left out: where the ellipse holds zero, or the chance of G_r is larger than the response.
     """
+    # Residuals of the posterior's mean, all cut to the shortest record.
     shortest = min(record.n_samples for record in records) - posterior.input_delay_samples
-    rest = [
-        replace(
-            record.slice(0, shortest),
-            output=fit_on_fresh_data(posterior, record).residual[:shortest, None],
-            reference=None,
-            reference_names=(),
+    of_residual = []
+    for record in records:
+        residual = fit_on_fresh_data(posterior, record).residual[:shortest, None]
+        of_residual.append(
+            replace(record.slice(0, shortest), output=residual, reference=None, reference_names=())
         )
-        for record in records
-    ]
-    common = empirical_frf(rest, half_width_lines=max(5, shortest // (4 * _RESOLVED)))
+    lines_beside = max(FEWEST_LINES_BESIDE, shortest // (4 * RESOLVED_FREQUENCIES))
+    common = empirical_frf(of_residual, half_width_lines=lines_beside)
     omega = common.omega_rad_s
     ellipses = posterior.at(omega)
     radius = ellipses.ellipse().semi_major
-    chance = np.trace(common.covariance, axis1=1, axis2=2)
-    told = (radius < np.abs(ellipses.centre)) & (chance < np.abs(ellipses.centre) ** 2)
-    band = np.digitize(omega, np.geomspace(omega[0], omega[-1], _BANDS + 1)[1:-1])
-    moved, chance = np.abs(common.centre) ** 2 / radius**2, chance / radius**2
+    response = np.abs(ellipses.centre)
+    variance = np.trace(common.covariance, axis1=1, axis2=2)
+    told = (radius < response) & (variance < response**2)
+
+    # Squares in units of the squared radius, averaged over bands.
+    moved = np.abs(common.centre) ** 2 / radius**2
+    chance = variance / radius**2
+    edges = np.geomspace(omega[0], omega[-1], FEEDBACK_BANDS + 1)
+    band = np.digitize(omega, edges[1:-1])
     surest = 0.0
-    for k in np.unique(band[told]):
-        among = told & (band == k)
-        # Of independent noise squares at the lines are exponentially distributed.
-        deviation = np.sqrt(np.sum(chance[among] ** 2)) / np.count_nonzero(among)
-        surest = max(surest, float(np.mean(moved[among] - chance[among]) - _SURE * deviation))
+    for number in np.unique(band[told]):
+        inside = told & (band == number)
+        # Of independent noise squares at the lines are exponentially distributed: deviation = mean.
+        deviation = np.sqrt(np.sum(chance[inside] ** 2)) / np.count_nonzero(inside)
+        excess = float(np.mean(moved[inside] - chance[inside]) - SURE_DEVIATIONS * deviation)
+        surest = max(surest, excess)
     return float(np.sqrt(surest))
 
 
 def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
-    """The signals longer than 2 max_lag without their means; ValueError where none is."""
-    signals = [signal for signal in signals if signal.size > 2 * max_lag] or signals
+    """Signals (T,) longer than 2 max_lag without their means; the shorter ones are left out.
+
+    Raises ValueError where none is longer, max_lag is below 1, a signal is not a finite (T,) array, or all
+    are constant.
+    """
+    long_enough = [signal for signal in signals if signal.size > 2 * max_lag]
+    # Where all are short, the first of them is named below.
+    signals = long_enough or signals
     if not signals:
         raise ValueError("need at least one record")
     if not max_lag >= 1:
@@ -212,21 +356,31 @@ def _centred(signals: Sequence[RealArray], max_lag: int) -> list[RealArray]:
 
 
 def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag: int) -> RealArray:
-    """sum_k e(k) u(k - lag) over all records, lag = -max_lag..max_lag, divided by the norms."""
+    """Correlation (2 max_lag + 1,) of signals e and u, (T,) of each record, at lags -max_lag..max_lag.
+
+    sum_k e(k) u(k - lag) over all records, divided by the norms; samples of two records are never multiplied.
+    """
     total = np.zeros(2 * max_lag + 1)
-    for a, b in zip(e, u, strict=True):
-        middle = b.size - 1
-        total += correlate(a, b, mode="full", method="fft")[middle - max_lag : middle + max_lag + 1]
-    return np.asarray(total / np.sqrt(sum(float(a @ a) for a in e) * sum(float(b @ b) for b in u)))
+    for part_e, part_u in zip(e, u, strict=True):
+        zero_lag = part_u.size - 1
+        at_all_lags = correlate(part_e, part_u, mode="full", method="fft")
+        total += at_all_lags[zero_lag - max_lag : zero_lag + max_lag + 1]
+    power_e = sum(float(part @ part) for part in e)
+    power_u = sum(float(part @ part) for part in u)
+    return np.asarray(total / np.sqrt(power_e * power_u))
 
 
 class Simulated(Protocol):
-    """A machine that simulates its records: `ident.friction.FrictionFit`."""
+    """A machine with friction that simulates its records: `ident.friction.FrictionFit`."""
 
     @property
-    def observed(self) -> bool: ...
+    def observed(self) -> bool:
+        """Its residuals are the prediction errors of an observer, which are white as they are."""
+        ...
 
-    def residual(self, record: Record) -> RealArray: ...
+    def residual(self, record: Record) -> RealArray:
+        """What the simulation leaves of a record, (T - delay,) in units of the output."""
+        ...
 
 
 def residual_tests(
@@ -234,9 +388,21 @@ def residual_tests(
 ) -> tuple[ResidualTest, ResidualTest]:
     """Whiteness and independence of what the posterior's own mean leaves of the records behind the ellipses.
 
-    friction: records of the shaft's position as measured are held against its simulation instead, which has
-    the friction between the samples, too. Where the bounds have a noise model, whiteness is that of the
-    residuals behind it: they rest on those.
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        Its mean is simulated; where its bounds have a noise model (`report.ar_coefficients`), whiteness is
+        that of the residuals behind it, as the bounds rest on those.
+    records : sequence of Record
+        One input and one output each.
+    friction : Simulated, optional
+        Records of the shaft's position as measured are held against its simulation instead, which has the
+        friction between the samples, too.
+
+    Returns
+    -------
+    (ResidualTest, ResidualTest)
+        Whiteness, independence.
     """
     # Prediction errors of an observer are white as they are.
     in_loop = friction is not None and friction.observed
