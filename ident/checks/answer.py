@@ -1,8 +1,9 @@
 """Does the output answer to the input at all?
 
-By the fit: what the driven columns explain against the price that the choice of the order asks of any pole,
-beside nuisances that need no input. By the ellipses: a response of zero inside all of them, which also sees
-an output that wanders by itself (drift, hum).
+`explains_nothing` asks the fit: what the driven columns explain is held against the price that the choice of
+the order asks of any pole, beside nuisances that need no input. `refuse_unanswered` asks the ellipses: where
+a response of zero lies inside all of them, no number of the model means anything. That also sees an output
+that wanders by itself (drift, hum), which a fit takes for slow poles.
 """
 
 from __future__ import annotations
@@ -19,37 +20,85 @@ from ident.data.arrays import RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression, project
 
-# A response of zero is kept up to this level.
-_LEVEL = 0.999
+# Level of the ellipses within which a response of zero counts as possible. An output that does not answer
+# passes where chance puts zero outside: once in a thousand at each independent frequency.
+ZERO_LEVEL = 0.999
 
 
 def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: RealArray) -> list[Finding]:
-    """One finding where the driven columns explain no more than poles fitted to noise would.
+    """Finding NO_ANSWER where the driven columns explain no more than poles fitted to noise; else empty.
 
-    residual (N,): of the fit with these poles, of which `fixed` were given. Nuisances (offset, free
+    Parameters
+    ----------
+    data : Regression
+        Records made ready for a fit: inputs u (U, N), output, nuisance columns.
+    poles, fixed : Poles
+        Poles of the fit, and those of them that were stated as known.
+    residual : (N,) array
+        What the fit leaves of the output.
+
+    Returns
+    -------
+    list of Finding
+        With the share of the motion (RMS) that is explained, per cent.
+
+    Notes
+    -----
+    The criterion of the order (`ident.fit.least_squares.information_criterion`) asks ln Ne of each free
+    number: J has to be below J0 exp(-k ln Ne / Ne), J0 that without the input, k the coefficients, direct
+    terms and searched poles, Ne the independent samples that the residual is worth. Nuisances (offset, free
     responses) are on both sides: a free decay or a hum is no answer to the input.
     """
-    undriven = replace(data, structure=replace(data.structure, feedthrough=False, relative_degree=1))
-    without = project(undriven, NO_POLES, poles).residual
-    power, rest = float(without @ without), float(residual @ residual)
+    structure = replace(data.structure, feedthrough=False, relative_degree=1)
+    undriven = project(replace(data, structure=structure), NO_POLES, poles).residual
+    power_undriven = float(undriven @ undriven)
+    power = float(residual @ residual)
     worth = data.colour(residual).effective_samples
-    numbers = data.n_inputs * (poles.order + data.structure.feedthrough) + poles.order - fixed.order
-    if not power > 0 or rest <= power * np.exp(-numbers * np.log(worth) / worth):
+    n_coefficients = data.n_inputs * (poles.order + data.structure.feedthrough)
+    n_numbers = n_coefficients + poles.order - fixed.order
+    if not power_undriven > 0 or power <= power_undriven * np.exp(-n_numbers * np.log(worth) / worth):
         return []
-    return [finding(FindingKind.NO_ANSWER, explained_percent=100 * max(1 - np.sqrt(rest / power), 0.0))]
+    explained = 1 - np.sqrt(power / power_undriven)
+    return [finding(FindingKind.NO_ANSWER, explained_percent=100 * max(explained, 0.0))]
 
 
 def refuse_unanswered(
     posterior: ResponsePosterior, omega_rad_s: RealArray, warnings: Iterable[Finding], *, why: str = ""
 ) -> None:
-    """Raises ValueError, one line, where a response of zero lies inside all ellipses at omega (F,): no number
-    of such a model means anything. warnings: of the fit; why: what else is known."""
+    """Nothing, where the ellipses say that the output answers; else raises an error of one line.
+
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        Mean and ellipses of a response; `report.n_rows`: samples behind them.
+    omega_rad_s : (F,) array
+        Frequencies at which the ellipses are asked.
+    warnings : iterable of Finding
+        Of the fit: NO_POLE or NO_ANSWER among them make zero likelier.
+    why : str
+        What else is known, for the error.
+
+    Raises
+    ------
+    ValueError
+        A response of zero lies inside the ellipses at all frequencies, at 99.9 %.
+
+    Notes
+    -----
+    Where the fit is doubted, the level is that over all N / 2 frequencies at which noise may have put a pole
+    (Bonferroni).
+    """
     doubts = {FindingKind.NO_POLE, FindingKind.NO_ANSWER} & {warning.kind for warning in warnings}
-    # At 99.9 %; where the fit is doubted, over the N / 2 frequencies at which noise may have put a pole.
+    # Squared distance of zero from the centre, chi-square with two degrees of freedom (real, imaginary part).
     ellipses = posterior.at(omega_rad_s)
-    squared = ellipses.normalised_distance(np.zeros(ellipses.centre.size)) ** 2 * chi2.ppf(ellipses.level, 2)
-    n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
-    if np.all(squared <= chi2.isf((1 - _LEVEL) / (n_rows / 2 if doubts else 1.0), 2)):
+    distance = ellipses.normalised_distance(np.zeros(ellipses.centre.size))
+    squared = distance**2 * chi2.ppf(ellipses.level, 2)
+    n_frequencies = 1.0
+    if doubts:
+        n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
+        n_frequencies = n_rows / 2
+    limit = chi2.isf((1 - ZERO_LEVEL) / n_frequencies, 2)
+    if np.all(squared <= limit):
         unknown = "no response at all explains the log as well as any model; check columns, wiring and unit"
         names = f"the output '{posterior.output_name}' does not answer to the input '{posterior.input_name}'"
         raise ValueError(f"{names}: {why or unknown}")
