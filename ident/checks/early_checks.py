@@ -147,6 +147,8 @@ def still_output(records: Sequence[Record]) -> str:
 
 
 def _constant(record: Record, role: str, name: str, value: float) -> str:
+    """The complaint that a column stands at a value; role: "input" or "output", also the name of the
+    option."""
     return (
         f"{record.label}: {role} column '{name}' is constant ({value:.6g}); expected a signal that moves: "
         f"leave this log out, or name another column with --{role} NAME ({role})"
@@ -155,18 +157,19 @@ def _constant(record: Record, role: str, name: str, value: float) -> str:
 
 def late_command(records: Sequence[Record]) -> str:
     """The complaint that in every record the input first moves when hardly a sample is left."""
-    left = []
+    samples_left = []
     for record in records:
-        first = int(np.argmax(record.input[:, 0] != record.input[0, 0]))
-        left.append(record.n_samples - first)
-    most = int(np.argmax(left))
-    if left[most] > FEWEST_SAMPLES:
+        moved = record.input[:, 0] != record.input[0, 0]
+        first_move = int(np.argmax(moved))
+        samples_left.append(record.n_samples - first_move)
+    longest = int(np.argmax(samples_left))
+    if samples_left[longest] > FEWEST_SAMPLES:
         return ""
-    record = records[most]
+    record = records[longest]
     return (
-        f"{record.label}: input column '{record.input_names[0]}' first moves {left[most]} samples before the "
-        f"end, too late to show an answer; expected more than {FEWEST_SAMPLES} samples from there: record "
-        "longer"
+        f"{record.label}: input column '{record.input_names[0]}' first moves {samples_left[longest]} samples "
+        f"before the end, too late to show an answer; expected more than {FEWEST_SAMPLES} samples from "
+        "there: record longer"
     )
 
 
@@ -245,9 +248,11 @@ def few_lines(records: Sequence[Record]) -> str:
     shortest = min(record.n_samples for record in records)
     power = np.zeros(shortest // 2)
     for record in records:
-        moved = _without_line(record.input[:shortest, 0]) * np.hanning(shortest)
-        own = np.abs(np.fft.rfft(moved)[1 : power.size + 1]) ** 2
-        power += own / max(float(own.sum()), np.finfo(np.float64).tiny)
+        windowed = _without_line(record.input[:shortest, 0]) * np.hanning(shortest)
+        # Without the line at zero.
+        spectrum = np.fft.rfft(windowed)[1 : power.size + 1]
+        periodogram = np.abs(spectrum) ** 2
+        power += periodogram / max(float(periodogram.sum()), np.finfo(np.float64).tiny)
     count = power.sum() ** 2 / (power @ power)
     references = [record.reference for record in records if record.reference is not None]
     if references and not any(np.any(np.ptp(reference, axis=0)) for reference in references):
@@ -270,7 +275,9 @@ def _without_line(signal: RealArray) -> RealArray:
     """A signal (T,) without its straight line of least squares."""
     line = np.linspace(-1.0, 1.0, signal.size)
     centred = signal - signal.mean()
-    return np.asarray(centred - (line @ centred) / max(float(line @ line), np.finfo(np.float64).tiny) * line)
+    power = max(float(line @ line), np.finfo(np.float64).tiny)
+    slope = (line @ centred) / power
+    return np.asarray(centred - slope * line)
 
 
 def refuse_few_lines(records: Sequence[Record]) -> None:
@@ -342,17 +349,19 @@ def _correlates(output: RealArray, cause: RealArray) -> bool:
     products = _sums_of_products(answer, driven)[lags]
     squares = _sums_of_products(answer**2, driven**2)[lags]
     # Without a square of any size there is nothing but rounding.
-    there = squares > _NO_POWER * squares.max()
-    if not there.any():
+    has_power = squares > _NO_POWER * squares.max()
+    if not has_power.any():
         return False
-    deviates = np.abs(products[there]) / np.sqrt(squares[there])
-    by_chance = lags.size * math.erfc(float(deviates.max()) / math.sqrt(2))
-    return by_chance < _BY_CHANCE
+    deviates = np.abs(products[has_power]) / np.sqrt(squares[has_power])
+    # Probability of the largest deviate at one lag, two-sided, times the number of lags (Bonferroni).
+    at_one_lag = math.erfc(float(deviates.max()) / math.sqrt(2))
+    return lags.size * at_one_lag < _BY_CHANCE
 
 
 def _sums_of_products(later: RealArray, earlier: RealArray) -> RealArray:
     """Sum of later[k + lag] earlier[k] of two signals (T,) at lags 0 to T - 1, (T,)."""
     n = later.size
+    # Zeros behind the signals: no product wraps around.
     spectrum = np.fft.rfft(later, 2 * n) * np.fft.rfft(earlier, 2 * n).conj()
     return np.asarray(np.fft.irfft(spectrum, 2 * n)[:n])
 
@@ -361,9 +370,10 @@ def _innovations(signal: RealArray) -> RealArray:
     """What an autoregression does not predict of a signal (T,), (T - _OWN_PAST,)."""
     centred = _averages(signal, 1, signal.size)
     fitted = centred[: _MOST_AVERAGES + _OWN_PAST]
-    own = [fitted[_OWN_PAST - lag : fitted.size - lag] for lag in range(1, _OWN_PAST + 1)]
-    coefficients = np.linalg.lstsq(np.column_stack(own), fitted[_OWN_PAST:], rcond=None)[0]
-    return np.asarray(np.convolve(centred, np.append(1.0, -coefficients), "valid"))
+    past = [fitted[_OWN_PAST - lag : fitted.size - lag] for lag in range(1, _OWN_PAST + 1)]
+    coefficients = np.linalg.lstsq(np.column_stack(past), fitted[_OWN_PAST:], rcond=None)[0]
+    prediction_error_filter = np.append(1.0, -coefficients)
+    return np.asarray(np.convolve(centred, prediction_error_filter, "valid"))
 
 
 def _is_coherent(output: RealArray, cause: RealArray) -> bool:
@@ -389,13 +399,17 @@ def _is_coherent(output: RealArray, cause: RealArray) -> bool:
         power_answer = np.sum(np.abs(answer) ** 2, axis=0)
         power_driven = np.sum(np.abs(driven) ** 2, axis=0)
         common = np.abs(np.sum(answer * driven.conj(), axis=0)) ** 2
-        there = (power_driven > _NO_POWER * power_driven.max()) & (power_answer > 0)
-        if not there.any():
+        is_driven = power_driven > _NO_POWER * power_driven.max()
+        is_moving = power_answer > 0
+        lines = is_driven & is_moving
+        if not lines.any():
             continue
-        coherence = common[there] / (power_answer[there] * power_driven[there])
+        coherence = common[lines] / (power_answer[lines] * power_driven[lines])
         n_pieces = answer.shape[0]
         worth = 18 * n_pieces**2 / (19 * n_pieces - 1)
-        by_chance = coherence.size * (1 - min(float(coherence.max()), 1.0)) ** (worth - 1)
+        largest = min(float(coherence.max()), 1.0)
+        # Probability at one line, times the number of lines (Bonferroni).
+        by_chance = coherence.size * (1 - largest) ** (worth - 1)
         if by_chance < _BY_CHANCE:
             return True
     return False
@@ -420,26 +434,30 @@ def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
             return False
         y = _averages(output, averaged, n)
         c = _averages(cause, averaged, n)
-        own_past = [y[_OWN_PAST - lag : n - lag] for lag in range(1, _OWN_PAST + 1)]
-        own = np.linalg.qr(np.column_stack([np.ones(n_equations), *own_past]))[0]
+        past_of_output = [y[_OWN_PAST - lag : n - lag] for lag in range(1, _OWN_PAST + 1)]
+        explained = np.linalg.qr(np.column_stack([np.ones(n_equations), *past_of_output]))[0]
         lags = range(from_lag, from_lag + _PAST_OF_CAUSE)
-        added = np.column_stack([c[_OWN_PAST - lag : n - lag] for lag in lags])
+        past_of_cause = np.column_stack([c[_OWN_PAST - lag : n - lag] for lag in lags])
 
         # What the output's own past leaves of both.
-        residual = y[_OWN_PAST:] - own @ (own.T @ y[_OWN_PAST:])
-        added = added - own @ (own.T @ added)
+        residual = y[_OWN_PAST:] - explained @ (explained.T @ y[_OWN_PAST:])
+        added = past_of_cause - explained @ (explained.T @ past_of_cause)
         if not residual @ residual > _EXACT * float(y @ y):
             return True
         if _events(c) < _FEWEST_EVENTS:
+            # Likelihood ratio n ln(J without the cause / J with it).
             solution = np.linalg.lstsq(added, residual, rcond=None)[0]
             left = residual - added @ solution
-            statistic = n_equations * np.log(float(residual @ residual) / max(float(left @ left), _EXACT))
+            power_left = max(float(left @ left), _EXACT)
+            statistic = n_equations * np.log(float(residual @ residual) / power_left)
         else:
+            # Score s of each lag, with the variance V that its own terms have: s^T V^-1 s.
             products = added * residual[:, None]
             size = np.maximum(np.linalg.norm(products, axis=0), np.finfo(np.float64).tiny)
             score = products.sum(axis=0) / size
             variance = (products / size).T @ (products / size)
-            statistic = float(score @ np.linalg.pinv(variance, rcond=_SAME_LAGS, hermitian=True) @ score)
+            inverse = np.linalg.pinv(variance, rcond=_SAME_LAGS, hermitian=True)
+            statistic = float(score @ inverse @ score)
         if statistic > limit:
             return True
     return False
@@ -455,66 +473,76 @@ def _chi_square_limit(degrees_of_freedom: int) -> float:
 def _events(cause: RealArray) -> float:
     """How often a signal (T,) moves anew: the participation ratio of what its past does not predict."""
     power = _innovations(cause) ** 2
-    return float(power.sum() ** 2 / max(float(power @ power), np.finfo(np.float64).tiny))
+    sum_of_squares = max(float(power @ power), np.finfo(np.float64).tiny)
+    return float(power.sum() ** 2 / sum_of_squares)
 
 
 def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
     """The first n averages of a signal (T,) over so many samples, (n,), around zero and of unit size."""
     means = signal[: n * averaged].reshape(n, averaged).mean(axis=1)
-    means = means - means.mean()
-    return np.asarray(means / max(float(np.abs(means).max()), np.finfo(np.float64).tiny))
+    centred = means - means.mean()
+    size = max(float(np.abs(centred).max()), np.finfo(np.float64).tiny)
+    return np.asarray(centred / size)
 
 
 def saturated(records: Sequence[Record]) -> list[Finding]:
     """A finding on every record of a loop whose input mostly stands at its two ends."""
-    found = []
+    findings = []
     for record in records:
         command = record.input[:, 0]
         if record.reference is None or np.ptp(command) == 0:
             continue  # in open loop a command of two levels is a good one
         low = float(command.min())
         high = float(command.max())
-        share = float(np.mean((command == low) | (command == high)))
+        at_low = command == low
+        at_high = command == high
+        share = float(np.mean(at_low | at_high))
         if share > _MOSTLY:
-            found.append(
+            findings.append(
                 finding(
-                    FindingKind.SATURATED, record=record.label, name=record.input_names[0], share=share,
-                    low=low, high=high,
+                    FindingKind.SATURATED,
+                    record=record.label,
+                    name=record.input_names[0],
+                    share=share,
+                    low=low,
+                    high=high,
                 )
-            )  # fmt: skip
-    return found
+            )
+    return findings
 
 
 def few_readings(records: Sequence[Record]) -> list[Finding]:
     """A finding on every record whose output takes fewer than ten values."""
-    found = []
+    findings = []
     for record in records:
         count = np.unique(record.output[:, 0]).size
         if count < _FEW_READINGS:
-            found.append(
+            findings.append(
                 finding(
                     FindingKind.FEW_READINGS, record=record.label, name=record.output_names[0], count=count
                 )
             )
-    return found
+    return findings
 
 
 def clipped(records: Sequence[Record]) -> list[Finding]:
     """A finding on every input or output that stands suspiciously often at an end of its range."""
-    found = []
+    findings = []
     for record in records:
+        # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
+        limit_is_known = record.cut or (record.repair is not None and record.repair.own_s)
         for kind, signal, names in (
             ("input", record.input, record.input_names),
             ("output", record.output, record.output_names),
         ):
+            if kind == "input" and limit_is_known:
+                continue
             share = clipped_share(signal[:, 0])
-            # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
-            known = record.cut or (record.repair is not None and record.repair.own_s)
-            if share > 0 and not (kind == "input" and known):
-                found.append(
+            if share > 0:
+                findings.append(
                     finding(FindingKind.CLIPPED, record=record.label, signal=kind, name=names[0], share=share)
                 )
-    return found
+    return findings
 
 
 STILL_INPUT = EarlyCheck("the input moves", still_input)

@@ -551,9 +551,9 @@ def excitation_limit_rad_s(
             # Lines of the record are 2 pi / duration apart.
             duration_s = record.n_samples * record.dt_s
             n_lines = np.maximum(duration_s * omega[1:] / (2 * np.pi * TOLD_BAND_PARTS), 1.0)
-            told = n_lines * gain**2 * density[1:] >= TOLD_POWER_RATIO * noise
+            above_noise = n_lines * gain**2 * density[1:] >= TOLD_POWER_RATIO * noise
             no_leakage = density[1:] >= LEAKAGE * density.max()
-            present[1:] |= told & no_leakage
+            present[1:] |= above_noise & no_leakage
         last = np.flatnonzero(present)[-1]
         highest_rad_s = max(highest_rad_s, float(omega[last]))
     return highest_rad_s

@@ -59,7 +59,7 @@ SLOW_BESIDE_PAIR = 0.3
 # Largest change of the logarithm of a decay or frequency (15 %) up to which two ends of a search are one
 # start.
 SAME_START = 0.15
-# Starts of a descent under a relative degree: the optimum without it and the next two others. A wrong start
+# Starts of a descent under a relative degree: the optimum without it and two others. A wrong start
 # can lose a mode.
 STARTS_UNDER_DEGREE = 3
 # A score below this part of the limit, every sample counted as independent, leaves the descent out. The score
@@ -411,7 +411,7 @@ def _without_integrators(
     n_integrators = given.data.structure.integrators
     fixed = given.search.fixed
     # The integrators stand first among the real poles, the fixed ones.
-    others = Poles(given.poles.real[n_integrators:], given.poles.pairs)
+    other_poles = Poles(given.poles.real[n_integrators:], given.poles.pairs)
     options = given.search.options.model_copy(
         update={
             "integrators": 0,
@@ -431,12 +431,12 @@ def _without_integrators(
     longest = small.data.longest
     starts = []
     for decays in SLOW_STARTS[n_integrators]:
-        starts.append(others.appended(Poles(1 - np.array(decays) / longest)))
+        starts.append(other_poles.appended(Poles(1 - np.array(decays) / longest)))
     if n_integrators >= 2:
         further = 1 - np.array([SLOW_BESIDE_PAIR] * (n_integrators - 2)) / longest
         for turns in SLOW_TURNS:
             pair = np.exp(2 * np.pi * turns / longest * np.array([-SLOW_PAIR_DECAY + 1j]))
-            starts.append(others.appended(Poles(further, pair)))
+            starts.append(other_poles.appended(Poles(further, pair)))
     ends = [small.descend(start, "integrators freed", ROUGH) for start in starts]
     ends.append(OrderSelection(small).run())
     best = min(ends, key=lambda end: end.rss)
@@ -478,12 +478,12 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> SpareIntegra
     """
     n_integrators = given.data.structure.integrators
     price_of_one = 2 * float(np.log(given.worth()))
-    others = Poles(given.poles.real[n_integrators:], given.poles.pairs)
+    other_poles = Poles(given.poles.real[n_integrators:], given.poles.pairs)
     spare: SpareIntegrators | None = None
     for fewer in range(n_integrators - 1, -1, -1):
-        if others.order + fewer == 0:
+        if other_poles.order + fewer == 0:
             break
-        start = Poles(np.concatenate([np.zeros(fewer), others.real]), others.pairs)
+        start = Poles(np.concatenate([np.zeros(fewer), other_poles.real]), other_poles.pairs)
         value = statistic(given.refitted(records, start, integrators=fewer).end.rss, given)
         price = (n_integrators - fewer) * price_of_one
         if value > price:

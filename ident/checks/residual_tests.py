@@ -183,9 +183,9 @@ def independence_test(
     Variance of each lag under independence: sum_k r_e(k) r_u(k) / N, r_e and r_u the autocorrelations, so
     that colour alone does not fail.
     """
-    if len(inputs) != len(residuals) or any(
-        u.size != e.size for u, e in zip(inputs, residuals, strict=False)
-    ):
+    input_sizes = [u.size for u in inputs]
+    residual_sizes = [e.size for e in residuals]
+    if input_sizes != residual_sizes:
         raise ValueError("need one input of equal length for every residual")
     e = _centred(residuals, max_lag)
     u = _centred(inputs, max_lag)
@@ -195,14 +195,16 @@ def independence_test(
     # Standard deviation of a lag. A Bartlett taper keeps the sum of sample correlations positive.
     longest = min(part.size for part in e) // 2
     memory = _pooled_correlation(e, e, longest) * _pooled_correlation(u, u, longest)
-    taper = 1 - np.abs(np.arange(-longest, longest + 1)) / (longest + 1)
+    memory_lags = np.arange(-longest, longest + 1)
+    taper = 1 - np.abs(memory_lags) / (longest + 1)
     common_memory = max(float(np.sum(taper * memory)), 1.0 / n)
     deviation = np.sqrt(common_memory / n)
 
     # Probability 2 Phi(-x) of the largest lag alone, then that one of max_lag + 1 lags is so large:
     # 1 - (1 - p)^(max_lag + 1).
     n_tested = max_lag + 1
-    single = 2 * norm.sf(np.abs(correlation[max_lag:]) / deviation)
+    deviates = np.abs(correlation[max_lag:]) / deviation
+    single = 2 * norm.sf(deviates)
     least_single = min(float(single.min()), BELOW_ONE)
     probability = float(-np.expm1(n_tested * np.log1p(-least_single)))
 
@@ -210,7 +212,8 @@ def independence_test(
     largest_before = 0.0
     if max_lag:
         largest_before = np.abs(correlation[:max_lag]).max()
-    limit_before = deviation * norm.ppf(1 - (1 - TEST_LEVEL) / (2 * max(max_lag, 1)))
+    one_sided_chance = (1 - TEST_LEVEL) / (2 * max(max_lag, 1))
+    limit_before = deviation * norm.ppf(1 - one_sided_chance)
 
     half_width = norm.ppf(0.5 + TEST_LEVEL / 2) * deviation
     return ResidualTest(
@@ -313,7 +316,9 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
     radius = ellipses.ellipse().semi_major
     response = np.abs(ellipses.centre)
     variance = np.trace(common.covariance, axis1=1, axis2=2)
-    told = (radius < response) & (variance < response**2)
+    is_not_zero = radius < response
+    is_measured = variance < response**2
+    informative = is_not_zero & is_measured
 
     # Squares in units of the squared radius, averaged over bands.
     moved = np.abs(common.centre) ** 2 / radius**2
@@ -321,12 +326,13 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
     edges = np.geomspace(omega[0], omega[-1], FEEDBACK_BANDS + 1)
     band = np.digitize(omega, edges[1:-1])
     surest = 0.0
-    for number in np.unique(band[told]):
-        inside = told & (band == number)
+    for number in np.unique(band[informative]):
+        in_band = band == number
+        inside = informative & in_band
         # Of independent noise squares at the lines are exponentially distributed: deviation = mean.
         deviation = np.sqrt(np.sum(chance[inside] ** 2)) / np.count_nonzero(inside)
-        excess = float(np.mean(moved[inside] - chance[inside]) - SURE_DEVIATIONS * deviation)
-        surest = max(surest, excess)
+        excess = np.mean(moved[inside] - chance[inside])
+        surest = max(surest, float(excess - SURE_DEVIATIONS * deviation))
     return float(np.sqrt(surest))
 
 
@@ -362,9 +368,10 @@ def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag:
     """
     total = np.zeros(2 * max_lag + 1)
     for part_e, part_u in zip(e, u, strict=True):
-        zero_lag = part_u.size - 1
         at_all_lags = correlate(part_e, part_u, mode="full", method="fft")
-        total += at_all_lags[zero_lag - max_lag : zero_lag + max_lag + 1]
+        zero_lag = part_u.size - 1
+        wanted = slice(zero_lag - max_lag, zero_lag + max_lag + 1)
+        total += at_all_lags[wanted]
     power_e = sum(float(part @ part) for part in e)
     power_u = sum(float(part @ part) for part in u)
     return np.asarray(total / np.sqrt(power_e * power_u))
@@ -408,10 +415,12 @@ def residual_tests(
     in_loop = friction is not None and friction.observed
     colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
     filter_of_noise = np.array([1.0, *colour])
-    residuals = [
-        fit_on_fresh_data(posterior, record).residual if friction is None else friction.residual(record)
-        for record in records
-    ]
+    residuals = []
+    for record in records:
+        if friction is None:
+            residuals.append(fit_on_fresh_data(posterior, record).residual)
+        else:
+            residuals.append(friction.residual(record))
     whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
     delay = posterior.input_delay_samples
     inputs = [record.input[: record.n_samples - delay, 0] for record in records]
