@@ -1,13 +1,26 @@
-"""Global search for the poles: DIRECT on log J, descents from the best points, block rescans."""
+"""Global search for the poles of a least-squares problem: DIRECT on log J, descents, rescans of single
+blocks.
+
+J is the residual sum of squares with coefficients and nuisances re-fitted at given poles (variable
+projection, Golub and Pereyra, SIAM J. Numer. Anal. 10(2), 1973). It has many local minima, so
+`PoleSearch.joint` looks at a whole box of poles with DIRECT (Jones, Perttunen and Stuckman, J. Optim. Theory
+Appl. 79(1), 1993) and descends from the best points that lie apart. `add_pair`, `add_real` and `split_pair`
+make a set of poles larger, `rescan` moves one block at a time to where a grid finds it better, the rest
+frozen. `descend` is the local refinement behind all of them. What problem is searched does not matter
+(`ident.fit.problem.PoleProblem`): records or frequency responses.
+
+`Fitted` is an optimum with its search; `SearchStage`, `PolishedMinimum` and `SearchTrace` are the trace that
+is stored and drawn. Fixed poles come first of each type everywhere and are never moved.
+"""
 
 from __future__ import annotations
 
 import cmath
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cache, partial
-from itertools import combinations_with_replacement, cycle, islice, pairwise
-from typing import Any, Generic, Literal, TypeVar
+from functools import cache
+from itertools import combinations_with_replacement, pairwise
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -25,34 +38,83 @@ from ident.search.direct import best_apart, minimise
 
 Problem = TypeVar("Problem", bound=PoleProblem, covariant=True)
 
-# A rescan or an exchange has to gain this fraction of J to count.
+# Share of J that a rescan or an exchange of poles has to gain to count: far more than rounding, far less than
+# any pole is worth.
 GAIN = 1e-6
-# Rescans of every block at most.
-_ROUNDS = 6
-# Descents that only compare starts stop when this share of J is left to gain.
+# Share of J that is left to gain when a descent ends that only compares starts.
 ROUGH = 1e-3
-# So many starts that end in one place make further ones and a rescan superfluous.
-_STARTS_TO_AGREE = 3
-# Where they disagree, so many times the starts asked for are tried.
-_PATIENCE = 5
-# Cost evaluations for one more pair when the rest is frozen: two unknowns.
-_PAIR_EVALUATIONS = 240
-_REAL_GRID = 9  # levels of a real pole: two a decade over the box of a record of 10 000 samples
-_PAIR_GRID = (40, 2)
-# Ends of rough descents are one optimum if J and poles differ by no more than this.
-_SAME_COST = 3 * ROUGH
-_SAME_POLE = 0.1  # see `_SAME_COST`
-# Up to this share of the output's power a residual is little: with more noise many minima lie together.
-_LITTLE_NOISE = 0.02
+# Share of J that is left to gain when a descent ends whose poles are used.
+FINE = 1e-9
+# Rescans of every block at most.
+MOST_ROUNDS = 6
+# Points of a rescan of real poles, and of a pair, from which a descent starts.
+STARTS_OF_REAL = 2
+STARTS_OF_PAIR = 1
+
+# Starts that end in one place and make further ones and a rescan superfluous.
+STARTS_TO_AGREE = 3
+# Where they disagree, so many times the starts asked for are tried. A safeguard: on 78 records of the
+# benchmark plants all models stay the same with neither further starts nor an early end, as rescans find the
+# better place.
+PATIENCE = 5
+# Share of the output's power up to which a residual is little: with more noise many minima lie together, and
+# starts that agree prove nothing.
+LITTLE_NOISE = 0.02
+# Share of J by which ends of rough descents differ that are one optimum: each is known to `ROUGH`.
+SAME_COST = 3 * ROUGH
+# Share of a decay or frequency by which poles of such ends differ: near an optimum J is flat, so poles end
+# less alike than J.
+SAME_POLE = 0.1
+
+# Cost evaluations of DIRECT for one more pair when the rest is frozen: two unknowns.
+PAIR_EVALUATIONS = 240
+# Levels of a real pole in a grid: two a decade over the box of a record of 10 000 samples.
+REAL_LEVELS = 9
+# Frequencies and damping ratios of a pair in a grid. A grid of 60 x 3 led to the same models on the benchmark
+# plants.
+PAIR_OMEGAS = 40
+PAIR_ZETAS = 2
+# Samples below which a record counts as so long for the slowest pole of a search (`search_space` does so,
+# too).
+SHORTEST = 30
+# Decay over the longest record, 1 - a times samples, of the slowest real pole of the search's box: a record
+# says nothing about slower ones.
+SLOWEST_DECAY = 0.2
+
+
+class Block(NamedTuple):
+    """Poles that a rescan moves together: real poles or pairs, and their places among those."""
+
+    part: Literal["real", "pairs"]
+    places: slice
 
 
 class PoleSearch(Generic[Problem]):
-    """The search on one problem, with its trace. Fixed poles come first of each type and are never moved.
+    """A search for the poles of one problem, with its trace.
 
-    bounds: sides that refined poles keep; default: those that the options state.
+    Parameters
+    ----------
+    data : PoleProblem
+        Cost J at given poles, and its change; `power` of the output, samples of the longest record.
+    options : IdentOptions
+        Bounds of the poles, fixed poles, evaluations and starts of the search.
+    bounds : Bounds, optional
+        Sides that refined poles keep; default: those that the options state.
+
+    Attributes
+    ----------
+    fixed : Poles
+        Stated poles; they come first of each type in every result and are never moved.
+    stages : list of SearchStage
+        Global searches so far.
+    minima : list of PolishedMinimum
+        Ends of descents so far, in order.
+    evaluations : int
+        Evaluations of the cost so far, steps of descents included.
     """
 
     def __init__(self, data: Problem, options: IdentOptions, bounds: Bounds | None = None) -> None:
+        """Nothing is searched yet."""
         self.data = data
         self.options = options
         self.fixed = options.fixed()
@@ -60,189 +122,287 @@ class PoleSearch(Generic[Problem]):
         self.stages: list[SearchStage] = []
         self.minima: list[PolishedMinimum] = []
         self.evaluations = 0
-        # Slower than the box of the search goes, of which a record says nothing.
-        self._slowest = 0.2 / max(data.longest, 30)
+        self._slowest = SLOWEST_DECAY / max(data.longest, SHORTEST)
+        # What the data cannot show is not searched, unless somebody stated a bound.
         self._box = options
         unbounded = options.omega_max_rad_s is None and options.coordinates == "log"
         if unbounded and data.omega_max_rad_s is not None:
             self._box = options.model_copy(update={"omega_max_rad_s": data.omega_max_rad_s})
+        # The end on which a joint search settled; a rescan of it is superfluous.
         self._settled: Refined | None = None
+        # Colour of the residual of the end that was asked for last.
         self._coloured: tuple[Refined, ResidualColour] | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
+        """Box of so many searched real poles and pairs, as a map from the unit cube."""
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self._box)
 
     def joint(self, n_real: int, n_pairs: int) -> Refined:
-        """Best poles of a joint global search over n_real real poles and n_pairs pairs. It has settled if
-        the first starts, far from each other, all end in one place that can be trusted (`is_trusted`: a
-        broad wrong minimum catches several, but leaves dynamics); else `_PATIENCE` times as many starts
-        are tried."""
+        """End of the best descent after a global search over all searched poles together.
+
+        Parameters
+        ----------
+        n_real, n_pairs : int
+            Numbers of real poles and pairs beside the fixed ones; none: these are refined alone.
+
+        Returns
+        -------
+        Refined
+            Poles, fixed ones first, and J.
+
+        Notes
+        -----
+        It has settled if the first starts, far from each other, all end in one place that can be trusted
+        (`is_trusted`: a broad wrong minimum catches several, but leaves dynamics). Else `PATIENCE` times as
+        many starts as asked for are tried.
+        """
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
             return self.descend(self.fixed, title)
         space = self.space(n_real, n_pairs)
         cost = self.data.candidate_cost(space, self.fixed, self.fixed)
-        few = min(self.options.starts, _STARTS_TO_AGREE)
-        points = self._global(title, cost, self.options.evaluations, self.options.starts * _PATIENCE)
+        points = self._global(title, cost, self.options.evaluations, self.options.starts * PATIENCE)
+        n_first = min(self.options.starts, STARTS_TO_AGREE)
 
-        def starts(chosen: RealArray) -> list[Poles]:
-            return [self.fixed.appended(space.poles(point)) for point in chosen]
-
-        known = len(self.minima)
-        best = self._best_descent(starts(points[:few]), title)
-        ends = self.minima[known : known + len(points[:few])]
-        agreed = len(ends) == _STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
+        # The first starts; what is settled ends here.
+        first_starts = [self.fixed.appended(space.poles(point)) for point in points[:n_first]]
+        n_known = len(self.minima)
+        best = self._best_descent(first_starts, title)
+        ends = self.minima[n_known : n_known + len(first_starts)]
+        agreed = len(ends) == STARTS_TO_AGREE and all(self._is_same(end, best) for end in ends)
         if agreed and self.is_trusted(best):
             self._settled = best
             return best
-        if len(points) > few:
-            other = self._best_rough(starts(points[few:]), title)
+
+        further_starts = [self.fixed.appended(space.poles(point)) for point in points[n_first:]]
+        if further_starts:
+            other = self._best_rough(further_starts, title)
             if other.rss < best.rss * (1 - GAIN):
-                best = min(best, self.descend(other.poles, title), key=lambda end: end.rss)
+                other = self.descend(other.poles, title)
+                if other.rss < best.rss:
+                    best = other
         return best
 
     def is_trusted(self, best: Refined) -> bool:
-        """Whether `best` leaves little of the output, the rest white, and is no saddle of equal real
-        poles."""
-        distances = sorted(1 - a for a in best.poles.real[self.fixed.real.size :].tolist())
-        meeting = any(
-            fast > self._slowest / 4 and fast - slow <= _SAME_POLE * fast
-            for slow, fast in pairwise(distances)
-        )
-        return not meeting and best.rss <= _LITTLE_NOISE * self.data.power and self.colour(best).white
+        """Whether an end leaves little of the output, the rest white, and is no saddle of equal real poles.
+
+        Two real poles that are about to meet are such a saddle: a descent does not part them.
+        """
+        searched_real = best.poles.real[self.fixed.real.size :]
+        distances = sorted(1 - pole for pole in searched_real.tolist())
+        for slow, fast in pairwise(distances):
+            # Poles far slower than the box are all alike.
+            in_box = fast > self._slowest / 4
+            if in_box and fast - slow <= SAME_POLE * fast:
+                return False
+        explains = best.rss <= LITTLE_NOISE * self.data.power
+        return explains and self.colour(best).white
 
     def _is_same(self, end: PolishedMinimum, best: Refined) -> bool:
-        """Whether a rough descent was on its way to `best`."""
-        if end.rss > best.rss * (1 + _SAME_COST):
+        """Whether a rough descent was on its way to `best`, by J and by decays and frequencies of the
+        poles."""
+        if end.rss > best.rss * (1 + SAME_COST):
             return False
-        return all(
-            abs(ours - theirs) <= _SAME_POLE * theirs + self._slowest
-            for ours, theirs in zip(_rates(end.poles), _rates(best.poles), strict=True)
-        )
+        for rate, best_rate in zip(_rates(end.poles), _rates(best.poles), strict=True):
+            # Poles slower than the box may differ by all of it.
+            if not abs(rate - best_rate) <= SAME_POLE * best_rate + self._slowest:
+                return False
+        return True
 
     def add_pair(self, poles: Poles) -> Refined:
-        """Best descent from the given poles and one more pair, sought on what their tangent space leaves."""
+        """End of the best descent from some poles (fixed ones first) and one more pair.
+
+        The pair is sought by DIRECT on what the tangent space of these poles leaves of the output: whatever
+        their first-order changes explain is taken out (`Poles.doubled`).
+        """
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
         cost = self.data.candidate_cost(space, poles.doubled(), poles)
-        points = self._global(
-            title, cost, min(_PAIR_EVALUATIONS, self.options.evaluations), self.options.starts
-        )
+        evaluations = min(PAIR_EVALUATIONS, self.options.evaluations)
+        points = self._global(title, cost, evaluations, self.options.starts)
         return self._best_descent([poles.appended(space.poles(point)) for point in points], title)
 
     def add_real(self, poles: Poles) -> Refined:
-        """Best descent from the given poles and one more real pole."""
+        """End of the best descent from some poles (fixed ones first) and one more real pole.
+
+        Starts are the two best levels of a grid, twice as fine as that of a rescan, on what the tangent space
+        of the poles leaves of the output.
+        """
         space = self.space(1, 0)
         cost = self.data.candidate_cost(space, poles.doubled(), poles)
-        grid = np.linspace(0, 1, 2 * _REAL_GRID)[:, np.newaxis]
-        points = best_apart(grid, cost.rss(grid), 2)
+        grid = np.linspace(0, 1, 2 * REAL_LEVELS)[:, np.newaxis]
+        points = best_apart(grid, cost.rss(grid), STARTS_OF_REAL)
         self.evaluations += cost.evaluations
-        return self._best_descent(
-            [poles.appended(space.poles(point)) for point in points], "one more real pole"
-        )
+        starts = [poles.appended(space.poles(point)) for point in points]
+        return self._best_descent(starts, "one more real pole")
 
     def split_pair(self, poles: Poles) -> Refined:
-        """Best descent with one searched pair as two, a half-width apart, where `add_pair` sees no mode."""
+        """End of the best descent with one searched pair as two, a half-width apart.
+
+        For two modes so close that `add_pair` sees none: one pair in the middle explains both to first order.
+        """
         starts = []
-        for i in range(self.fixed.pairs.size, poles.pairs.size):
-            log = cmath.log(poles.pairs[i])
-            angles = np.clip(log.imag + np.array([0.5, -0.5]) * log.real, *self.bounds.array[2:4])
-            starts.append(poles.without_pair(i).appended(Poles(pairs=np.exp(log.real + 1j * angles))))
+        for index in range(self.fixed.pairs.size, poles.pairs.size):
+            # log p = -s + j f, half-power width s; the two stand at f - s / 2 and f + s / 2.
+            log = cmath.log(poles.pairs[index])
+            angles = log.imag + np.array([0.5, -0.5]) * log.real
+            angles = np.clip(angles, self.bounds.omega_min, self.bounds.omega_max)
+            two = Poles(pairs=np.exp(log.real + 1j * angles))
+            starts.append(poles.without_pair(index).appended(two))
         return self._best_descent(starts, "pair as two")
 
     def rescan(self, best: Refined) -> Refined:
-        """Look at each block on a grid with the rest frozen, descend from what is found, until a round gains
-        nothing; not if the joint search settled on `best`."""
+        """End that is left when no block of poles is better elsewhere, the rest frozen.
+
+        Parameters
+        ----------
+        best : Refined
+            Where to begin; returned as it is if a joint search settled on it.
+
+        Returns
+        -------
+        Refined
+
+        Notes
+        -----
+        Blocks, up to two real poles or one pair, are looked at in turns, until a whole round gained nothing
+        or after `MOST_ROUNDS` rounds.
+        """
         if best is self._settled:
             return best
         n_fixed_real, n_fixed_pairs = self.fixed.counts
         n_real, n_pairs = best.poles.counts
         # Up to two real poles are looked at together: one alone can be held by the other.
-        couples = [slice(i, min(i + 2, n_real)) for i in range(n_fixed_real, n_real, 2)]
-        scans = [partial(self._rescan, part="real", here=here) for here in couples]
-        scans += [
-            partial(self._rescan, part="pairs", here=slice(i, i + 1)) for i in range(n_fixed_pairs, n_pairs)
-        ]
-        quiet = 0
-        for scan in islice(cycle(scans), _ROUNDS * len(scans)):
-            found = scan(best)
-            quiet = 1 if found.rss < best.rss * (1 - GAIN) else quiet + 1
-            best = found
-            if quiet == len(scans):
+        blocks = [Block("real", slice(i, min(i + 2, n_real))) for i in range(n_fixed_real, n_real, 2)]
+        blocks += [Block("pairs", slice(i, i + 1)) for i in range(n_fixed_pairs, n_pairs)]
+        # Blocks that were looked at since the last gain, that one included.
+        n_quiet = 0
+        for block in MOST_ROUNDS * blocks:
+            end = self._rescanned(best, block)
+            if end.rss < best.rss * (1 - GAIN):
+                n_quiet = 1
+            else:
+                n_quiet += 1
+            best = end
+            if n_quiet == len(blocks):
                 break
         return best
 
-    def _rescan(self, best: Refined, part: Literal["real", "pairs"], here: slice) -> Refined:
-        """Descents from the best points of a grid over one block, the rest frozen, not from next to where it
-        is."""
+    def _rescanned(self, best: Refined, block: Block) -> Refined:
+        """Best end of descents from the best points of a grid over one block of poles, the rest frozen.
+
+        `best` itself where nothing gains. Points next to where the block is are left out: they would come
+        back.
+        """
         poles = best.poles
-        if part == "real":
-            kept, block = poles.without_real(here), Poles(poles.real[here])
-            grid, n_levels, n_starts = _real_grid(block.order), _REAL_GRID, 2
+        if block.part == "real":
+            frozen = poles.without_real(block.places)
+            moving = Poles(poles.real[block.places])
+            grid = _real_grid(moving.order)
+            level_step = 1 / (REAL_LEVELS - 1)
+            n_starts = STARTS_OF_REAL
         else:
-            kept, block = poles.without_pair(here), Poles(pairs=poles.pairs[here])
-            grid, n_levels, n_starts = _pair_grid(), _PAIR_GRID[0], 1
-        space = self.space(*block.counts)
-        cost = self.data.candidate_cost(space, kept, kept)
-        here_now = np.sort(space.levels(block))
+            frozen = poles.without_pair(block.places)
+            moving = Poles(pairs=poles.pairs[block.places])
+            grid = _pair_grid()
+            level_step = 1 / (PAIR_OMEGAS - 1)
+            n_starts = STARTS_OF_PAIR
+        space = self.space(*moving.counts)
+        cost = self.data.candidate_cost(space, frozen, frozen)
+        levels = np.sort(space.levels(moving))
         costs = cost.rss(grid)
         self.evaluations += cost.evaluations
-        found = best
         for point in best_apart(grid, costs, n_starts):
-            new = space.poles(point)
-            if np.all(np.abs(np.sort(space.levels(new)) - here_now) <= 1 / (n_levels - 1)):
+            candidate = space.poles(point)
+            distance = np.abs(np.sort(space.levels(candidate)) - levels)
+            if np.all(distance <= level_step):
                 continue
-            moved = getattr(poles, part).copy()
-            moved[here] = getattr(new, part)
-            trial = self.descend(replace(poles, **{part: moved}), "rescan", ROUGH)
-            if trial.rss < found.rss * (1 - GAIN):
-                found = self.descend(trial.poles, "rescan")
-        return found
+            start = getattr(poles, block.part).copy()
+            start[block.places] = getattr(candidate, block.part)
+            rough = self.descend(replace(poles, **{block.part: start}), "rescan", ROUGH)
+            if rough.rss < best.rss * (1 - GAIN):
+                best = self.descend(rough.poles, "rescan")
+        return best
 
     def colour(self, end: Refined) -> ResidualColour:
-        """Colour of the residual of an end; kept for the last end asked for."""
+        """Colour of the residual of an end: whether it is white, and what it is worth in independent samples.
+
+        Kept for the end asked for last.
+        """
         if self._coloured is None or self._coloured[0] is not end:
-            self._coloured = end, self.data.colour(self.data.residual(end.poles))
+            residual = self.data.residual(end.poles)
+            self._coloured = (end, self.data.colour(residual))
         return self._coloured[1]
 
-    def descend(self, poles: Poles, stage: str, tolerance: float = 1e-9) -> Refined:
-        """Refine from the given poles (fixed ones first) and note the end in the trace."""
+    def descend(self, poles: Poles, stage: str, tolerance: float = FINE) -> Refined:
+        """End of a local refinement from some poles, fixed ones first; noted in the trace.
+
+        Parameters
+        ----------
+        poles : Poles
+        stage : str
+            Name of the step in the trace.
+        tolerance : float
+            Share of J that is left to gain at the end. From `ROUGH` on the start may be far from an optimum,
+            so that first steps are cautious.
+
+        Returns
+        -------
+        Refined
+        """
         damping = FAR if tolerance >= ROUGH else NEAR
         end = refine(self.data, poles, self.bounds, self.fixed, tolerance=tolerance, damping=damping)
         self.evaluations += end.iterations + 1
         self.minima.append(PolishedMinimum(stage, end.poles, end.rss))
         return end
 
-    def _best_descent(self, starts: list[Poles], stage: str) -> Refined:
+    def _best_descent(self, starts: Sequence[Poles], stage: str) -> Refined:
+        """End of a fine descent from the best end of rough descents from some starts."""
         return self.descend(self._best_rough(starts, stage).poles, stage)
 
-    def _best_rough(self, starts: list[Poles], stage: str) -> Refined:
-        return min((self.descend(start, stage, ROUGH) for start in starts), key=lambda end: end.rss)
+    def _best_rough(self, starts: Sequence[Poles], stage: str) -> Refined:
+        """Best of the ends of rough descents from some starts, the first of equal ones."""
+        ends = [self.descend(start, stage, ROUGH) for start in starts]
+        return min(ends, key=lambda end: end.rss)
 
     def _global(self, title: str, cost: CandidateCost, evaluations: int, count: int) -> RealArray:
+        """Up to `count` best points (C, D) apart from each other of a search by DIRECT; noted in the
+        trace."""
         points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
-        self.stages.append(SearchStage(title, cost.space.names, cost.space.coordinates(points), costs))
+        coordinates = cost.space.coordinates(points)
+        self.stages.append(SearchStage(title, cost.space.names, coordinates, costs))
         return best_apart(points, costs, count)
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """An optimum, and the search (records, options, bounds, trace) it belongs to."""
+    """An optimum of one output's records, and the search it belongs to.
+
+    Attributes
+    ----------
+    search : PoleSearch
+        Records, options, bounds and trace.
+    end : Refined
+        Poles, fixed ones first, and residual sum of squares J.
+    """
 
     search: PoleSearch[Regression]
     end: Refined
 
     @property
     def data(self) -> Regression:
+        """The records made ready for a fit."""
         return self.search.data
 
     @property
     def poles(self) -> Poles:
+        """Poles of the optimum, fixed ones first of each type."""
         return self.end.poles
 
     @property
     def residual(self) -> RealArray:
+        """What the fit leaves of the output, (N,)."""
         return self.data.residual(self.poles)
 
     def worth(self) -> float:
@@ -250,9 +410,22 @@ class Fitted:
         return self.search.colour(self.end).effective_samples
 
     def refitted(self, records: Sequence[Record], start: Poles, **changed: Any) -> Fitted:
-        """The optimum from `start` with other settings, which structure and options call by the same names.
+        """The optimum from other poles with other settings.
 
-        Where the rows are the same their nuisances are, so that both sides of a comparison have them.
+        Parameters
+        ----------
+        records : sequence of Record
+            Those of this fit.
+        start : Poles
+            Where the descent begins, fixed ones first.
+        **changed
+            Settings that structure and options call by the same names, such as `integrators`.
+
+        Returns
+        -------
+        Fitted
+            Where the rows are the same their nuisance polynomials are, so that both sides of a comparison
+            have them.
         """
         data = prepare(records, replace(self.data.structure, **changed))
         if data.n_samples == self.data.n_samples:
@@ -262,36 +435,51 @@ class Fitted:
 
 
 def _rates(poles: Poles) -> list[float]:
-    """Decays of the real poles, frequencies of the pairs and their decays per sample, each by size."""
-    pairs = [cmath.log(pole) for pole in poles.pairs.tolist()]
-    return [
-        *sorted(1 - a for a in poles.real.tolist()),
-        *sorted(abs(log) for log in pairs),
-        *sorted(-log.real for log in pairs),
-    ]
+    """Distances from one of the real poles, frequencies of the pairs and their decays, per sample, each by
+    size."""
+    logs = [cmath.log(pole) for pole in poles.pairs.tolist()]
+    distances = sorted(1 - pole for pole in poles.real.tolist())
+    frequencies = sorted(abs(log) for log in logs)
+    decays = sorted(-log.real for log in logs)
+    return [*distances, *frequencies, *decays]
 
 
 @cache
 def _pair_grid() -> RealArray:
-    """Frequencies and dampings of one pair, as points of the unit cube."""
-    omegas, zetas = np.linspace(0, 1, _PAIR_GRID[0]), np.linspace(0, 1, _PAIR_GRID[1] + 2)[1:-1]
+    """Frequencies and damping ratios of one pair, as points (E, 2) of the unit cube."""
+    omegas = np.linspace(0, 1, PAIR_OMEGAS)
+    # Inside the box: at its sides a pair has no damping, or no peak.
+    zetas = np.linspace(0, 1, PAIR_ZETAS + 2)[1:-1]
     return np.array([[omega, zeta] for omega in omegas for zeta in zetas])
 
 
 @cache
 def _real_grid(n_poles: int) -> RealArray:
-    """Levels of one real pole, or all ordered couples of levels of two, as points of the unit cube."""
-    levels = np.linspace(0, 1, _REAL_GRID)
+    """Levels of one real pole (E, 1), or all ordered couples of levels of two (E, 2), in the unit cube."""
+    levels = np.linspace(0, 1, REAL_LEVELS)
     if n_poles == 1:
         return levels[:, np.newaxis]
-    # The triangular map of the search space turns (low, 1) into equal poles at the top.
-    couples = combinations_with_replacement(levels, 2)
-    return np.array([[low, 0.0 if low == 1 else (high - low) / (1 - low)] for low, high in couples])
+    # The search space maps (x1, x2) to levels x1 and x1 + (1 - x1) x2; (1, x2) is two equal poles at the top.
+    points = []
+    for low, high in combinations_with_replacement(levels, 2):
+        above_low = 0.0 if low == 1 else (high - low) / (1 - low)
+        points.append([low, above_low])
+    return np.array(points)
 
 
 @dataclass(frozen=True, eq=False)
 class SearchStage:
-    """One global search: coordinates (E, D) of the points in the order of evaluation and log J (E,)."""
+    """One global search: D coordinates of E points in the order of evaluation, and their costs.
+
+    Attributes
+    ----------
+    title : str
+    coordinate_names : tuple of str
+        D names with units.
+    points : (E, D) array
+    log_cost : (E,) array
+        Natural logarithm of J.
+    """
 
     title: str
     coordinate_names: tuple[str, ...]
@@ -299,18 +487,17 @@ class SearchStage:
     log_cost: RealArray
 
     def __post_init__(self) -> None:
+        """Locked arrays; ValueError where their shapes do not fit together."""
         object.__setattr__(self, "coordinate_names", tuple(self.coordinate_names))
         lock(self, "points", "log_cost")
-        if self.points.shape != (self.log_cost.size, len(self.coordinate_names)):
-            raise ValueError(
-                f"points must be ({self.log_cost.size}, {len(self.coordinate_names)}); got "
-                f"{self.points.shape}"
-            )
+        expected = (self.log_cost.size, len(self.coordinate_names))
+        if self.points.shape != expected:
+            raise ValueError(f"points must be ({expected[0]}, {expected[1]}); got {self.points.shape}")
 
 
 @dataclass(frozen=True, eq=False)
 class PolishedMinimum:
-    """End of one descent: where it started, the poles it reached and their residual sum of squares."""
+    """End of one descent: name of the step, the poles it reached and their residual sum of squares."""
 
     stage: str
     poles: Poles
@@ -319,8 +506,18 @@ class PolishedMinimum:
 
 @dataclass(frozen=True, eq=False)
 class SearchTrace:
-    """Global searches (stages) and descents (minima, in order) of one identification, warnings, and
-    evaluations of the cost, rescans and descents included."""
+    """What a search did on the way to one identification.
+
+    Attributes
+    ----------
+    stages : tuple of SearchStage
+        Global searches.
+    minima : tuple of PolishedMinimum
+        Ends of descents, in order.
+    warnings : tuple of Finding
+    evaluations : int
+        Of the cost, rescans and descents included.
+    """
 
     stages: tuple[SearchStage, ...]
     minima: tuple[PolishedMinimum, ...]
