@@ -1,10 +1,19 @@
-"""How many poles: stepwise from the data, or the numbers asked for."""
+"""How many poles: stepwise from the data, or the numbers asked for.
+
+`OrderSelection.run` begins with one mode and a few real poles, adds pairs and real poles as long as an
+information criterion falls, and takes out what it does not miss. The criterion is Ne ln(J / N) + (free
+numbers) ln Ne (Schwarz, Annals of Statistics 6(2), 1978), J the residual sum of squares of N samples and Ne
+the independent samples that the residual of the chosen model is worth, so that coloured noise asks for no
+further poles. `exchanged` and `with_real` put poles of one type in the place of others, which growing alone
+does not do. Poles are found by `ident.search.pole_search`; fixed ones come first of each type, are never
+moved, and not counted here.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,33 +23,54 @@ from ident.data.arrays import ComplexArray
 from ident.fit.least_squares import EXPLAINED
 from ident.fit.problem import PoleProblem
 from ident.fit.refinement import Refined
-from ident.search.pole_search import GAIN, PoleSearch
+from ident.search.pole_search import FINE, GAIN, PoleSearch
 
+# (fraction 0..1, message) of a search that goes on.
 Progress = Callable[[float, str], None]
+# (J, order) -> criterion of that model, lower is better (`ident.fit.problem.PoleProblem.criterion`).
+Criterion = Callable[[float, int], float]
 
+# Real poles and pairs of the first global search where their numbers are free: one mode with the real poles,
+# then pair by pair. A joint search of several has never found the best: of problems with three and five modes
+# 0 of 32, pair by pair 32 of 32.
+FIRST_REAL = 2
+FIRST_PAIRS = 1
+# Rounds of growing and pruning at most: after a pole was pruned another one may be worth adding. Chosen.
+MOST_ROUNDS = 3
+# Samples for each free number that a model with a further pair has at least. Chosen: with so few the price of
+# the criterion, which holds for many samples, is too low.
+SAMPLES_PER_NUMBER = 2
+# Share of J that is left to gain when a descent ends that only asks which pole can be spared.
+SPARING = 1e-4
 # Exchanges of a pole for another at most.
-_EXCHANGES = 4
-# Damping ratio above which a pair does what real poles do, and how far apart two of them begin.
-_NO_OVERSHOOT, _APART = 0.9, 1.5
-# Poles have met if they differ by less than this share of their distance from one.
-_MET = 1e-4
+MOST_EXCHANGES = 4
+# Damping ratio above which a pair does what real poles do: its step overshoots by less than 0.2 %.
+NO_OVERSHOOT = 0.9
+# Factor between a rate of decay and those of two real poles that start to both sides of it. Chosen.
+APART = 1.5
+# Share of their distance from one by which poles differ that have met: descents end alike to 1e-9 of J, so to
+# about its square root.
+MET = 1e-4
 
 
 def silent(fraction: float, message: str) -> None:
-    """Default progress: nobody listens."""
-
-
-# (J, order) -> criterion of that model, lower is better (`ident.fit.problem.PoleProblem.criterion`).
-Criterion = Callable[[float, int], float]
+    """Nothing: the default progress, to which nobody listens."""
 
 
 @dataclass(frozen=True)
 class OrderStep:
-    """One structure that was tried: numbers of searched poles, residual sum of squares, criterion.
+    """One structure that a selection looked at.
 
-    criterion = Ne ln(J/N) + (2 n + nuisances) ln Ne: a pole costs itself and a coefficient, and one number
-    per record whose initial state is estimated. Ne: independent samples that the chosen model's residual is
-    worth.
+    Attributes
+    ----------
+    n_real, n_pairs : int
+        Numbers of searched poles; fixed ones do not count.
+    rss : float
+        Least residual sum of squares J that was found with so many.
+    criterion : float
+        Ne ln(J / N) + (2 n + nuisances) ln Ne: a pole costs itself and a coefficient, and one number for each
+        record whose initial state is estimated. Ne: independent samples that the chosen model's residual is
+        worth.
     """
 
     n_real: int
@@ -50,183 +80,271 @@ class OrderStep:
 
     @property
     def order(self) -> int:
+        """Number of searched poles, a pair counted twice."""
         return self.n_real + 2 * self.n_pairs
 
 
+class PoleCounts(NamedTuple):
+    """Numbers of searched real poles and of searched pairs."""
+
+    real: int
+    pairs: int
+
+
 class OrderSelection:
-    """Grows and prunes the set of poles of one search."""
+    """Growth and pruning of the set of poles of one search.
+
+    Parameters
+    ----------
+    search : PoleSearch
+        Finds poles and refines them; its options state numbers of poles, or most of them.
+    progress : Progress
+        Told how far the selection is.
+    """
 
     def __init__(self, search: PoleSearch[PoleProblem], progress: Progress = silent) -> None:
+        """Nothing is looked at yet."""
         self.search = search
         self.options: IdentOptions = search.options
         self.progress = progress
-        self._tried: dict[tuple[int, int], float] = {}
+        self._least_rss: dict[PoleCounts, float] = {}
 
     def run(self, start: Refined | None = None) -> Refined:
-        """Best poles with the numbers asked for, or with those the criterion keeps; `start`: poles to go on
-        from, such as those found under another structure."""
+        """End with the numbers of poles asked for, or with those the criterion keeps.
+
+        Parameters
+        ----------
+        start : Refined, optional
+            Poles to go on from, such as those found under another structure; default: a global search.
+
+        Returns
+        -------
+        Refined
+            Poles, fixed ones first, and J.
+        """
         options = self.options
-        n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         self.progress(0.05, "global search for the first poles")
-        # One mode with the real poles, then pair by pair: a joint search of several has never found the best.
-        first = self.search.joint(n_real, min(1, most_pairs)) if start is None else start
-        best = self._noted(self.search.rescan(first))
-        for _ in range(3):
-            order = best.poles.order
-            best = grown = self._grow_pairs(best, most_pairs)
-            while options.n_real is None and self._counts(best)[0] < options.max_real and self._visible(best):
-                trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
-                if not self._better(trial, best):
-                    break
-                best = trial
-            best = self.pruned(best)
+        if start is None:
+            n_real = min(FIRST_REAL, options.max_real) if options.n_real is None else options.n_real
+            start = self.search.joint(n_real, min(FIRST_PAIRS, most_pairs))
+        best = self._noted(self.search.rescan(start))
+        for _ in range(MOST_ROUNDS):
+            order_before = best.poles.order
+            with_pairs = self._grown_by_pairs(best, most_pairs)
+            best = self.pruned(self._grown_by_real(with_pairs))
             # From where no pair was to be added, none will be: a second look would end the same.
-            if best is grown or best.poles.order == order:
+            if best is with_pairs or best.poles.order == order_before:
                 break
         return best
+
+    def _grown_by_pairs(self, best: Refined, most_pairs: int) -> Refined:
+        """End with further pairs, one by one: as many as asked for, or as long as the criterion falls."""
+        while self._counts(best).pairs < most_pairs and self._visible(best):
+            n_pairs = self._counts(best).pairs
+            self.progress(0.1 + 0.8 * n_pairs / max(most_pairs, 1), f"search for pole pair {n_pairs + 1}")
+            trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
+            if self.options.n_pairs is None and not self._better(trial, best):
+                break
+            is_last = n_pairs == most_pairs - 1
+            if n_pairs > 0 and is_last:
+                trial = self._or_split(best, trial)
+            best = trial
+        return best
+
+    def _or_split(self, smaller: Refined, larger: Refined) -> Refined:
+        """`larger`, or the smaller model with one pair as two where that leaves less.
+
+        Only with a stated number of pairs, the last of which `larger` may have spent on something else, and
+        where it leaves something to explain.
+        """
+        if self.options.n_pairs is None or self.search.is_trusted(larger):
+            return larger
+        split = self._noted(self.search.split_pair(smaller.poles))
+        return min(larger, split, key=lambda end: end.rss)
+
+    def _grown_by_real(self, best: Refined) -> Refined:
+        """End with further real poles, one by one, as long as the criterion falls; a stated number is
+        kept."""
+        if self.options.n_real is not None:
+            return best
+        while self._counts(best).real < self.options.max_real and self._visible(best):
+            trial = self._noted(self.search.rescan(self.search.add_real(best.poles)))
+            if not self._better(trial, best):
+                break
+            best = trial
+        return best
+
+    def pruned(self, best: Refined) -> Refined:
+        """End without the poles whose loss the criterion does not mind, the least needed first.
+
+        Poles of a type whose number is stated stay.
+        """
+        real_is_free = self.options.n_real is None
+        pairs_are_free = self.options.n_pairs is None
+        while True:
+            trials = self._one_less(best.poles, real_is_free, pairs_are_free)
+            if not trials:
+                return best
+            chosen = self._likeliest(best, trials, "pruning", SPARING)
+            if chosen is best:
+                return best
+            best = self._noted(self.search.descend(chosen.poles, "pruning"))
 
     def exchanged(self, best: Refined) -> Refined:
-        """One pole more and the least needed one less, as long as something is gained: a pair may stand where
-        two real poles should. Not for records, where the pole gained may follow friction."""
-        for _ in range(_EXCHANGES):
+        """End with one pole more and the least needed one less, as often as that gains.
+
+        A pair may stand where two real poles should. Not for records, where the pole gained may follow
+        friction.
+        """
+        for _ in range(MOST_EXCHANGES):
             if not self._visible(best):
                 break
+            counts = self._counts(best)
             larger = [self.search.add_pair(best.poles)]
-            if self._counts(best)[0]:
+            if counts.real:
                 larger.append(self.search.add_real(best.poles))
-            found = min((self._reduced(end, self._counts(best)) for end in larger), key=lambda end: end.rss)
-            if not found.rss < best.rss * (1 - GAIN):
+            ends = [self._reduced(end, counts) for end in larger]
+            exchanged = min(ends, key=lambda end: end.rss)
+            if not exchanged.rss < best.rss * (1 - GAIN):
                 break
-            best = self._noted(self.search.rescan(found))
+            best = self._noted(self.search.rescan(exchanged))
         return best
 
+    def _reduced(self, end: Refined, counts: PoleCounts) -> Refined:
+        """End with poles taken out one by one down to `counts`, first the one whose loss costs least."""
+        while True:
+            present = self._counts(end)
+            trials = self._one_less(end.poles, present.real > counts.real, present.pairs > counts.pairs)
+            if not trials:
+                return self.search.descend(end.poles, "exchange")
+            ends = [self.search.descend(poles, "exchange", SPARING) for poles in trials]
+            end = min(ends, key=lambda trial: trial.rss)
+
     def with_real(self, best: Refined) -> Refined:
-        """Pairs without any overshoot as one real pole or two, as long as the criterion falls: what grows
-        pair by pair makes such pairs of real poles."""
+        """End with one real pole or two in the place of each pair without any overshoot, if that is likelier.
+
+        As long as the criterion falls: what grows pair by pair makes such pairs of real poles. Then poles
+        that have met are parted (`_parted`). With stated numbers of poles `best` stays.
+        """
         while self.options.n_real is None and self.options.n_pairs is None:
-            fixed, poles = self.search.fixed.pairs.size, best.poles
+            poles = best.poles
             trials = []
-            for i in range(fixed, poles.pairs.size):
-                rate = np.log(poles.pairs[i])
-                if -rate.real / abs(rate) > _NO_OVERSHOOT:
-                    size = abs(rate)
-                    trials += [
-                        poles.without_pair(i).appended(Poles(np.exp(-size * np.array(apart))))
-                        for apart in ([1.0], [1.0 / _APART, _APART])
-                    ]
+            for index in range(self.search.fixed.pairs.size, poles.pairs.size):
+                log = np.log(poles.pairs[index])
+                rate = abs(log)
+                damping_ratio = -log.real / rate
+                if damping_ratio > NO_OVERSHOOT:
+                    without = poles.without_pair(index)
+                    trials.append(without.appended(_real_poles(rate, [1.0])))
+                    trials.append(without.appended(_real_poles(rate, [1.0 / APART, APART])))
             chosen = self._likeliest(best, trials, "real poles of a pair")
             if chosen is best:
                 break
             best = self.pruned(chosen)
-        return self._apart(best)
+        return self._parted(best)
 
-    def _apart(self, best: Refined) -> Refined:
-        """Without poles that have met: a descent does not part them, and they have no residue each. One in
-        place of two, or two real poles further apart, whichever fits better."""
-        fixed, poles = self.search.fixed, best.poles
+    def _parted(self, best: Refined) -> Refined:
+        """End without poles that have met: a descent does not part them, and they have no residue each.
+
+        One in the place of two, or two real poles further apart, whichever the criterion prefers. `best`
+        where no poles have met, or their numbers are stated.
+        """
+        fixed = self.search.fixed
+        poles = best.poles
         if self.options.n_real is not None or self.options.n_pairs is not None:
             return best
         real = _met(poles.real[fixed.real.size :].astype(complex))
-        pairs = _met(poles.pairs[fixed.pairs.size :])
+        pair = _met(poles.pairs[fixed.pairs.size :])
         if real is not None:
-            one = poles.without_real(fixed.real.size + real)
-            none = one.without_real(int(np.argmin(np.abs(one.real - poles.real[fixed.real.size + real]))))
-            rate = -np.log(poles.real[fixed.real.size + real])
-        elif pairs is not None:
-            one = poles.without_pair(fixed.pairs.size + pairs)
-            met = poles.pairs[fixed.pairs.size + pairs]
-            none, rate = one.without_pair(int(np.argmin(np.abs(one.pairs - met)))), abs(np.log(met))
+            at = fixed.real.size + real
+            one_less = poles.without_real(at)
+            twin = int(np.argmin(np.abs(one_less.real - poles.real[at])))
+            without_both = one_less.without_real(twin)
+            rate = -np.log(poles.real[at])
+        elif pair is not None:
+            at = fixed.pairs.size + pair
+            one_less = poles.without_pair(at)
+            twin = int(np.argmin(np.abs(one_less.pairs - poles.pairs[at])))
+            without_both = one_less.without_pair(twin)
+            rate = abs(np.log(poles.pairs[at]))
         else:
             return best
-        two = none.appended(Poles(np.exp(-rate * np.array([1 / _APART, _APART]))))
-        ends = [self._noted(self.search.descend(trial, "poles apart")) for trial in (one, two)]
+        apart = without_both.appended(_real_poles(rate, [1 / APART, APART]))
+        ends = [self._noted(self.search.descend(trial, "poles apart")) for trial in (one_less, apart)]
         criterion = self._criterion(best)
         return min(ends, key=lambda end: criterion(end.rss, end.poles.order))
 
     def table(self, best: Refined) -> tuple[OrderStep, ...]:
-        """Everything that was tried, by order, judged by the residual of the chosen model."""
+        """Every structure that was looked at, by order, judged by the residual of the chosen model `best`."""
         criterion = self._criterion(best)
-        steps = [
-            OrderStep(n_real, n_pairs, rss, criterion(rss, n_real + 2 * n_pairs))
-            for (n_real, n_pairs), rss in self._tried.items()
-        ]
+        steps = []
+        for counts, rss in self._least_rss.items():
+            order = counts.real + 2 * counts.pairs
+            steps.append(OrderStep(counts.real, counts.pairs, rss, criterion(rss, order)))
         return tuple(sorted(steps, key=lambda step: (step.order, step.n_real)))
 
-    def _grow_pairs(self, best: Refined, most_pairs: int) -> Refined:
-        while (count := self._counts(best)[1]) < most_pairs and self._visible(best):
-            self.progress(0.1 + 0.8 * count / max(most_pairs, 1), f"search for pole pair {count + 1}")
-            trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
-            if self.options.n_pairs is None and not self._better(trial, best):
-                break
-            best = self._split(best, trial) if 0 < count == most_pairs - 1 else trial
-        return best
+    def _likeliest(
+        self, best: Refined, trials: Sequence[Poles], stage: str, tolerance: float = FINE
+    ) -> Refined:
+        """Lowest by the criterion among `best` and the ends of descents from some poles; `best` wins a tie.
 
-    def _split(self, smaller: Refined, best: Refined) -> Refined:
-        """`best`, or the smaller model with one pair as two where that leaves less and `best` something to
-        explain."""
-        if self.options.n_pairs is None or self.search.is_trusted(best):
-            return best
-        return min(best, self._noted(self.search.split_pair(smaller.poles)), key=lambda end: end.rss)
-
-    def pruned(self, best: Refined) -> Refined:
-        """Take out poles whose loss the criterion does not mind, the least needed first."""
-        free_real, free_pairs = self.options.n_real is None, self.options.n_pairs is None
-        while trials := self._one_less(best.poles, free_real, free_pairs):
-            chosen = self._likeliest(best, trials, "pruning", 1e-4)
-            if chosen is best:
-                break
-            best = self._noted(self.search.descend(chosen.poles, "pruning"))
-        return best
-
-    def _likeliest(self, best: Refined, trials: Sequence[Poles], *how: Any) -> Refined:
-        """Of `best` and where descents from these poles end, by the criterion read from its residual; how: as
-        `PoleSearch.descend`."""
-        ends = [self._noted(self.search.descend(poles, *how)) for poles in trials]
+        The criterion is read from the residual of `best`. stage, tolerance: of `PoleSearch.descend`.
+        """
+        ends = [self._noted(self.search.descend(poles, stage, tolerance)) for poles in trials]
         criterion = self._criterion(best)
         return min([best, *ends], key=lambda end: criterion(end.rss, end.poles.order))
 
-    def _reduced(self, end: Refined, counts: tuple[int, int]) -> Refined:
-        """Poles taken out one by one, the one first whose loss costs least, down to the given numbers."""
-        while trials := self._one_less(
-            end.poles, *(here > wanted for here, wanted in zip(self._counts(end), counts, strict=True))
-        ):
-            end = min((self.search.descend(poles, "exchange", 1e-4) for poles in trials), key=lambda e: e.rss)
-        return self.search.descend(end.poles, "exchange")
-
     def _one_less(self, poles: Poles, real: bool, pairs: bool) -> list[Poles]:
-        """The poles without one of the searched real ones or pairs."""
+        """Poles without one of the searched real ones (where `real`), and without one of the pairs
+        (`pairs`)."""
         fixed = self.search.fixed
-        return [
-            *(poles.without_real(i) for i in range(fixed.real.size, poles.real.size) if real),
-            *(poles.without_pair(i) for i in range(fixed.pairs.size, poles.pairs.size) if pairs),
-        ]
+        smaller: list[Poles] = []
+        if real:
+            smaller += [poles.without_real(i) for i in range(fixed.real.size, poles.real.size)]
+        if pairs:
+            smaller += [poles.without_pair(i) for i in range(fixed.pairs.size, poles.pairs.size)]
+        return smaller
 
     def _criterion(self, end: Refined) -> Criterion:
-        """The criterion read from the residual of this model."""
-        return self.search.data.criterion(end.rss, end.poles.order, self.search.colour(end).effective_samples)
+        """The criterion (J, order) -> number with Ne of the residual of this model."""
+        worth = self.search.colour(end).effective_samples
+        return self.search.data.criterion(end.rss, end.poles.order, worth)
 
     def _better(self, trial: Refined, best: Refined) -> bool:
-        """Is the larger trial's criterion lower? For one more pair: Ne ln(J0/J1) > 4 ln Ne."""
+        """Whether the larger trial's criterion is lower. For one more pair: Ne ln(J0 / J1) > 4 ln Ne."""
         criterion = self._criterion(trial)
         return criterion(trial.rss, trial.poles.order) < criterion(best.rss, best.poles.order)
 
     def _visible(self, best: Refined) -> bool:
-        enough = self.search.data.n_samples > 2 * self.search.data.n_parameters(best.poles.order + 2)
+        """Whether a further pair could be seen: enough samples for it, and a residual above rounding."""
+        n_numbers = self.search.data.n_parameters(best.poles.order + 2)
+        enough = self.search.data.n_samples > SAMPLES_PER_NUMBER * n_numbers
         return enough and best.rss > EXPLAINED * self.search.data.power
 
-    def _counts(self, end: Refined) -> tuple[int, int]:
+    def _counts(self, end: Refined) -> PoleCounts:
+        """Numbers of searched real poles and pairs of an end."""
         fixed = self.search.fixed
-        return end.poles.real.size - fixed.real.size, end.poles.pairs.size - fixed.pairs.size
+        return PoleCounts(end.poles.real.size - fixed.real.size, end.poles.pairs.size - fixed.pairs.size)
 
     def _noted(self, end: Refined) -> Refined:
-        key = self._counts(end)
-        self._tried[key] = min(end.rss, self._tried.get(key, np.inf))
+        """The end itself; its J is noted for the table where it is the least of its structure."""
+        counts = self._counts(end)
+        self._least_rss[counts] = min(end.rss, self._least_rss.get(counts, np.inf))
         return end
 
 
+def _real_poles(rate: float, factors: Sequence[float]) -> Poles:
+    """Real poles exp(-rate factor), one for each factor; rate: decay per sample."""
+    return Poles(np.exp(-rate * np.array(factors)))
+
+
 def _met(poles: ComplexArray) -> int | None:
-    """Index of a pole that another has met; None where all are apart."""
-    near = np.abs(poles[:, None] - poles[None, :]) <= _MET * np.abs(1 - poles)
-    at = np.flatnonzero((near & ~np.eye(poles.size, dtype=bool)).any(axis=1))
-    return int(at[0]) if at.size else None
+    """Index of a pole (P,) that another one has met; None where all are apart."""
+    distance = np.abs(poles[:, None] - poles[None, :])
+    near = distance <= MET * np.abs(1 - poles)
+    another = ~np.eye(poles.size, dtype=bool)
+    indices = np.flatnonzero((near & another).any(axis=1))
+    if not indices.size:
+        return None
+    return int(indices[0])
