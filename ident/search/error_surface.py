@@ -1,4 +1,9 @@
-"""The cost over one pole pair with everything else frozen: the paper's Fig. 1 for any record and model."""
+"""The cost over one pole pair with everything else frozen: the paper's Fig. 1 for any record and model.
+
+`error_surface` moves one pair of a fitted model over a grid and fits coefficients and nuisances anew at every
+point. The picture shows how many local minima a descent could end in. Coordinates are those of the pole
+search: the paper's (beta, gamma) of its equation (29), or frequency and damping ratio.
+"""
 
 from __future__ import annotations
 
@@ -17,13 +22,41 @@ from ident.data.record import Record
 from ident.data.shown import Shown
 from ident.fit.regression import prepare
 
+# Default window, for a picture that holds the pair's own valley and its neighbours. Frequency: two octaves
+# each way, below the Nyquist frequency by this share.
+OMEGA_FACTOR = 4
+BELOW_NYQUIST = 0.99
+# Damping ratio, and width 1 - gamma: a factor of 30 each way, the damping ratio within these ends.
+DAMPING_FACTOR = 30
+LEAST_ZETA = 1e-5
+LARGEST_ZETA = 0.95
+# beta: ten damping widths each way, at least this much, and inside -1..1 by a rounding error.
+BETA_WIDTHS = 10
+LEAST_BETA_WIDTH = 0.02
+INSIDE_BETA = 1 - 1e-9
+# Sides (low, high) of the cube that candidates are given in: [real pole (none here), first, second]
+# coordinate. Any box that holds the grid serves. raw: beta, gamma.
+RAW_BOX = ((0.0, -1.0, 0.0), (1.0, 1.0, 1.0))
+# log: log10 of omega [rad/sample], log10 of zeta.
+LOG_BOX = ((-1.0, -12.0, -12.0), (0.0, 1.0, 0.0))
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorSurface(Shown):
-    """Mean square residual J/N (20) over two coordinates of one pair, coefficients fitted at every point.
+    """Mean square residual J / N (20) over two coordinates of one pair, coefficients fitted at every point.
 
-    first (A,), second (B,): values of (beta, gamma) of (29), or (omega [rad/s], zeta), called `names`;
-    mean_square (A, B) in squared units of the output; pole: the model's own pair.
+    Attributes
+    ----------
+    first : (A,) array
+        Values of beta of (29), or omega in rad/s.
+    second : (B,) array
+        Values of gamma of (29), or zeta.
+    names : tuple of two str
+        What the coordinates are called.
+    mean_square : (A, B) array
+        In squared units of the output.
+    pole : tuple of two float
+        The model's own pair in these coordinates.
     """
 
     first: RealArray
@@ -33,6 +66,7 @@ class ErrorSurface(Shown):
     pole: tuple[float, float]
 
     def __post_init__(self) -> None:
+        """Locked arrays; ValueError where their shapes do not fit together."""
         lock(self, "first", "second", "mean_square")
         if self.mean_square.shape != (self.first.size, self.second.size):
             raise ValueError(
@@ -40,13 +74,12 @@ class ErrorSurface(Shown):
             )
 
     def local_minima(self) -> list[tuple[int, int]]:
-        """Grid points lower than all their (up to 8) neighbours, lowest first."""
-        beside = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
-        lowest = self.mean_square < minimum_filter(
-            self.mean_square, footprint=beside, mode="constant", cval=np.inf
-        )
-        order = np.argsort(self.mean_square[lowest], kind="stable")
-        return [(int(i), int(j)) for i, j in np.argwhere(lowest)[order]]
+        """Indices (of first, of second) of points lower than all their up to 8 neighbours, lowest first."""
+        neighbours = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+        least_beside = minimum_filter(self.mean_square, footprint=neighbours, mode="constant", cval=np.inf)
+        is_minimum = self.mean_square < least_beside
+        order = np.argsort(self.mean_square[is_minimum], kind="stable")
+        return [(int(i), int(j)) for i, j in np.argwhere(is_minimum)[order]]
 
 
 def error_surface(
@@ -60,49 +93,91 @@ def error_surface(
     second: RealArray | None = None,
     n_points: int = 61,
 ) -> ErrorSurface:
-    """Mean square residual with the pair number `pair` of the model moved over a grid, its other poles
-    frozen.
+    """Mean square residual of records with one pair of a model moved over a grid, its other poles frozen.
 
-    coordinates: "raw" for (beta, gamma), "log" for (omega, zeta). first, second: grid; default two octaves
-    each way in omega and a factor of 30 in zeta, or a window of ten damping widths. Raises ValueError if the
-    model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi/dt, 0 < zeta < 1.
+    Parameters
+    ----------
+    records : sequence of Record
+        One input and one output each.
+    model : GobfModel
+        Its poles; coefficients are fitted anew.
+    structure : Structure
+        Integrators, delay and nuisances of the fit.
+    pair : int
+        Which of the model's pairs, from 0.
+    coordinates : str
+        "raw" for (beta, gamma), "log" for (omega [rad/s], zeta).
+    first, second : (A,), (B,) array, optional
+        The grid; default two octaves each way in omega and a factor of 30 in zeta, or a window of ten damping
+        widths.
+    n_points : int
+        Points of each default grid.
+
+    Returns
+    -------
+    ErrorSurface
+
+    Raises
+    ------
+    ValueError
+        The model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi / dt,
+        0 < zeta < 1.
+
+    Notes
+    -----
+    gamma = |p|^2 and beta = 2 Re p / (1 + gamma), p the pole of the pair.
     """
     if not 0 <= pair < model.poles.pairs.size:
         raise ValueError(f"the model has {model.poles.pairs.size} pole pairs; there is no pair {pair}")
-    pole = complex(model.poles.pairs[pair])
-    nyquist = np.pi / model.dt_s
+    names: tuple[str, str]
     if coordinates == "raw":
+        names = ("beta", "gamma")
+        pole = complex(model.poles.pairs[pair])
         gamma = abs(pole) ** 2
-        own = (2 * pole.real / (1 + gamma), gamma)
+        beta = 2 * pole.real / (1 + gamma)
+        own_pair = (beta, gamma)
         width = 1 - gamma
         if first is None:
-            left, right = np.clip(own[0] + (max(10 * width, 0.02) * np.array([-1, 1])), -1 + 1e-9, 1 - 1e-9)
+            reach = max(BETA_WIDTHS * width, LEAST_BETA_WIDTH)
+            left, right = np.clip(beta + (reach * np.array([-1, 1])), -INSIDE_BETA, INSIDE_BETA)
             first = np.linspace(float(left), float(right), n_points)
         if second is None:
-            second = 1 - np.geomspace(min(30 * width, 1.0), width / 30, n_points)
-        names = ("beta", "gamma")
-        proper = np.all(np.abs(first) < 1) and np.all((second >= 0) & (second < 1))
-        box = np.array([[0.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
-        values_first, values_second = first, second
+            widths = np.geomspace(min(DAMPING_FACTOR * width, 1.0), width / DAMPING_FACTOR, n_points)
+            second = 1 - widths
+        first_is_proper = np.all(np.abs(first) < 1)
+        second_is_proper = np.all((second >= 0) & (second < 1))
+        low, high = np.array(RAW_BOX)
+        first_coordinates = first
+        second_coordinates = second
     else:
-        own = (float(model.poles.omega_rad_s(model.dt_s)[pair]), float(model.poles.zeta()[pair]))
-        if first is None:
-            first = np.geomspace(own[0] / 4, min(4 * own[0], 0.99 * nyquist), n_points)
-        if second is None:
-            second = np.geomspace(max(own[1] / 30, 1e-5), min(30 * own[1], 0.95), n_points)
         names = ("omega_rad_s", "zeta")
-        proper = np.all((first > 0) & (first < nyquist)) and np.all((second > 0) & (second < 1))
-        box = np.array([[-1.0, -12.0, -12.0], [0.0, 1.0, 0.0]])
-        values_first, values_second = np.log10(first * model.dt_s), np.log10(second)
-    if not proper:
+        nyquist = np.pi / model.dt_s
+        omega = float(model.poles.omega_rad_s(model.dt_s)[pair])
+        zeta = float(model.poles.zeta()[pair])
+        own_pair = (omega, zeta)
+        if first is None:
+            highest = min(OMEGA_FACTOR * omega, BELOW_NYQUIST * nyquist)
+            first = np.geomspace(omega / OMEGA_FACTOR, highest, n_points)
+        if second is None:
+            least = max(zeta / DAMPING_FACTOR, LEAST_ZETA)
+            largest = min(DAMPING_FACTOR * zeta, LARGEST_ZETA)
+            second = np.geomspace(least, largest, n_points)
+        first_is_proper = np.all((first > 0) & (first < nyquist))
+        second_is_proper = np.all((second > 0) & (second < 1))
+        low, high = np.array(LOG_BOX)
+        first_coordinates = np.log10(first * model.dt_s)
+        second_coordinates = np.log10(second)
+    if not (first_is_proper and second_is_proper):
         raise ValueError(
             f"the grid of {names} leaves the region of stable pole pairs below the Nyquist frequency"
         )
+
+    # Every point of the grid as a candidate beside the frozen poles, in units of the box.
     data = prepare(records, structure)
-    kept = model.poles.without_pair(pair)
-    low, high = box
+    frozen = model.poles.without_pair(pair)
     space = SearchSpace(0, 1, low, high, coordinates == "raw", model.dt_s)
-    grid = np.array([[a, b] for a in values_first for b in values_second])
-    cost = data.candidate_cost(space, kept, kept)
-    rss = cost.rss((grid - low[1:]) / (high[1:] - low[1:])).reshape(first.size, second.size)
-    return ErrorSurface(first, second, names, rss / data.n_samples, own)
+    grid = np.array([[a, b] for a in first_coordinates for b in second_coordinates])
+    units = (grid - low[1:]) / (high[1:] - low[1:])
+    cost = data.candidate_cost(space, frozen, frozen)
+    rss = cost.rss(units).reshape(first.size, second.size)
+    return ErrorSurface(first, second, names, rss / data.n_samples, own_pair)
