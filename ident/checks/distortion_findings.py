@@ -23,20 +23,23 @@ from ident.data.record import Record
 from ident.data.repeats import AmplitudeBand, Repeats, repeats_of
 
 # Share of the response (RMS). Significant distortion below it is not called distortion, as loop shaping with
-# usual margins (gain errors of tens of per cent) need not mind 1 %. Chosen.
+# usual margins (gain errors of tens of per cent) need not mind 1 %. Chosen; doubled or halved, no test of
+# verdicts moves.
 LEAST_DISTORTION = 0.01
 # Share of the response (RMS). A band in which noise would hide so much distortion says nothing about
 # linearity; in records that are not periodic, noise and distortion together are asked to stay below it.
-# Chosen.
+# Chosen; doubled or halved, no test of verdicts moves.
 MOST_HIDDEN = 0.05
 # Ratio of powers (6 dB). Distortion is called odd, or even, where the power at lines of that parity is so
-# many times the power at the others. Chosen.
+# many times the power at the others. Chosen; doubled or halved, no test of verdicts moves.
 PARITY_POWER_RATIO = 4.0
 # Ratio of shares of the response. Distortion is said to fall or grow with the amplitude where its share
-# changes by so much. Chosen; Coulomb friction halves its share where the amplitude doubles.
+# changes by so much. Chosen: Coulomb friction halves its share where the amplitude doubles; at 1.12 or 1.5 no
+# test of verdicts moves.
 TREND_RATIO = 1.25
 # Share of a difference's power. A change of the gain, or a shift of resonances, is named in a band where it
-# explains so much of what differs between amplitudes. Chosen.
+# explains so much of what differs between amplitudes. Chosen; doubled, a resonance that falls by 1 % is no
+# longer named in its test, halved nothing moves.
 LEAST_EXPLAINED = 0.3
 # Coherence that stands for zero: keeps 1 / coherence finite at lines without any answer.
 LEAST_COHERENCE = 1e-12

@@ -1,8 +1,13 @@
 """What makes logs hopeless or doubtful, told by their columns alone in a fraction of a second.
 
 `early_checks` lists them in the order in which they speak. They need numpy and nothing else, so that a
-command refuses hopeless logs before it loads what identifies: that takes seconds. A refusal is certain. What
-may be meant is a doubt (`early_doubts`), and the identification goes on.
+command refuses hopeless logs before it loads what identifies: that takes seconds. Each is a function of the
+records of one channel (one input, one output, of one sampling time; at least one record) that returns its
+complaint, one line with file, column, what is expected and what mends it, or "" where it has none. A refusal
+is certain. What may be meant is a doubt (`early_doubts`), and the identification goes on.
+
+Whether an output answers to its input is asked by three tests without a model, of coherence, prediction and
+correlation, each with its reference at its function.
 """
 
 from __future__ import annotations
@@ -51,9 +56,10 @@ _BY_CHANCE_DEVIATE = 3.09
 
 # Parts into which the coherence test cuts a record: few for slow answers, many for weak ones.
 _PARTS = (8, 32, 128)
-# Samples: shorter parts have too few lines. A record that has no room for the fewest parts is not tested.
+# Samples of a part at least: shorter ones have too few lines. A record that has no room for the fewest parts
+# is not tested.
 _SHORTEST_PART = 32
-# Of the largest power of the cause: lines with less hold rounding only.
+# Share of the largest power of the cause: lines with less hold rounding only.
 _NO_POWER = 1e-9
 
 # Samples over which the prediction test averages: from one up to a sixty-fourth of the sampling rate, for
@@ -66,22 +72,30 @@ _OWN_PAST = 20
 _PAST_OF_CAUSE = 10
 # Moves of a cause (participation ratio): of fewer, ten lags have no variance that their own squares tell.
 _FEWEST_EVENTS = 20.0
-# Relative: lags of a slow cause with less variance of their own are one and the same.
+# Share of the largest eigenvalue of their covariance: lags of a slow cause with less variance of their own
+# are one and the same.
 _SAME_LAGS = 1e-8
 # Samples of each average that the prediction test uses at most: 20 000 rows of 31 columns cost 20 ms.
 _MOST_AVERAGES = 20_000
-# Of an output's samples, the share by which an answer may come late: less overlap tells nothing.
+# Share of an output's samples by which an answer may come late: what overlaps less tells nothing.
 _LATEST = 0.75
-# Samples that the correlation test uses at most.
+# Samples that the correlation test uses at most, to end in a fraction of a second.
 _MOST_CORRELATED = 200_000
-# Of the output's power: what is predicted better is rounding, of which no test holds.
+# Share of the output's power: what is predicted better is rounding, of which no test holds.
 _EXACT = 1e-18
 
 
 @dataclass(frozen=True)
 class EarlyCheck:
-    """A named check; complaint: one line on the records of one channel, empty where there is nothing to
-    say."""
+    """A check that can refuse logs.
+
+    Attributes
+    ----------
+    name : str
+        What it asks for, as in "the output moves".
+    complaint : callable
+        Of the records of one channel: one line, or "" where there is nothing to complain of.
+    """
 
     name: str
     complaint: Callable[[Sequence[Record]], str]
@@ -92,9 +106,9 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
 
     Parameters
     ----------
-    records
+    records : sequence of Record
         Of one channel, to identify from: one input and one output each.
-    checks
+    checks : sequence of EarlyCheck
         In the order in which they speak: `early_checks`.
 
     Raises
@@ -109,14 +123,19 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
 
 
 def early_doubts(records: Sequence[Record]) -> list[Finding]:
-    """Findings on records (one input, one output each) that can be used but hardly are what was meant: a
-    command of a loop that mostly stands at its ends, an output of few readings."""
+    """Findings SATURATED, then FEW_READINGS, on records that can be used but hardly are what was meant.
+
+    A command of a loop that mostly stands at its ends, an output of few readings; one input and one output
+    each.
+    """
     return [*saturated(records), *few_readings(records)]
 
 
 def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
-    """The complaint that no record has more than `FEWEST_SAMPLES`; order: of the model, where it is
-    stated."""
+    """The complaint that no record has more than `FEWEST_SAMPLES` rows, or "".
+
+    order: of the model, where it is stated; it stands in the complaint and decides nothing.
+    """
     longest = max(records, key=lambda record: record.n_samples)
     if longest.n_samples > FEWEST_SAMPLES:
         return ""
@@ -130,7 +149,7 @@ def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
 
 
 def still_input(records: Sequence[Record]) -> str:
-    """The complaint about a record none of whose inputs moves."""
+    """The complaint about the first record none of whose inputs moves, or ""."""
     for record in records:
         if not np.ptp(record.input, axis=0).any():
             return _constant(record, "input", record.input_names[0], float(record.input[0, 0]))
@@ -138,7 +157,7 @@ def still_input(records: Sequence[Record]) -> str:
 
 
 def still_output(records: Sequence[Record]) -> str:
-    """The complaint about a record one of whose outputs is constant."""
+    """The complaint about the first record one of whose outputs is constant, or ""."""
     for record in records:
         for index, name in enumerate(record.output_names):
             if not np.ptp(record.output[:, index]) > 0:
@@ -156,7 +175,10 @@ def _constant(record: Record, role: str, name: str, value: float) -> str:
 
 
 def late_command(records: Sequence[Record]) -> str:
-    """The complaint that in every record the input first moves when hardly a sample is left."""
+    """The complaint that in every record the input first moves when hardly a sample is left, or "".
+
+    Hardly: `FEWEST_SAMPLES` or fewer from the first row whose input differs from that of row 0.
+    """
     samples_left = []
     for record in records:
         moved = record.input[:, 0] != record.input[0, 0]
@@ -174,7 +196,7 @@ def late_command(records: Sequence[Record]) -> str:
 
 
 def two_readings(records: Sequence[Record]) -> str:
-    """The complaint that the output takes two values in all records together."""
+    """The complaint that the output takes two values at most in all records together, or ""."""
     values = np.unique(np.concatenate([np.unique(record.output[:, 0]) for record in records]))
     if values.size > 2:
         return ""
@@ -187,8 +209,10 @@ def two_readings(records: Sequence[Record]) -> str:
 
 
 def resting_output(records: Sequence[Record]) -> str:
-    """The complaint that in every record the output leaves one reading for hardly a sample: a sensor at its
-    end, or a machine that sticks."""
+    """The complaint that in every record the output leaves one reading for hardly a sample, or "".
+
+    Hardly: for `FEWEST_SAMPLES` rows or fewer, as a sensor at its end or a machine that sticks.
+    """
     for record in records:
         output = record.output[:, 0]
         values, counts = np.unique(output, return_counts=True)
@@ -205,7 +229,7 @@ def resting_output(records: Sequence[Record]) -> str:
 
 
 def copied_column(records: Sequence[Record]) -> str:
-    """The complaint that the output is the input or the reference again, times a number, sample by sample."""
+    """The complaint that the output is the input or a reference again, times a number, row by row; or ""."""
     for record in records:
         output = record.output[:, 0]
         others = [("input", record.input[:, 0], record.input_names[0])]
@@ -236,8 +260,10 @@ def _is_copy(signal: RealArray, other: RealArray) -> bool:
 
 
 def few_lines(records: Sequence[Record]) -> str:
-    """The complaint about the records of a loop whose input is concentrated at few frequencies, as of a sine
-    or a limit cycle, or whose references all stand still: an arm cannot be told from its loop then.
+    """The complaint that records of a loop excite no band, or "".
+
+    Their input is concentrated at few frequencies, as of a sine or a limit cycle, or their references all
+    stand still: an arm cannot be told from its loop then.
 
     Notes
     -----
@@ -281,12 +307,12 @@ def _without_line(signal: RealArray) -> RealArray:
 
 
 def refuse_few_lines(records: Sequence[Record]) -> None:
-    """Raises ValueError with what `few_lines` complains of in the records of a loop."""
+    """Nothing, where the records of a loop excite a band; else raises ValueError (`few_lines`)."""
     refuse_hopeless(records, [FEW_LINES])
 
 
 def no_answer(records: Sequence[Record]) -> str:
-    """The complaint that in no record the output has anything to do with what moves the machine.
+    """The complaint that in no record the output has anything to do with what moves the machine, or "".
 
     Notes
     -----
@@ -334,7 +360,7 @@ def _answers(output: RealArray, cause: RealArray) -> bool:
 
 
 def _correlates(output: RealArray, cause: RealArray) -> bool:
-    """Whether what is new in an output (T,) is correlated with what was new in a cause (T,), at any lag.
+    """Whether what is new in an output (T,) is correlated with what was new in a cause (T,), at any lag >= 0.
 
     Notes
     -----
@@ -367,7 +393,10 @@ def _sums_of_products(later: RealArray, earlier: RealArray) -> RealArray:
 
 
 def _innovations(signal: RealArray) -> RealArray:
-    """What an autoregression does not predict of a signal (T,), (T - _OWN_PAST,)."""
+    """What an autoregression of 20 lags does not predict of a signal (T,), (T - 20,), in its own size.
+
+    The coefficients come from the first 20 000 rows, by least squares.
+    """
     centred = _averages(signal, 1, signal.size)
     fitted = centred[: _MOST_AVERAGES + _OWN_PAST]
     past = [fitted[_OWN_PAST - lag : fitted.size - lag] for lag in range(1, _OWN_PAST + 1)]
@@ -486,7 +515,8 @@ def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
 
 
 def saturated(records: Sequence[Record]) -> list[Finding]:
-    """A finding on every record of a loop whose input mostly stands at its two ends."""
+    """Findings SATURATED, on every record of a loop (with a reference) whose input mostly stands at its
+    ends."""
     findings = []
     for record in records:
         command = record.input[:, 0]
@@ -512,7 +542,7 @@ def saturated(records: Sequence[Record]) -> list[Finding]:
 
 
 def few_readings(records: Sequence[Record]) -> list[Finding]:
-    """A finding on every record whose output takes fewer than ten values."""
+    """Findings FEW_READINGS, on every record whose output takes fewer than ten values."""
     findings = []
     for record in records:
         count = np.unique(record.output[:, 0]).size
@@ -526,7 +556,10 @@ def few_readings(records: Sequence[Record]) -> list[Finding]:
 
 
 def clipped(records: Sequence[Record]) -> list[Finding]:
-    """A finding on every input or output that stands suspiciously often at an end of its range."""
+    """Findings CLIPPED, on every input or output that stands suspiciously often at an end of its range.
+
+    Of each record the first input and the first output; `share`: of its samples (`clipped_share`).
+    """
     findings = []
     for record in records:
         # An input at the amplifier's known limit is no doubt, nor are means of a binary one.
@@ -551,8 +584,19 @@ FEW_LINES = EarlyCheck("the command of a loop excites a band", few_lines)
 
 
 def early_checks(order: int = 0, *, loop: bool = False) -> list[EarlyCheck]:
-    """The checks of one channel, in the order in which they speak; order: of the model, where it is stated;
-    loop: the logs were made in one that is to be opened."""
+    """The checks of one channel, in the order in which they speak.
+
+    Parameters
+    ----------
+    order : int
+        Of the model, where it is stated; else 0.
+    loop : bool
+        The logs were made in a closed loop that is to be opened: their command has to excite a band.
+
+    Returns
+    -------
+    list of EarlyCheck
+    """
     checks = [
         EarlyCheck("more samples than a residual test needs", partial(too_few_samples, order=order)),
         STILL_INPUT,

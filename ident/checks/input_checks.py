@@ -32,12 +32,13 @@ from ident.fit.refinement import pole_system
 # input is there at a frequency, whatever the noise. Chosen; doubled or halved, no test of the advice moves.
 PRESENT_DENSITY = 1e-2
 # Power of the response over that of the noise, averaged over a third of a frequency: an input is there, too,
-# where this is reached. The response is then known to 1 / sqrt(10), about 30 %.
+# where this is reached. The response is then known to 1 / sqrt(10), about 30 %. Doubled or halved, no test of
+# the advice moves.
 TOLD_POWER_RATIO = 10.0
 # That average is taken over a band as wide as its frequency divided by this number.
 TOLD_BAND_PARTS = 3
 # Share of the largest density (-60 dB) below which power may be leakage: the side lobes of a Hann window are
-# lower from its seventh line on.
+# lower from its seventh line on. Ten times as much takes the weak input of a good sensor for none.
 LEAKAGE = 1e-6
 # Share of the Nyquist frequency: an input that ends below it is called weak. Above it a sampled model has few
 # samples a period anyway, and hardly any machine is driven there. Chosen.
@@ -73,16 +74,19 @@ NO_SIZE = 1e-30
 # Share of the largest eigenvalue below which a scaled normal matrix is singular: rounding of products.
 SINGULAR = 1e-12
 
-# Share of a residual's power that a straight line has to have to be called a drift. Chosen.
+# Share of a residual's power that a straight line has to have to be called a drift. Chosen; doubled or
+# halved, no test of the advice moves.
 DRIFT_SHARE = 0.2
 # Probability that noise has so much of a line: one false alarm in 100 000 records.
 DRIFT_BY_CHANCE = 1e-5
 # Samples of a residual in which a drift is looked for: of fewer the colour is not known.
 SHORTEST_DRIFT = 50
-# A straight line serves as well as a slow pole if it leaves at most this factor more. Chosen.
+# A straight line serves as well as a slow pole if it leaves at most this factor more. Chosen; at 1.1 or 1.025
+# no test of the advice moves.
 AS_WELL = 1.05
 # Mean of an input over its deviation: from here on an operating point is called far from zero, as its
-# constant response is a hundred times the power of what is fitted. Chosen.
+# constant response is a hundred times the power of what is fitted. Chosen; doubled or halved, no test of the
+# advice moves.
 LARGE_OFFSET = 10.0
 # Samples for each unknown below which the choice of the poles is itself uncertain. A rule of thumb.
 SAMPLES_PER_UNKNOWN = 10
@@ -92,10 +96,13 @@ SAMPLES_PER_UNKNOWN = 10
 SAME_INPUT = 1e-12
 # Share of the mean power that a combination of inputs, each of unit power in a band, has if they are alike
 # there. Independent inputs have ten times as much by chance where `FEWEST_LINES` lines an input count.
+# Doubled or halved, no test of such bands moves.
 ALIKE_POWER = 1e-2
 # Share of the largest part in the dependent combinations from which on an input counts as one of the alike.
 ALIKE_PART = 0.05
-# Cells an octave into which frequencies are sorted: bands are told to a twelfth of an octave.
+# Cells an octave into which frequencies are sorted: bands are told to a twelfth of an octave. Doubled, the
+# band of `FEWEST_CELLS` is so narrow that independent inputs are called alike; halved, a dependent band is
+# missed.
 CELLS_PER_OCTAVE = 12
 # Cells that a band of alike inputs has at least, a third of an octave: poles bridge a smaller one.
 FEWEST_CELLS = 4

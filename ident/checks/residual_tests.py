@@ -27,14 +27,16 @@ from ident.data.finding import TEST_LEVEL, WHITE_LAGS, Finding, FindingKind, fin
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
 
-# Frequencies at which feedback is looked for: ten in each of the bands below. Chosen.
+# Frequencies at which feedback is looked for: ten a band below in the mean. Chosen; at 30 or 120 no test of
+# feedback moves.
 RESOLVED_FREQUENCIES = 60
 # Lines to each side that are averaged for one frequency at least: eleven lines scatter by a third.
 FEWEST_LINES_BESIDE = 5
 # Bands over which feedback is averaged, equally wide on a logarithmic axis from the first line to Nyquist.
+# Chosen; at 3 or 12 no test of feedback moves.
 FEEDBACK_BANDS = 6
 # Standard deviations of chance that are taken off in each band: with six bands one in a hundred logs without
-# feedback goes beyond (6 x 0.13 %).
+# feedback goes beyond (6 x 0.13 %). Halved, feedback is seen on a record that was opened in two stages.
 SURE_DEVIATIONS = 3.0
 # Keeps the logarithm of 1 - p finite where no lag is correlated at all (p = 1): rounding of doubles.
 BELOW_ONE = 1 - 1e-16

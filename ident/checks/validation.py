@@ -26,7 +26,8 @@ from ident.data.arrays import BoolArray, RealArray, lock, real_rows
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
-# Windows into which a log of an arm that drifts is cut at most. Chosen.
+# Windows into which a log of an arm that drifts is cut at most. Chosen: with 8 the drift of an arm within a
+# window is too large in its test, with 32 nothing moves.
 MOST_WINDOWS = 16
 # Samples of a window for each unknown of its start (poles and a constant) at least: the start then takes up a
 # twentieth of the noise.
