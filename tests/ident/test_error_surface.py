@@ -55,7 +55,7 @@ def test_frozen_poles_stay():
 
 def test_what_cannot_be_drawn_is_refused():
     record = resonant_record()
-    with pytest.raises(ValueError, match="there is no pair 1"):
+    with pytest.raises(ValueError, match="pair 1"):
         error_surface([record], TRUE, Structure(), pair=1)
-    with pytest.raises(ValueError, match="leaves the region"):
+    with pytest.raises(ValueError, match="zeta"):
         error_surface([record], TRUE, Structure(), second=np.array([1.2]))
