@@ -49,7 +49,8 @@ SLOW_STARTS = {
     2: ((0.1, 1.0), (0.3, 5.0), (1.0, 20.0), (10.0, 30.0)),
     3: ((0.1, 0.5, 2.0), (0.3, 2.0, 10.0), (2.0, 10.0, 30.0)),
 }
-# Two freed integrators may also have become a slow oscillation: its turns over the longest record.
+# Two freed integrators may also have become a slow oscillation: its turns over the longest record. Chosen
+# around one turn.
 SLOW_TURNS = (0.3, 1.0, 3.0)
 # Decay of such a pair as a share of its angle: a damping ratio of 0.29, in the middle of what a search
 # allows.

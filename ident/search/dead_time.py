@@ -49,7 +49,8 @@ LONGEST_PART = 2
 NEAR_STEPS = (-1, 1)
 # ... and where it is selected again from the start, as the poles may stand for a wrong number of samples.
 ANEW_STEPS = (-3, -2, -1, 0, 1, 2, 3)
-# Selections of the order behind one number of samples after the other, at most.
+# Selections of the order behind one number of samples after the other, at most. A bound on time: they end
+# where the number stays.
 MOST_ROUNDS = 6
 # Gain of the criterion (-2 log of a Bayes factor) from which a delay is kept: strong evidence (Kass and
 # Raftery, JASA 90(430), 1995). Below, a fast pole is likelier.

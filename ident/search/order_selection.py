@@ -42,7 +42,7 @@ MOST_ROUNDS = 3
 SAMPLES_PER_NUMBER = 2
 # Share of J that is left to gain when a descent ends that only asks which pole can be spared.
 SPARING = 1e-4
-# Exchanges of a pole for another at most.
+# Exchanges of a pole for another at most. A bound on time: they end where one gains nothing.
 MOST_EXCHANGES = 4
 # Damping ratio above which a pair does what real poles do: its step overshoots by less than 0.2 %.
 NO_OVERSHOOT = 0.9

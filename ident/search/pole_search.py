@@ -45,7 +45,7 @@ GAIN = 1e-6
 ROUGH = 1e-3
 # Share of J that is left to gain when a descent ends whose poles are used.
 FINE = 1e-9
-# Rescans of every block at most.
+# Rescans of every block at most. A bound on time: the rescan ends where a whole round gains nothing.
 MOST_ROUNDS = 6
 # Points of a rescan of real poles, and of a pair, from which a descent starts.
 STARTS_OF_REAL = 2
