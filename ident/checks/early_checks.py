@@ -232,13 +232,13 @@ def copied_column(records: Sequence[Record]) -> str:
     """The complaint that the output is the input or a reference again, times a number, row by row; or ""."""
     for record in records:
         output = record.output[:, 0]
-        others = [("input", record.input[:, 0], record.input_names[0])]
+        other_columns = [("input", record.input[:, 0], record.input_names[0])]
         if record.reference is not None:
-            others += [
+            other_columns += [
                 ("reference", signal, name)
                 for signal, name in zip(record.reference.T, record.reference_names, strict=True)
             ]
-        for role, signal, name in others:
+        for role, signal, name in other_columns:
             if _is_copy(output, signal):
                 return (
                     f"{record.label}: output column '{record.output_names[0]}' is the {role} column '{name}' "

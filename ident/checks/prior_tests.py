@@ -123,17 +123,17 @@ def judged(
 
 
 def fixed_poles_test(
-    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], with_prior: Fitted
 ) -> PriorTest:
     """Verdict on poles fixed by the user, against as many free ones.
 
     Parameters
     ----------
     records : sequence of Record
-        All records of the fit; not used, as the alternative is fitted on the rows of `given`.
+        All records of the fit; not used, as the alternative is fitted on the rows of `with_prior`.
     searched : (records, Structure)
         The part of the records that is searched (`thinned`), and its structure.
-    given : Fitted
+    with_prior : Fitted
         The fit with the fixed poles, on all records.
 
     Returns
@@ -147,13 +147,13 @@ def fixed_poles_test(
     and pairs, and, with two real poles or more, by a search with pairs in their place: no number of real
     poles makes a mode.
     """
-    n_integrators = given.data.structure.integrators
-    fixed = given.search.fixed
-    poles = given.poles
+    n_integrators = with_prior.data.structure.integrators
+    fixed = with_prior.search.fixed
+    poles = with_prior.poles
     n_real = poles.real.size - n_integrators
     n_pairs = poles.pairs.size
     as_many_free = {"fixed_poles": (), "n_real": n_real, "n_pairs": n_pairs}
-    options = given.search.options.model_copy(update=as_many_free)
+    options = with_prior.search.options.model_copy(update=as_many_free)
 
     small = PoleSearch(prepare(*searched), options)
     ends = [small.descend(poles, "fixed poles freed", ROUGH)]
@@ -163,7 +163,7 @@ def fixed_poles_test(
         turned = options.model_copy(update={"n_real": n_real % 2, "n_pairs": pairs_instead})
         ends.append(OrderSelection(PoleSearch(small.data, turned)).run())
     best = min(ends, key=lambda end: end.rss)
-    search = PoleSearch(given.data, options)
+    search = PoleSearch(with_prior.data, options)
     freed = Fitted(search, search.descend(best.poles, "fixed poles freed"))
 
     real_words = [f"{pole:.6g}" for pole in np.sort(freed.poles.real[n_integrators:])]
@@ -171,20 +171,20 @@ def fixed_poles_test(
     return judged(
         FindingKind.FIXED_POLES,
         "fixed_poles",
-        statistic(given.end.rss, freed),
+        statistic(with_prior.end.rss, freed),
         fixed.real.size - n_integrators + 2 * fixed.pairs.size,
         free_poles=", ".join(real_words + pair_words),
     )
 
 
-def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -> PriorTest:
+def delay_test(records: Sequence[Record], with_prior: Fitted, relative_degree: int) -> PriorTest:
     """Verdict on the input delay, against one sample less and one more.
 
     Parameters
     ----------
     records : sequence of Record
         All records of the fit.
-    given : Fitted
+    with_prior : Fitted
         The fit with the stated delay.
     relative_degree : int
         That the model keeps; below 2 it asks nothing of the poles.
@@ -200,23 +200,23 @@ def delay_test(records: Sequence[Record], given: Fitted, relative_degree: int) -
     mostly negative (shown as 0), so one degree of freedom is on the safe side.
     """
     if relative_degree > 1:
-        given = replace(given, end=best_under_relative_degree(given, relative_degree))
-    structure = given.data.structure
+        with_prior = replace(with_prior, end=best_under_relative_degree(with_prior, relative_degree))
+    structure = with_prior.data.structure
     delay = structure.input_delay_samples
-    residual = _residual_under(given, relative_degree)
-    least_power = EXPLAINED * float(given.data.y @ given.data.y)
+    residual = _residual_under(with_prior, relative_degree)
+    least_power = EXPLAINED * float(with_prior.data.y @ with_prior.data.y)
 
     largest = 0.0
     other_delay = delay + 1
     trials = [1] if delay == 0 else [delay - 1, delay + 1]
     for trial in trials:
-        shifted = given.refitted(records, given.poles, input_delay_samples=trial)
+        shifted = with_prior.refitted(records, with_prior.poles, input_delay_samples=trial)
         if relative_degree > 1:
             shifted = replace(shifted, end=best_under_relative_degree(shifted, relative_degree))
         shifted_residual = _residual_under(shifted, relative_degree)
         # A record has no rows before its delay: the later one of both starts the common rows.
         common_delay = max(delay, trial)
-        power = _power_from(residual, given.data, common_delay - delay)
+        power = _power_from(residual, with_prior.data, common_delay - delay)
         shifted_power = _power_from(shifted_residual, shifted.data, common_delay - trial)
         worth = shifted.data.colour(shifted_residual).effective_samples
         value = 0.0
@@ -246,13 +246,13 @@ def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
     return float(sum(part @ part for part in parts))
 
 
-def direct_term_test(records: Sequence[Record], given: Fitted) -> PriorTest:
+def direct_term_test(records: Sequence[Record], with_prior: Fitted) -> PriorTest:
     """Verdict on relative degree 1 (no direct term), against a model with a direct term.
 
-    records: all records of the fit `given`, which has none. One degree of freedom.
+    records: all records of the fit `with_prior`, which has none. One degree of freedom.
     """
-    free = given.refitted(records, given.poles, feedthrough=True)
-    return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(given.end.rss, free), 1)
+    free = with_prior.refitted(records, with_prior.poles, feedthrough=True)
+    return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(with_prior.end.rss, free), 1)
 
 
 def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest, Refined]:
@@ -346,7 +346,7 @@ def _distance(first: Poles, second: Poles) -> float:
 
 
 def integrators_test(
-    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], with_prior: Fitted
 ) -> tuple[PriorTest, Fitted]:
     """Verdict on integrators, against as many free slow poles; and the fit with these.
 
@@ -357,7 +357,7 @@ def integrators_test(
     searched : (records, Structure)
         The part of them that is searched (`thinned`), and its structure; the alternative is searched anew
         there.
-    given : Fitted
+    with_prior : Fitted
         The fit with k integrators.
 
     Returns
@@ -372,20 +372,20 @@ def integrators_test(
     An integrator that a zero of the model cancels is refused as well: one integrator and zero less are as
     good, while no other pole can be spared; it has to gain 2 ln Ne as any pole.
     """
-    n_integrators = given.data.structure.integrators
-    free = _without_integrators(records, searched, given)
+    n_integrators = with_prior.data.structure.integrators
+    free = _without_integrators(records, searched, with_prior)
     accepted = 0
     for fewer in range(n_integrators - 1, 0, -1):
         if _fewer_integrators_value(records, free, fewer) <= limit(fewer):
             accepted = fewer
             break
     prior = f"integrators = {n_integrators}"
-    value = statistic(given.end.rss, free)
+    value = statistic(with_prior.end.rss, free)
     test = judged(FindingKind.INTEGRATORS, prior, value, n_integrators, accepted=accepted)
     if test.refused:
         return test, free
 
-    spare = _spare_integrators(records, given)
+    spare = _spare_integrators(records, with_prior)
     if spare is None:
         return test, free
     test = PriorTest(
@@ -402,22 +402,22 @@ def integrators_test(
 
 
 def _without_integrators(
-    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], given: Fitted
+    records: Sequence[Record], searched: tuple[Sequence[Record], Structure], with_prior: Fitted
 ) -> Fitted:
-    """Best fit of all records with free poles in place of the integrators of `given`.
+    """Best fit of all records with free poles in place of the integrators of `with_prior`.
 
-    Starts are compared on the part that is searched: the other poles of `given` with slow real poles, or a
-    slow pair, in place of the integrators; and a search anew. The best goes on with all samples.
+    Starts are compared on the part that is searched: the other poles of `with_prior` with slow real poles, or
+    a slow pair, in place of the integrators; and a search anew. The best goes on with all samples.
     """
-    n_integrators = given.data.structure.integrators
-    fixed = given.search.fixed
+    n_integrators = with_prior.data.structure.integrators
+    fixed = with_prior.search.fixed
     # The integrators stand first among the real poles, the fixed ones.
-    other_poles = Poles(given.poles.real[n_integrators:], given.poles.pairs)
-    options = given.search.options.model_copy(
+    other_poles = Poles(with_prior.poles.real[n_integrators:], with_prior.poles.pairs)
+    options = with_prior.search.options.model_copy(
         update={
             "integrators": 0,
-            "n_real": given.poles.real.size - fixed.real.size + n_integrators,
-            "n_pairs": given.poles.pairs.size - fixed.pairs.size,
+            "n_real": with_prior.poles.real.size - fixed.real.size + n_integrators,
+            "n_pairs": with_prior.poles.pairs.size - fixed.pairs.size,
             "decay_min_per_s": None,
         }
     )
@@ -442,7 +442,7 @@ def _without_integrators(
     ends.append(OrderSelection(small).run())
     best = min(ends, key=lambda end: end.rss)
 
-    search = PoleSearch(prepared(records, given.data.structure), options)
+    search = PoleSearch(prepared(records, with_prior.data.structure), options)
     search.evaluations = small.evaluations
     return Fitted(search, search.descend(best.poles, "integrators freed"))
 
@@ -471,21 +471,21 @@ class SpareIntegrators(NamedTuple):
     price: float
 
 
-def _spare_integrators(records: Sequence[Record], given: Fitted) -> SpareIntegrators | None:
-    """How few integrators are enough beside the same other poles of `given`; None where all are needed.
+def _spare_integrators(records: Sequence[Record], with_prior: Fitted) -> SpareIntegrators | None:
+    """How few integrators are enough beside the same other poles of `with_prior`; None where all are needed.
 
     Each integrator has to gain 2 ln Ne. None also where a searched pole, or a pair at twice the price, can be
     spared as well: that one can take the place of an integrator.
     """
-    n_integrators = given.data.structure.integrators
-    price_of_one = 2 * float(np.log(given.worth()))
-    other_poles = Poles(given.poles.real[n_integrators:], given.poles.pairs)
+    n_integrators = with_prior.data.structure.integrators
+    price_of_one = 2 * float(np.log(with_prior.worth()))
+    other_poles = Poles(with_prior.poles.real[n_integrators:], with_prior.poles.pairs)
     spare: SpareIntegrators | None = None
     for fewer in range(n_integrators - 1, -1, -1):
         if other_poles.order + fewer == 0:
             break
         start = Poles(np.concatenate([np.zeros(fewer), other_poles.real]), other_poles.pairs)
-        value = statistic(given.refitted(records, start, integrators=fewer).end.rss, given)
+        value = statistic(with_prior.refitted(records, start, integrators=fewer).end.rss, with_prior)
         price = (n_integrators - fewer) * price_of_one
         if value > price:
             break
@@ -493,12 +493,12 @@ def _spare_integrators(records: Sequence[Record], given: Fitted) -> SpareIntegra
     if spare is None:
         return None
 
-    poles = given.poles
-    fixed = given.search.fixed
+    poles = with_prior.poles
+    fixed = with_prior.search.fixed
     reduced = [(poles.without_real(i), price_of_one) for i in range(fixed.real.size, poles.real.size)]
     reduced += [(poles.without_pair(i), 2 * price_of_one) for i in range(fixed.pairs.size, poles.pairs.size)]
     for start, price in reduced:
-        if statistic(given.search.descend(start, "one less").rss, given) <= price:
+        if statistic(with_prior.search.descend(start, "one less").rss, with_prior) <= price:
             return None
     return spare
 
