@@ -100,11 +100,12 @@ SAME_INPUT = 1e-12
 ALIKE_POWER = 1e-2
 # Share of the largest part in the dependent combinations from which on an input counts as one of the alike.
 ALIKE_PART = 0.05
-# Cells an octave into which frequencies are sorted: bands are told to a twelfth of an octave. Doubled, the
-# band of `FEWEST_CELLS` is so narrow that independent inputs are called alike; halved, a dependent band is
-# missed.
+# Cells an octave into which frequencies are sorted: bands are told to a twelfth of an octave. Doubled,
+# independent inputs are called alike in their tests, likely as a window closes with fewer lines to spare;
+# halved, a dependent band is missed.
 CELLS_PER_OCTAVE = 12
-# Cells that a band of alike inputs has at least, a third of an octave: poles bridge a smaller one.
+# Cells that a band of alike inputs has at least, a third of an octave: poles bridge a smaller one. Doubled or
+# halved, no test of such bands moves.
 FEWEST_CELLS = 4
 # Rounding of logarithms: a line exactly on the edge of a cell belongs to the upper one.
 CELL_ROUNDING = 1e-9
