@@ -12,14 +12,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import lfilter
 
+from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
+from ident.basis.noise_model import NoiseModel
 from ident.basis.options import IdentOptions
 from ident.checks.early_checks import clipped
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.checks.residual_tests import whiteness_test
 from ident.checks.validation import fit_on_fresh_data
-from ident.data.arrays import RealArray
 from ident.data.finding import FindingKind, finding
 from ident.data.nonparametric import over_lines
 from ident.data.record import Record
@@ -41,39 +41,37 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     white floor lies below the lowest mode found behind a noise model; else the fit behind that model."""
     plain = identify(records, options, 0.0, 0.5)
     options = options.model_copy(update={"input_delay_samples": plain.model.input_delay_samples})
-    noise_filter = long_arx_filter(records, options)
-    if noise_filter.size == 1 or plain.rss == 0 or whiteness_test(plain.residuals).passed:
+    noise = long_arx_filter(records, options)
+    if noise.is_white or plain.rss == 0 or whiteness_test(plain.residuals).passed:
         return plain
     # Without its first rows a record starts in motion.
     inside = options.model_copy(update={"estimate_initial_state": True})
-    behind = identify([prewhitened(record, noise_filter) for record in records], inside, 0.5, 1.0)
+    behind = identify([prewhitened(record, noise) for record in records], inside, 0.5, 1.0)
     modes = behind.model.poles.pairs[behind.model.poles.zeta() <= LARGEST_DAMPING]
     lowest_Hz = np.min(np.abs(np.log(modes)), initial=np.inf) / (2 * np.pi * behind.model.dt_s)
     if not _half_power_Hz(plain) < lowest_Hz < np.inf:
         return plain
     sought = tuple(said for said in plain.verdicts if said.kind is FindingKind.DEAD_TIME)
-    return _on_records(records, replace(behind, verdicts=(*sought, *behind.verdicts)), noise_filter)
+    return _on_records(records, replace(behind, verdicts=(*sought, *behind.verdicts)), noise)
 
 
-def prewhitened(record: Record, noise_filter: RealArray) -> Record:
-    """Input and output through A(q), without the first rows, whose predecessors were not recorded."""
-    if noise_filter.size == 1:
+def prewhitened(record: Record, noise: NoiseModel) -> Record:
+    """Input and output through the filter that whitens the noise, without the first rows, which have no
+    recorded past."""
+    if noise.is_white:
         return record
-    input_, output = (
-        lfilter(noise_filter, np.ones(1), signal, axis=0)[noise_filter.size - 1 :]
-        for signal in (record.input, record.output)
-    )
+    input_, output = (noise.without_start(signal) for signal in (record.input, record.output))
     return replace(record, input=input_, output=output, reference=None, reference_names=())
 
 
-def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArray:
-    """A(q) of A y = B u + c + white by least squares, its order by BIC; [1.0] where the records are too
+def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> AutoregressiveNoise:
+    """A(q) of A y = B u + c + white by least squares, its order by BIC; white where the records are too
     short for the shortest."""
     part, _ = thinned(records, options.search_samples)
     delay = options.input_delay_samples
     most = min(record.n_samples for record in part) // _ROWS_PER_ORDER - delay
     orders = [order for order in _ARX_ORDERS if order <= most]
-    best, least = np.ones(1), np.inf
+    best, least = WHITE_NOISE, np.inf
     if not orders:
         return best
     longest = orders[-1]
@@ -100,11 +98,13 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> RealArr
         variance = max(float(error @ error) / n, np.finfo(np.float64).tiny)
         criterion = float(n * np.log(variance) + kept.size * np.log(n))
         if criterion < least:
-            best, least = np.concatenate([[1.0], theta[:order]]), criterion
+            best, least = AutoregressiveNoise(np.concatenate([[1.0], theta[:order]])), criterion
     return best
 
 
-def _on_records(records: Sequence[Record], behind: Identification, noise_filter: RealArray) -> Identification:
+def _on_records(
+    records: Sequence[Record], behind: Identification, noise: AutoregressiveNoise
+) -> Identification:
     """The model found behind the filter with its residuals on the records as they are."""
     fits = [fit_on_fresh_data(behind.model, record) for record in records]
     residuals = tuple(fit.residual for fit in fits)
@@ -117,20 +117,20 @@ def _on_records(records: Sequence[Record], behind: Identification, noise_filter:
         fit_percent=np.array([fit.fit_percent for fit in fits]),
         rss=rss,
         noise_std=float(np.sqrt(rss / max(n_samples - unknowns, 1))),
-        noise_filter=noise_filter,
+        noise_filter=noise.a_polynomial,
         # The filter hides where a signal was cut off.
         advise=lambda: [*clipped(records), *behind.advise()],
     )
     # Variance of the residuals behind an autoregressive model of their own.
     order = min(_RESIDUAL_ORDER, (min(part.size for part in result.residuals) - 1) // 4)
-    whitening = fit_autoregression(result.residuals, order)
-    errors = [lfilter(whitening, np.ones(1), part)[whitening.size - 1 :] for part in result.residuals]
+    own = fit_autoregression(result.residuals, order)
+    errors = [own.without_start(part) for part in result.residuals]
     share = float(np.mean(np.concatenate(errors) ** 2)) / (rss / n_samples)
     said = finding(
         FindingKind.COLOURED_NOISE,
         half_power_Hz=_half_power_Hz(result),
         unpredictable_share=share,
-        order=noise_filter.size - 1,
+        order=noise.order,
     )
     return replace(result, verdicts=(*behind.verdicts, said))
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ident.basis.autoregressive_noise import AutoregressiveNoise
 from ident.basis.mimo_model import MimoModel
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
@@ -97,6 +98,11 @@ class FittedRecords(Shown):
                 "rss, noise_std and tangent_optimality must not be negative; got "
                 f"{self.rss}, {self.noise_std}, {self.tangent_optimality}"
             )
+
+    @property
+    def noise(self) -> AutoregressiveNoise:
+        """Model of the noise behind which everything was fitted, of `noise_filter`."""
+        return AutoregressiveNoise(self.noise_filter)
 
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:

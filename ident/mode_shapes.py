@@ -32,6 +32,7 @@ from scipy.signal import lfilter
 from scipy.special import expit, logit
 
 from ident.basis.mimo_model import residue_columns
+from ident.basis.noise_model import NoiseModel
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import ComplexArray, RealArray
 from ident.fit.least_squares import project
@@ -499,14 +500,13 @@ class ModalFit:
             q = np.linalg.qr(linear_rows.T)[0]
             rows -= (rows @ q) @ q.T
 
-    def covariance_factor(self, noise: Sequence[RealArray] = ()) -> RealArray:
+    def covariance_factor(self, noise: Sequence[NoiseModel] = ()) -> RealArray:
         """Factor S of the covariance S S^T of all free numbers, to first order.
 
         Parameters
         ----------
-        noise : sequence of ndarray, optional
-            Of every output 1, a_1 .. a_p, the weights by lag of A(q): A(q) e is white, where e is the noise
-            of power 1. Default: white noise.
+        noise : sequence of NoiseModel, optional
+            Of every output, brought to power 1. Default: white noise.
 
         Returns
         -------
@@ -530,17 +530,17 @@ class ModalFit:
             linear_factor = _inverse_factor(linear)
             corner = np.zeros((len(factor), linear_factor.shape[1]))
             factor = np.block([[factor, corner], [mixed @ factor, linear_factor]])
-        if all(weights.size == 1 for weights in noise):
+        if all(model.is_white for model in noise):
             return factor
 
         # Triangle T with T^T T = J^T R J, J with the linear columns, from spectra of the columns. Records are
         # padded to twice their length, so that nothing wraps round.
         columns = np.concatenate([-slopes, linear], axis=1).reshape(*self.y.shape, -1)
         triangle: RealArray = np.zeros((0, columns.shape[2]))
-        for output_columns, weights in zip(columns, noise, strict=True):
+        for output_columns, model in zip(columns, noise, strict=True):
             for record_rows in self.segments:
                 size = next_fast_len(2 * (record_rows.stop - record_rows.start), real=True)
-                noise_power = np.maximum(1 / np.abs(np.fft.rfft(weights, size)) ** 2, 1.0)
+                noise_power = np.maximum(model.relative_spectrum(size), 1.0)
                 # Half of the lines are computed, and stand for both halves.
                 line_weight = noise_power * 2 / size
                 spectra = np.fft.rfft(output_columns[record_rows], size, axis=0)

@@ -104,7 +104,7 @@ def stabilisation(
     and structure are those of the model, at its number of pairs the poles, too. Long records are thinned.
     """
     options = options or IdentOptions()
-    records = [prewhitened(record, found.noise_filter) for record in records]
+    records = [prewhitened(record, found.noise) for record in records]
     part, in_mid_record = thinned(records, min(options.search_samples, _MOST_SAMPLES))
     structure = replace(found.structure, estimate_initial_state=True) if in_mid_record else found.structure
     data = prepare(part, structure)

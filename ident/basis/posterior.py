@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import lfilter
 
+from ident.basis.autoregressive_noise import AutoregressiveNoise
 from ident.basis.functions import all_pass_response, basis_response, log_all_pass_slopes, regressor
 from ident.basis.model import refuse_unstable
 from ident.basis.poles import NO_POLES, Poles
@@ -43,6 +44,11 @@ class EmbeddingReport:
     probability_missed_mode: float = 0.0
     missed_mode_rad_s: float = 0.0
     n_added_modes: int = 0
+
+    @property
+    def noise(self) -> AutoregressiveNoise:
+        """Noise model behind the posterior, of `ar_coefficients`; white where there are none."""
+        return AutoregressiveNoise(np.array([1.0, *self.ar_coefficients]))
 
 
 # Checks at other levels, and stages after one another, ask for the same frequencies again.

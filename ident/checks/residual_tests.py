@@ -17,9 +17,10 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
-from scipy.signal import correlate, lfilter
+from scipy.signal import correlate
 from scipy.stats import chi2, norm
 
+from ident.basis.autoregressive_noise import WHITE_NOISE
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray, lock
@@ -415,15 +416,14 @@ def residual_tests(
     """
     # Prediction errors of an observer are white as they are.
     in_loop = friction is not None and friction.observed
-    colour = () if posterior.report is None or in_loop else posterior.report.ar_coefficients
-    filter_of_noise = np.array([1.0, *colour])
+    noise = WHITE_NOISE if posterior.report is None or in_loop else posterior.report.noise
     residuals = []
     for record in records:
         if friction is None:
             residuals.append(fit_on_fresh_data(posterior, record).residual)
         else:
             residuals.append(friction.residual(record))
-    whitened = [lfilter(filter_of_noise, np.ones(1), residual)[len(colour) :] for residual in residuals]
+    whitened = [noise.without_start(residual) for residual in residuals]
     delay = posterior.input_delay_samples
     inputs = [record.input[: record.n_samples - delay, 0] for record in records]
     return whiteness_test(whitened), independence_test(inputs, residuals)

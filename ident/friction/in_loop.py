@@ -563,7 +563,7 @@ def identify_behind(
         fit_percent=np.array([fit.fit_percent for fit in fits]),
         rss=rss,
         noise_std=float(np.sqrt(rss / sum(residual.size for residual in residuals))),
-        noise_filter=fit_autoregression(residuals, NOISE_ORDERS[-1]),
+        noise_filter=fit_autoregression(residuals, NOISE_ORDERS[-1]).a_polynomial,
     )
 
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
+from ident.basis.autoregressive_noise import WHITE_NOISE
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
@@ -145,14 +145,8 @@ def _behind_observed(
             break
         real[slow] **= np.exp(np.where(outside, np.clip(log, -1, 1), 0.0))
         poles = Poles(real, stable.pairs).appended(model.unstable)
-    whitening = np.array([1.0, *(response.report.ar_coefficients if response.report else ())])
-    wider = np.sqrt(
-        heterogeneity(
-            found,
-            records,
-            lambda signal: np.asarray(lfilter(whitening, [1.0], signal, axis=0)[whitening.size - 1 :]),
-        )
-    )
+    noise = response.report.noise if response.report else WHITE_NOISE
+    wider = np.sqrt(heterogeneity(found, records, noise.without_start))
     by_force = _by_linear_force(found, records, less, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     response, straight, onto = of_force(

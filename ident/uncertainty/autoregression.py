@@ -11,21 +11,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import cholesky, hankel, solve_triangular, toeplitz
-from scipy.signal import lfilter
+from scipy.linalg import toeplitz
 
+from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
+from ident.basis.noise_model import NoiseModel, reflected_inside
 from ident.data.arrays import RealArray
 
 # Largest relative change of A(q) by a correction: |1 + x|^2 >= 1/2, the spectrum is nowhere doubled.
 _LARGEST_MOVE = 1.0 - 1.0 / np.sqrt(2.0)
-# First rows are whitened up to this condition of their covariance: no start of a record is quite stationary.
-_LARGEST_CONDITION = 1e4
 _FREQUENCIES = np.concatenate([np.geomspace(1e-4, 1e-2, 128), np.linspace(0.0, np.pi, 2048)])
 
 
-def absorbed_gradient(
-    absorbed: Sequence[RealArray], whitening: RealArray, order: int, start: int
-) -> RealArray:
+def absorbed_gradient(absorbed: Sequence[RealArray], noise: NoiseModel, order: int, start: int) -> RealArray:
     """-E sum over t >= start of (A e)_t e_(t-i), i = 1 .. order, over records longer than 2 start, whose fit
     has `absorbed` the columns Z (T,r) for innovations of unit variance. Where it leaves the first rows out, Z
     is what the noise filter makes of its whitened rows from rest."""
@@ -33,7 +30,7 @@ def absorbed_gradient(
     for z in absorbed:
         if z.shape[0] <= 2 * start:
             continue
-        innovations = lfilter(whitening, np.ones(1), z, axis=0)[start:]
+        innovations = noise.filtered(z)[start:]
         for i in range(1, order + 1):
             sums[i - 1] += float(np.sum(innovations * z[start - i : z.shape[0] - i]))
     return sums
@@ -42,13 +39,13 @@ def absorbed_gradient(
 def fit_autoregression(
     residuals: Sequence[RealArray],
     max_order: int,
-    weights: RealArray | None = None,
+    weights: NoiseModel = WHITE_NOISE,
     absorbed: Sequence[RealArray] | None = None,
-) -> RealArray:
-    """[1, a_1, ..., a_n] of A(q) e = white, order n <= max_order by BIC, from all records together.
+) -> AutoregressiveNoise:
+    """A(q) e = white, order n <= max_order by BIC, from all records together.
 
     Conditional least squares on the rows that have max_order predecessors; roots on or outside the unit
-    circle are reflected inside. With the whitening filter `weights` of the fit behind the residuals, and what
+    circle are reflected inside. With the noise model `weights` of the fit behind the residuals, and what
     it `absorbed`, the sums of (A e)_t e_(t-i) are set to what the fit would have made of them for noise with
     that filter, to first order in its change. A correction that moves the spectrum by more than a factor of
     two is shrunk, and leaves all roots inside (Rouche). Raises ValueError when no record is longer than twice
@@ -72,8 +69,8 @@ def fit_autoregression(
         if cost < best_cost:
             best, best_cost = np.concatenate([[1.0], -coefficients]), cost
             variance = float(error @ error) / (n - order)
-    if weights is None or absorbed is None or best.size == 1 or weights.size == 1:
-        return _stable(best)
+    if absorbed is None or best.size == 1 or weights.is_white:
+        return AutoregressiveNoise(reflected_inside(best))
     order = best.size - 1
     gradient = absorbed_gradient(absorbed, weights, order, max_order)
     # (X^T X)^-1 through the singular values of X: its square may be beyond the reach of double precision.
@@ -82,61 +79,8 @@ def fit_autoregression(
     step = variance * (vt[kept].T / d[kept] ** 2) @ (vt[kept] @ gradient)
     # A(q) - s B(q), b_1 .. b_n = step, with the largest s <= 1 for which s |B / A| <= _LARGEST_MOVE where it
     # matters most: next to the roots, however sharp their peaks.
-    stable = _stable(best)
+    stable = reflected_inside(best)
     delays = np.exp(-1j * np.concatenate([_FREQUENCIES, np.angle(np.roots(stable))]))
     moved = np.polyval(np.concatenate([step[::-1], [0.0]]), delays) / np.polyval(stable[::-1], delays)
     share = min(1.0, _LARGEST_MOVE / max(float(np.abs(moved).max()), _LARGEST_MOVE))
-    return np.asarray(stable - share * np.concatenate([[0.0], step]), dtype=np.float64)
-
-
-def first_rows(whitening: RealArray) -> RealArray:
-    """(n,n) lower triangle that whitens the first n samples of stationary noise with A(q) of order n: the
-    inverse Cholesky factor of their covariance; zeros where that is nearly singular (_LARGEST_CONDITION)."""
-    order = whitening.size - 1
-    if order == 0:
-        return np.zeros((0, 0))
-    covariance = toeplitz(autocovariance(whitening, order - 1))
-    spread = np.linalg.eigvalsh(covariance)
-    if not spread[0] * _LARGEST_CONDITION >= spread[-1]:
-        return np.zeros((order, order))
-    factor = cholesky(covariance, lower=True)
-    return np.asarray(solve_triangular(factor, np.eye(order), lower=True), dtype=np.float64)
-
-
-def whitened(signals: RealArray, whitening: RealArray) -> RealArray:
-    """White unit-variance version of noise with A(q) v = e, along the first axis; (T,) or (T,n).
-
-    Rows that `first_rows` drops are zero.
-    """
-    order = whitening.size - 1
-    if order == 0 or signals.size == 0:
-        return signals
-    out = np.asarray(lfilter(whitening, np.ones(1), signals, axis=0), dtype=np.float64)
-    out[:order] = first_rows(whitening) @ signals[:order]
-    return out
-
-
-def autocovariance(whitening: RealArray, max_lag: int) -> RealArray:
-    """gamma_k, k = 0 .. max_lag, of e with A(q) e white of unit variance; A stable. Yule-Walker equations
-    sum_i a_i gamma_|k - i| = (k == 0) for k = 0 .. n, then the recursion."""
-    order = whitening.size - 1
-    equations = toeplitz(whitening, np.zeros(order + 1))
-    equations[:, 1:] += hankel(whitening)[:, 1:]
-    gamma = np.zeros(max(order, max_lag) + 1)
-    gamma[: order + 1] = np.linalg.solve(equations, np.eye(order + 1)[0])
-    for k in range(order + 1, max_lag + 1):
-        gamma[k] = -whitening[:0:-1] @ gamma[k - order : k]
-    return gamma[: max_lag + 1]
-
-
-def _stable(whitening: RealArray) -> RealArray:
-    """Roots reflected into the unit circle: the same spectrum, an invertible filter."""
-    roots = np.asarray(np.roots(whitening), dtype=np.complex128)
-    outside = np.abs(roots) >= 1
-    if not np.any(outside):
-        return whitening
-    # On the circle itself reflection changes nothing; a root there is pulled in by a millionth.
-    roots[outside] = np.minimum(1.0 / np.abs(roots[outside]), 1 - 1e-6) * np.exp(
-        1j * np.angle(roots[outside])
-    )
-    return np.asarray(np.real(np.poly(roots)), dtype=np.float64)
+    return AutoregressiveNoise(stable - share * np.concatenate([[0.0], step]))

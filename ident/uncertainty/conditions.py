@@ -96,7 +96,7 @@ def _linear_rows(
     """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance."""
     assert posterior.report is not None
     rows = tangent_rows([record], model, options.model_copy(update={"fir_length": posterior.fir_length}))
-    (block,) = replace(rows, whitening=np.array([1.0, *posterior.report.ar_coefficients])).blocks()
+    (block,) = replace(rows, noise=posterior.report.noise).blocks()
     basis, off = np.split(block.regressors, [block.regressors.shape[1] - model.unstable.order], axis=1)
     both = np.column_stack([basis, block.kernel[:], off, block.output])
     nuisance = nuisance_basis(block.nuisance)

@@ -11,8 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ident.basis.autoregressive_noise import WHITE_NOISE
 from ident.basis.functions import all_pass_slopes
 from ident.basis.model import GobfModel
+from ident.basis.noise_model import NoiseModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import EmbeddingReport, ResponsePosterior
@@ -67,18 +69,23 @@ NOISE_ROUNDS = 3
 
 
 def tangent(
-    records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
+    records: Sequence[Record],
+    model: GobfModel,
+    options: EmbeddingOptions | None = None,
+    *,
+    noise: NoiseModel | None = None,
 ) -> ResponsePosterior:
     """Posterior of the response around a model whose poles were chosen from these records.
 
     records: SISO, same sampling time as the model, each with its own initial state and offset; model gives
     poles, integrators and delay. Its poles, twice; then, twice each, modes that an order selection would have
     kept; then pairs of one further mode that has a probability worth counting
-    (`ident.uncertainty.undetected_mode`). Raises ValueError when the records are too short, have another
+    (`ident.uncertainty.undetected_mode`). noise: known beforehand, so that none is fitted, whatever the
+    options. Raises ValueError when the records are too short, have another
     sampling time, or do not excite the poles at all. A mode that is not seen at all stays outside the
     ellipses at its peak.
     """
-    return tangent_beside(records, model, (), options)[0]
+    return tangent_beside(records, model, (), options, noise=noise)[0]
 
 
 def tangent_beside(
@@ -90,6 +97,7 @@ def tangent_beside(
     n_known: int = 0,
     missed_above: float = 0.0,
     classes: Sequence[IntArray] = (),
+    noise: NoiseModel | None = None,
 ) -> tuple[ResponsePosterior, RealArray, RealArray]:
     """The tangent posterior with q columns beside the basis functions, in every record, and their
     coefficients: mean (q,) and factor (q, P') on the same unit normals as the response's covariance_factor.
@@ -97,19 +105,23 @@ def tangent_beside(
     The last n_known coefficients are independent unknowns of zero mean and unit variance, the others free.
     missed_above: least frequency of a mode that may be missing, radians a sample. classes: of the rows (T,)
     of each record, by what errors of the model may depend on; where they differ the covariance is wider
-    (`sandwiched`). Errors as `tangent`.
+    (`sandwiched`). noise: known beforehand, so that none is fitted. Errors as `tangent`.
     """
     options = options or EmbeddingOptions()
     rows, n_off = tangent_rows(records, model, options, beside), model.unstable.order
     rows = replace(rows, n_known=n_known, missed_above=missed_above, classes=tuple(classes))
     # Coloured noise taken for white passes for modes: none are added before it has been whitened.
-    first = options.model_copy(update={"prior_missed_mode": 0.0}) if options.coloured_noise else options
+    fits_noise = options.coloured_noise and noise is None
+    if noise is not None:
+        _refuse_short(records, noise)
+        rows = replace(rows, noise=noise)
+    first = options.model_copy(update={"prior_missed_mode": 0.0}) if fits_noise else options
     whole, reduced, kernel, missed = _solve(rows, first)
-    if options.coloured_noise:
+    if fits_noise:
         for _ in range(NOISE_ROUNDS):
             residuals, absorbed = gls_residuals(whole, reduced, kernel)
-            whitening = fit_autoregression(residuals, options.max_ar_order, whole.whitening, absorbed)
-            whole, reduced, kernel, missed = _solve(replace(whole, whitening=whitening), options)
+            fitted = fit_autoregression(residuals, options.max_ar_order, whole.noise, absorbed)
+            whole, reduced, kernel, missed = _solve(replace(whole, noise=fitted), options)
     poles, without_pairs = whole.poles, (reduced, kernel)
     if missed is not None and missed.poles.size:
         reduced, kernel = (
@@ -135,13 +147,23 @@ def tangent_beside(
         "tangent embedding",
         reduced,
         kernel,
-        ar_coefficients=tuple(float(a) for a in whole.whitening[1:]),
+        ar_coefficients=whole.noise.ar_coefficients,
         probability_missed_mode=missed.probability if missed else 0.0,
         missed_mode_rad_s=missed.most_probable_rad_s(model.dt_s) if missed else 0.0,
         n_added_modes=(whole.poles.order - rows.poles.order) // 4,
     )
     posterior = _posterior(model, poles, rows.structure.feedthrough, rows.fir_length, mean, factor, report)
     return posterior, joint[0][beside_rows], joint[1][beside_rows]
+
+
+def _refuse_short(records: Sequence[Record], noise: NoiseModel) -> None:
+    """Raise ValueError where a record is over before the noise model knows its past."""
+    for record in records:
+        if record.n_samples <= 2 * noise.n_start:
+            raise ValueError(
+                f"{record.label}: {record.n_samples} samples are too few for the noise model, whose first "
+                f"{noise.n_start} rows have no past; expected more than {2 * noise.n_start}"
+            )
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
@@ -249,7 +271,7 @@ def tangent_rows(
         own = [-all_pass_slopes(model.unstable, record.output[:, 0]) for record in records]
         both = zip(beside or [Beside(part[:, :0], part[:, :0]) for part in own], own, strict=True)
         beside = [replace(other, columns=np.hstack([part, other.columns])) for other, part in both]
-    return EmbeddingRows(tuple(records), structure, poles, length, np.ones(1), tuple(beside))
+    return EmbeddingRows(tuple(records), structure, poles, length, WHITE_NOISE, tuple(beside))
 
 
 def _solve(

@@ -7,14 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.signal import lfilter
 
+from ident.basis.autoregressive_noise import WHITE_NOISE
 from ident.basis.functions import all_pass_signal, nuisance_columns, regressor
+from ident.basis.noise_model import NoiseModel
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure, answered, driving_input, level_before, stabilised
 from ident.data.arrays import IntArray, RealArray
 from ident.data.record import Record
-from ident.uncertainty.autoregression import first_rows, whitened
 from ident.uncertainty.embedding_algebra import (
     RANK,
     Delays,
@@ -57,8 +57,8 @@ class Beside:
 class EmbeddingRows:
     """How to make the matrices; made anew for each pass, so that only one record's are in memory.
 
-    poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; whitening: A(q), [1]
-    for white noise. beside: one per record, or none, whose last n_known columns have coefficients known to
+    poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; noise: makes the
+    rows white. beside: one per record, or none, whose last n_known columns have coefficients known to
     one; known_std: of the (whitened) noise, as far as known. missed_above: least frequency of a mode that
     may be missing, radians a sample. classes: of the rows (T,) of each record, by what errors of the model
     may depend on.
@@ -68,7 +68,7 @@ class EmbeddingRows:
     structure: Structure
     poles: Poles
     fir_length: int
-    whitening: RealArray
+    noise: NoiseModel
     beside: tuple[Beside, ...] = ()
     n_known: int = 0
     known_std: float | None = None
@@ -126,28 +126,28 @@ class EmbeddingRows:
     def _rows(self, record: Record, beside: Beside | None) -> RecordRows:
         """Matrices of one record, every column whitened. Columns driven by the input from rest commute with
         A(q): for them the input is filtered, but for the first rows."""
-        structure, whitening = self.structure, self.whitening
+        structure, noise = self.structure, self.noise
         delay = structure.input_delay_samples
-        first = first_rows(whitening)
+        first = noise.first_rows
         unknown = structure.estimate_offset and structure.estimate_initial_state and not structure.integrators
         level = level_before(record.input[:, 0]) if unknown else 0.0
         plain = driving_input(record.input[:, 0] - level, structure.integrators, delay)
         head = plain[: len(first)]
-        u = plain if whitening.size == 1 else np.asarray(lfilter(whitening, np.ones(1), plain))
+        u = plain if noise.is_white else noise.filtered(plain)
         regressors = self._driven(u)
         if first.size:
             regressors[: len(first)] = first @ self._driven(head)
         if beside is not None:
-            more = whitened(answered(np.column_stack([beside.first, beside.columns]), delay), whitening)
+            more = noise.whiten(answered(np.column_stack([beside.first, beside.columns]), delay))
             p = beside.first.shape[1]
             regressors = np.column_stack([more[:, :p], regressors[:, p:], more[:, p:]])
         known = nuisance_columns(
             self.poles, plain.size, structure.n_polynomials, structure.estimate_initial_state
         )
         return RecordRows(
-            nuisance=whitened(known, whitening),
+            nuisance=noise.whiten(known),
             regressors=regressors,
-            output=whitened(answered(stabilised(record.output[:, 0], structure.unstable), delay), whitening),
+            output=noise.whiten(answered(stabilised(record.output[:, 0], structure.unstable), delay)),
             input=u,
             head=head,
             first=first,
@@ -162,14 +162,13 @@ def gls_residuals(
     rows: EmbeddingRows, reduced: ReducedRegression, kernel: KernelPosterior
 ) -> tuple[list[RealArray], list[RealArray]]:
     """y minus posterior mean and nuisance, unwhitened, one array per record; and what the fit has absorbed.
-    rows: of the fit, with its whitening. Neglected: the kernel's share of the absorption."""
+    rows: of the fit, with its noise model. Neglected: the kernel's share of the absorption."""
     mean, _ = joint_factor(reduced, kernel)
     p = reduced.n_columns
     scale = np.linalg.norm(reduced.r11, axis=0)
     residuals, absorbed = [], []
-    drops = rows.whitening.size > 1 and not np.any(first_rows(rows.whitening))
     # What is known beforehand is no record and leaves nothing.
-    for block in replace(rows, whitening=np.ones(1)).record_blocks():
+    for block in replace(rows, noise=WHITE_NOISE).record_blocks():
         rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
         local = np.zeros((rest.size, 0))
@@ -177,16 +176,16 @@ def gls_residuals(
         nuisance = block.nuisance[:, length > 0] / length[length > 0]
         if nuisance.shape[1]:
             # Fitted where it was estimated, in the whitened rows, and taken off the plain ones.
-            u, d, vt = np.linalg.svd(whitened(nuisance, rows.whitening), full_matrices=False)
+            u, d, vt = np.linalg.svd(rows.noise.whiten(nuisance), full_matrices=False)
             rank = int(np.count_nonzero(d > RANK * d[0]))
             local = nuisance @ (vt[:rank].T / d[:rank])
-            fitted = local @ (u[:, :rank].T @ whitened(np.column_stack([rest, shared]), rows.whitening))
+            fitted = local @ (u[:, :rank].T @ rows.noise.whiten(np.column_stack([rest, shared])))
             rest = rest - fitted[:, 0]
             shared = shared - fitted[:, 1:]
         theirs = solve_triangular((reduced.r11 / scale).T, shared.T, lower=True, check_finite=False).T
         residuals.append(rest)
         columns = np.column_stack([local, theirs])
-        if drops:
-            columns = lfilter(np.ones(1), rows.whitening, whitened(columns, rows.whitening), axis=0)
+        if rows.noise.drops_start:
+            columns = rows.noise.coloured(rows.noise.whiten(columns))
         absorbed.append(columns)
     return residuals, absorbed

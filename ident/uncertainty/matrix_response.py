@@ -24,7 +24,7 @@ from ident.data.shown import Shown
 from ident.fit.several_outputs import prepare_outputs, whitened
 from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
-from ident.uncertainty.autoregression import autocovariance, fit_autoregression
+from ident.uncertainty.autoregression import fit_autoregression
 
 _AROUND = 41  # frequencies around a mode, beside those of the grid, whose largest radius stands for all
 _AR_ORDER = 16  # at most, of the noise
@@ -153,6 +153,5 @@ def matrix_posterior(
     fit = ModalFit(data, modes)
     each = [(residual @ white.T).T for residual in identification.residuals]
     order = min(_AR_ORDER, max(1, max(one.shape[1] for one in each) // 20))
-    filters = [fit_autoregression([one[k] for one in each], order) for k in range(len(white))]
-    noise = [weights * np.sqrt(autocovariance(weights, 0)[0]) for weights in filters]
+    noise = [fit_autoregression([one[k] for one in each], order) for k in range(len(white))]
     return MatrixPosterior(model, factor, fit, fit.covariance_factor(noise), level)

@@ -149,8 +149,10 @@ def pair_statistics(
         n = basis.shape[1]
         products = np.zeros((others.shape[1], 2 * poles.size))
         gram_here, states = np.zeros((3, poles.size)), np.zeros((2, poles.size))
-        for start in range(0, block.input.size, _BLOCK):
-            part = slice(start, start + _BLOCK)
+        # The first rows are whitened together.
+        piece = max(_BLOCK, block.head.size)
+        for start in range(0, block.input.size, piece):
+            part = slice(start, start + piece)
             x1, x2 = _pair_rows(parameters, kernel_array(block.input[part]), states)
             if start == 0 and block.head.size:
                 plain = _pair_rows(parameters, kernel_array(block.head), np.zeros((2, poles.size)))

@@ -71,17 +71,17 @@ def test_the_long_arx_model_whitens_its_noise():
     a = np.poly([0.95, 0.8])
     y = scipy.signal.lfilter([0, 0.1], a, u) + scipy.signal.lfilter([1], a, 0.1 * rng.normal(size=u.size))
     found = long_arx_filter([as_record(u, y)], IdentOptions(input_delay_samples=1))
-    assert found.size == 5  # the shortest tried
+    assert found.order == 4  # the shortest tried
     # Each coefficient within four standard errors, of the order of 1 / sqrt(N).
-    np.testing.assert_allclose(found, [*a, 0, 0], atol=4 / np.sqrt(u.size))
+    np.testing.assert_allclose(found.a_polynomial, [*a, 0, 0], atol=4 / np.sqrt(u.size))
     shorter = prewhitened(as_record(u, y), found)
     assert shorter.n_samples == u.size - 4
-    np.testing.assert_allclose(shorter.input[0, 0], found @ u[4::-1])
+    np.testing.assert_allclose(shorter.input[0, 0], found.a_polynomial @ u[4::-1])
 
 
 def test_too_short_records_are_taken_as_white():
     rng = np.random.default_rng(1)
-    assert long_arx_filter([as_record(rng.normal(size=51), rng.normal(size=51))], IdentOptions()).size == 1
+    assert long_arx_filter([as_record(rng.normal(size=51), rng.normal(size=51))], IdentOptions()).is_white
 
 
 def test_a_mode_of_fewer_than_three_periods_is_none():

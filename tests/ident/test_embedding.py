@@ -232,18 +232,18 @@ def test_autoregression_finds_order_and_coefficients():
     true = np.array([1.0, -1.2, 0.6])
     records = [signal.lfilter([1.0], true, rng.standard_normal(4000)) for _ in range(2)]
     found = fit_autoregression(records, 8)
-    assert found.size == 3
+    assert found.order == 2
     # sd of an AR coefficient is at most 1 / sqrt(8000) = 0.011
-    np.testing.assert_allclose(found, true, atol=0.045)
-    assert fit_autoregression([rng.standard_normal(5000)], 8).size == 1
+    np.testing.assert_allclose(found.a_polynomial, true, atol=0.045)
+    assert fit_autoregression([rng.standard_normal(5000)], 8).is_white
     with pytest.raises(ValueError, match="more than 16 samples"):
         fit_autoregression([np.zeros(10)], 8)
 
 
 def test_autoregression_is_stable_even_for_a_growing_signal():
     growing = np.exp(0.05 * np.arange(300.0))
-    whitening = fit_autoregression([growing + 1e-3 * np.random.default_rng(10).standard_normal(300)], 2)
-    assert np.all(np.abs(np.roots(whitening)) < 1)
+    noise = fit_autoregression([growing + 1e-3 * np.random.default_rng(10).standard_normal(300)], 2)
+    assert np.all(np.abs(np.roots(noise.a_polynomial)) < 1)
 
 
 @pytest.mark.parametrize(

@@ -5,14 +5,10 @@ import pytest
 from scipy import signal
 
 from ident import Poles, Record, Structure
+from ident.basis.arma_noise import ArmaNoise
+from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
 from ident.basis.options import EmbeddingOptions
-from ident.uncertainty.autoregression import (
-    absorbed_gradient,
-    autocovariance,
-    first_rows,
-    fit_autoregression,
-    whitened,
-)
+from ident.uncertainty.autoregression import absorbed_gradient, fit_autoregression
 from ident.uncertainty.embedding import tangent
 from ident.uncertainty.embedding_algebra import (
     conditional_posterior,
@@ -26,30 +22,28 @@ from ident.uncertainty.embedding_rows import EmbeddingRows, gls_residuals
 from .benchmark_plants import DT_S as DT
 from .three_mode_arm import random_arm
 
-FILTERS = [np.array([1.0, -0.9]), np.array([1.0, -1.2, 0.6]), np.array([1.0, -0.5, 0.1, -0.3, 0.2])]
+NOISES = [
+    AutoregressiveNoise(np.array(a_polynomial))
+    for a_polynomial in ([1.0, -0.9], [1.0, -1.2, 0.6], [1.0, -0.5, 0.1, -0.3, 0.2])
+]
+# A resonance over a floor 1e-7 below it: the first rows are dropped.
+NARROW = AutoregressiveNoise(np.real(np.poly([0.96 * np.exp(0.1j), 0.96 * np.exp(-0.1j), 0.9, 0.8, 0.9])))
 
 
-def covariance(whitening, n):
-    """Toeplitz covariance (n,n) of A(q) v = e from a long impulse response."""
-    h = signal.lfilter([1.0], whitening, np.eye(1, 4000)[0])
+# Forgets within the rows of the records here.
+ARMA = ArmaNoise(np.array([1.0, -0.9]), np.array([1.0, -0.5]))
+
+
+def covariance(noise, n):
+    """Toeplitz covariance (n,n) of a noise from a long impulse response."""
+    h = noise.coloured(np.eye(1, 4000)[0])
     gamma = np.array([h[k:] @ h[: h.size - k] for k in range(n)])
     index = np.arange(n)
     return gamma[np.abs(index[:, None] - index)]
 
 
-@pytest.mark.parametrize("whitening", FILTERS)
-def test_autocovariance_and_whitening_are_exact(whitening):
-    n = 40
-    full = covariance(whitening, n)
-    np.testing.assert_allclose(autocovariance(whitening, n - 1), full[0], rtol=0, atol=1e-11 * full[0, 0])
-    white = whitened(np.eye(n), whitening)
-    np.testing.assert_allclose(white @ full @ white.T, np.eye(n), atol=1e-10)
-    assert first_rows(np.ones(1)).shape == (0, 0)
-    np.testing.assert_array_equal(whitened(np.arange(3.0), np.ones(1)), np.arange(3.0))
-
-
-@pytest.mark.parametrize("whitening", [np.ones(1), FILTERS[0], FILTERS[1]])
-def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
+@pytest.mark.parametrize("noise", [WHITE_NOISE, NOISES[0], NOISES[1], ARMA])
+def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(noise):
     rng = np.random.default_rng(3)
     sizes = (60, 45)
     records = [
@@ -57,7 +51,7 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
         for n in sizes
     ]
     structure = Structure(estimate_offset=True, estimate_initial_state=True)
-    rows = EmbeddingRows(tuple(records), structure, Poles(np.array([0.8, 0.5])), 3, whitening)
+    rows = EmbeddingRows(tuple(records), structure, Poles(np.array([0.8, 0.5])), 3, noise)
     reduced = reduce_regression(rows.blocks())
     # No kernel: all weight on alpha = 0, so that the fit is plain generalised least squares.
     grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1), np.ones(1))
@@ -74,7 +68,7 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
             [np.ones(n), 0.8 ** np.arange(n), 0.5 ** np.arange(n)]
         )
         flat.append(np.column_stack([local, *own]))
-        cov[start : start + n, start : start + n] = covariance(whitening, n)
+        cov[start : start + n, start : start + n] = covariance(noise, n)
         start += n
     k, y = np.vstack(flat), np.concatenate([record.output[:, 0] for record in records])
     weight = np.linalg.inv(cov)
@@ -89,17 +83,13 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(whitening):
     assert ours.shape[0] == total
 
 
-# A resonance over a floor 1e-7 below it: the first rows are dropped.
-NARROW = np.real(np.poly([0.96 * np.exp(0.1j), 0.96 * np.exp(-0.1j), 0.9, 0.8, 0.9]))
-
-
-@pytest.mark.parametrize("whitening", [FILTERS[0], FILTERS[1], FILTERS[2], NARROW])
-def test_bias_of_the_estimating_equations_equals_the_dense_one(whitening):
+@pytest.mark.parametrize("noise", [NOISES[0], NOISES[1], NOISES[2], NARROW])
+def test_bias_of_the_estimating_equations_equals_the_dense_one(noise):
     rng = np.random.default_rng(5)
     n, order, start = 80, 5, 6
     record = Record("r", rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, ("u",), ("y",))
     structure = Structure(estimate_offset=True, estimate_initial_state=True)
-    rows = EmbeddingRows((record,), structure, Poles(np.array([0.9, 0.6])), 3, whitening)
+    rows = EmbeddingRows((record,), structure, Poles(np.array([0.9, 0.6])), 3, noise)
     reduced = reduce_regression(rows.blocks())
     grid = evaluate_grid(reduced, [kernel_spectrum(reduced, 0.5, tc_factor(0.5, 3))], np.ones(1), np.ones(1))
     _, absorbed = gls_residuals(rows, reduced, conditional_posterior(grid, np.zeros((1, 1)), 1.0))
@@ -109,46 +99,49 @@ def test_bias_of_the_estimating_equations_equals_the_dense_one(whitening):
         [np.ones(n), 0.9**a, 0.6**a]
         + [signal.lfilter([0.0, 1.0], [1.0, -p], record.input[:, 0]) for p in (0.9, 0.6)]
     )
-    filtering = signal.lfilter(whitening, [1.0], np.eye(n), axis=0)
+    filtering = noise.filtered(np.eye(n))
     white = filtering.copy()
-    if whitening is NARROW:
-        white = white[whitening.size - 1 :]
+    if noise is NARROW:
+        white = white[noise.order :]
     else:
-        white[: whitening.size - 1] = 0
-        head = covariance(whitening, n)[: whitening.size - 1, : whitening.size - 1]
-        white[: whitening.size - 1, : whitening.size - 1] = np.linalg.inv(np.linalg.cholesky(head))
+        white[: noise.order] = 0
+        head = covariance(noise, n)[: noise.order, : noise.order]
+        white[: noise.order, : noise.order] = np.linalg.inv(np.linalg.cholesky(head))
     fit = k @ np.linalg.lstsq(white @ k, white, rcond=None)[0]
     left = np.eye(n) - fit
-    moments = filtering @ left @ covariance(whitening, n) @ left.T
+    moments = filtering @ left @ covariance(noise, n) @ left.T
     expected = [-sum(moments[t, t - i] for t in range(start, n)) for i in range(1, order + 1)]
     np.testing.assert_allclose(
-        absorbed_gradient(absorbed, whitening, order, start), expected, atol=1e-5 * np.abs(expected).max()
+        absorbed_gradient(absorbed, noise, order, start), expected, atol=1e-5 * np.abs(expected).max()
     )
 
 
 def test_nothing_absorbed_changes_nothing_and_the_bias_of_a_mean_is_put_back():
     rng = np.random.default_rng(4)
-    e = signal.lfilter([1.0], FILTERS[0], rng.standard_normal(3000))
+    e = NOISES[0].coloured(rng.standard_normal(3000))
     plain = fit_autoregression([e], 1)
     nothing = [np.zeros((3000, 1))]
-    np.testing.assert_allclose(fit_autoregression([e], 1, FILTERS[0], nothing), plain, rtol=1e-12)
+    again = fit_autoregression([e], 1, NOISES[0], nothing)
+    np.testing.assert_allclose(again.a_polynomial, plain.a_polynomial, rtol=1e-12)
     # The mean estimated: Z = 1 (1^T S^-1 1)^(-1/2), and the bias of a is known to be (1 + rho) / N.
-    weight = np.linalg.norm(whitened(np.ones(3000), FILTERS[0]))
-    moved = fit_autoregression([e], 1, FILTERS[0], [np.full((3000, 1), 1 / weight)])
-    assert moved[1] - plain[1] == pytest.approx(-1.9 / 3000, rel=0.1)
+    weight = np.linalg.norm(NOISES[0].whiten(np.ones(3000)))
+    moved = fit_autoregression([e], 1, NOISES[0], [np.full((3000, 1), 1 / weight)])
+    assert moved.a_polynomial[1] - plain.a_polynomial[1] == pytest.approx(-1.9 / 3000, rel=0.1)
 
 
 def test_a_correction_that_is_no_small_perturbation_is_shrunk():
     """Noise with a range of eight decades, most of it absorbed: the spectrum moves by less than two."""
     rng = np.random.default_rng(6)
-    e = signal.lfilter([1.0], NARROW, rng.standard_normal(4000))
+    e = NARROW.coloured(rng.standard_normal(4000))
     slow = np.column_stack([np.cos(w * np.arange(4000)) for w in np.linspace(0.05, 0.15, 40)])
     plain = fit_autoregression([e], 5)
     for size in (1.0, 1e3, 1e6):
         moved = fit_autoregression([e], 5, NARROW, [size * slow])
-        assert np.all(np.abs(np.roots(moved)) < 1)
+        assert np.all(np.abs(np.roots(moved.a_polynomial)) < 1)
         w = np.linspace(0, np.pi, 3000)
-        ratio = np.abs(signal.freqz(moved, [1.0], w)[1] / signal.freqz(plain, [1.0], w)[1]) ** 2
+        after = signal.freqz(moved.a_polynomial, [1.0], w)[1]
+        before = signal.freqz(plain.a_polynomial, [1.0], w)[1]
+        ratio = np.abs(after / before) ** 2
         assert ratio.min() > 0.499
         assert ratio.max() < 2.0
     # Had it not been shrunk it would have been 1e6 times what it is.
@@ -156,11 +149,14 @@ def test_a_correction_that_is_no_small_perturbation_is_shrunk():
 
 
 def test_first_rows_are_dropped_where_their_covariance_is_nearly_singular():
-    np.testing.assert_array_equal(first_rows(NARROW), np.zeros((5, 5)))
+    np.testing.assert_array_equal(NARROW.first_rows, np.zeros((5, 5)))
+    assert NARROW.drops_start
     y = np.random.default_rng(7).standard_normal((30, 2))
-    white = whitened(y, NARROW)
+    white = NARROW.whiten(y)
     np.testing.assert_array_equal(white[:5], 0.0)
-    np.testing.assert_allclose(white[5:], signal.lfilter(NARROW, [1.0], y, axis=0)[5:], rtol=1e-12)
+    np.testing.assert_allclose(
+        white[5:], signal.lfilter(NARROW.a_polynomial, [1.0], y, axis=0)[5:], rtol=1e-12
+    )
     record = Record("r", y[:, :1], y[:, 1:], DT, ("u",), ("y",))
     rows = EmbeddingRows((record,), Structure(), Poles(np.array([0.5])), 3, NARROW)
     (block,) = rows.blocks()

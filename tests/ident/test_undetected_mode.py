@@ -6,6 +6,7 @@ from scipy import signal
 from scipy.stats import multivariate_normal
 
 from ident import Poles, Record, Structure, basis_response
+from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
 from ident.basis.options import EmbeddingOptions
 from ident.uncertainty import undetected_mode
 from ident.uncertainty.embedding import tangent
@@ -13,7 +14,7 @@ from ident.uncertainty.embedding_algebra import KernelPosterior, reduce_regressi
 from ident.uncertainty.embedding_rows import EmbeddingRows
 
 from .benchmark_plants import DT_S as DT
-from .test_residual_noise import covariance
+from .test_residual_noise import ARMA, covariance
 from .three_mode_arm import OMEGA, random_arm
 
 REAL = (0.8, 0.3)
@@ -59,7 +60,7 @@ def all_pass(poles, u):
     return signal.lfilter(num, den, u.astype(complex)).real
 
 
-def setup(whitening):
+def setup(noise):
     rng = np.random.default_rng(3)
     records = []
     for n in SIZES:
@@ -67,13 +68,13 @@ def setup(whitening):
         y = signal.lfilter([0.0, 0.2], [1.0, -1.2, 0.8], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
         records.append(Record("r", u, y, DT, ("u",), ("y",)))
     structure = Structure(estimate_offset=True)
-    rows = EmbeddingRows(tuple(records), structure, Poles(np.array(REAL), np.array([PAIR])), 6, whitening)
+    rows = EmbeddingRows(tuple(records), structure, Poles(np.array(REAL), np.array([PAIR])), 6, noise)
     return records, rows
 
 
-@pytest.mark.parametrize("whitening", [np.ones(1), np.array([1.0, -0.7, 0.2])])
-def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
-    records, rows = setup(whitening)
+@pytest.mark.parametrize("noise", [WHITE_NOISE, AutoregressiveNoise(np.array([1.0, -0.7, 0.2])), ARMA])
+def test_evidence_and_amplitudes_equal_the_dense_ones(noise):
+    records, rows = setup(noise)
     reduced = reduce_regression(rows.blocks())
     statistics = undetected_mode.pair_statistics(rows.pair_blocks(), reduced, TRIAL)
     evidence = undetected_mode.pair_evidence(statistics, reduced.degrees_of_freedom)
@@ -82,7 +83,7 @@ def test_evidence_and_amplitudes_equal_the_dense_ones(whitening):
     flat, columns, output = [], [], []
     for index, record in enumerate(records):
         u, n = record.input[:, 0], record.n_samples
-        white = np.linalg.inv(np.linalg.cholesky(covariance(whitening, n)))
+        white = np.linalg.inv(np.linalg.cholesky(covariance(noise, n)))
         offset = np.zeros((n, 2))
         offset[:, index] = 1.0
         x = driven(everything, u)
@@ -166,7 +167,7 @@ def test_moments_are_those_of_the_mixture():
 
 
 def test_weights_are_prior_times_evidence():
-    _, rows = setup(np.ones(1))
+    _, rows = setup(WHITE_NOISE)
     reduced = reduce_regression(rows.blocks())
     prior = np.array([0.25, 0.75])
     statistics = undetected_mode.pair_statistics(rows.pair_blocks(), reduced, TRIAL)
@@ -238,7 +239,7 @@ def test_a_mode_near_the_noise_widens_the_ellipses_at_its_place_and_nowhere_else
 def test_refined_pair_is_at_the_minimum_of_the_residual():
     arm = random_arm(np.random.default_rng(14))
     poles = Poles(arm.poles[:2].real, arm.poles[2:4]).doubled()
-    rows = EmbeddingRows((arm.record,), Structure(estimate_offset=True), poles, 20, np.ones(1))
+    rows = EmbeddingRows((arm.record,), Structure(estimate_offset=True), poles, 20, WHITE_NOISE)
     reduced = reduce_regression(rows.blocks())
     start = arm.poles[4] * np.exp(0.01j)
     found = undetected_mode.refined_pair(rows.pair_blocks, reduced, start)

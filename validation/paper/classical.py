@@ -39,8 +39,8 @@ def classical(
     reduced, kernel = _solved(rows)
     for _ in range(NOISE_ROUNDS if options.coloured_noise else 0):
         residuals, absorbed = gls_residuals(rows, reduced, kernel)
-        whitening = fit_autoregression(residuals, options.max_ar_order, rows.whitening, absorbed)
-        rows = replace(rows, whitening=whitening)
+        noise = fit_autoregression(residuals, options.max_ar_order, rows.noise, absorbed)
+        rows = replace(rows, noise=noise)
         reduced, kernel = _solved(rows)
     return ResponsePosterior(
         model.poles,

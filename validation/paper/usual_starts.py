@@ -10,6 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
+from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
+from ident.basis.noise_model import NoiseModel
 from ident.basis.structure import filter_input
 from ident.data.arrays import RealArray
 from ident.data.record import Record
@@ -36,18 +38,18 @@ def instrumental_variables(u: RealArray, y: RealArray, na: int, nb: int) -> tupl
     that makes instruments is reflected into the unit circle first: growing ones would drown everything.
     """
     a, b = arx_polynomials(u, y, na, nb)
-    a, b = _instrumented(u, y, lfilter(b, stabilised(a), u), na, nb, _ONE)
+    a, b = _instrumented(u, y, lfilter(b, stabilised(a), u), na, nb, WHITE_NOISE)
     residual = lfilter(a, _ONE, y) - lfilter(b, _ONE, u)
     order = na + nb
     tail = _solved(-shifted(residual, range(1, order + 1))[order:], residual[order:])
-    return _instrumented(u, y, lfilter(b, stabilised(a), u), na, nb, monic(tail))
+    return _instrumented(u, y, lfilter(b, stabilised(a), u), na, nb, AutoregressiveNoise(monic(tail)))
 
 
 def _instrumented(
-    u: RealArray, y: RealArray, instrument: RealArray, na: int, nb: int, whitening: RealArray
+    u: RealArray, y: RealArray, instrument: RealArray, na: int, nb: int, noise: NoiseModel
 ) -> tuple[RealArray, RealArray]:
     first = max(na, nb - 1)
-    u, y, x = (np.asarray(lfilter(whitening, _ONE, signal)) for signal in (u, y, instrument))
+    u, y, x = (noise.filtered(np.asarray(signal)) for signal in (u, y, instrument))
     past_u = shifted(u, range(nb))
     columns = np.hstack([-shifted(y, range(1, na + 1)), past_u])[first:]
     instruments = np.hstack([-shifted(x, range(1, na + 1)), past_u])[first:]
