@@ -1,4 +1,11 @@
-"""Records as whitened rows of the embedding's regression, and what a fit of them leaves."""
+"""Records as whitened rows of the embedding's regression, and what a fit of them leaves.
+
+`EmbeddingRows` says which columns there are: basis functions driven by the input, columns beside them,
+initial state and offset as nuisance, and the delayed input of the kernel. It makes the matrices of one record
+after the other, whitened by a noise model, so that only one record's are in memory. `gls_residuals` takes a
+fit of these rows and gives its residuals, not whitened, from which the next noise model is fitted
+(generalised least squares: Ljung, System Identification, 2nd ed., section 10.4).
+"""
 
 from __future__ import annotations
 
@@ -29,11 +36,22 @@ from ident.uncertainty.embedding_algebra import (
 
 @dataclass(frozen=True, eq=False)
 class RecordRows:
-    """The rows of one record that answer to its input: nuisance (T,n), regressors F (T,p), output y (T,),
-    whitened.
+    """The rows of one record that answer to its input, whitened.
 
-    input (T,): after integrators, delay and A(q); head (n,): its first samples before A(q); first (n,n): what
-    whitens those rows, zero where they are dropped.
+    Attributes
+    ----------
+    nuisance : ndarray, shape (T, n)
+        Offset, polynomials, free responses.
+    regressors : ndarray, shape (T, p)
+        F: basis functions, direct term, columns beside them.
+    output : ndarray, shape (T,)
+        y.
+    input : ndarray, shape (T,)
+        After integrators, delay and the whitening filter, from rest.
+    head : ndarray, shape (n_start,)
+        First samples of the input before the whitening filter.
+    first : ndarray, shape (n_start, n_start)
+        What whitens these rows (`NoiseModel.first_rows`); zero where they are left out.
     """
 
     nuisance: RealArray
@@ -46,8 +64,15 @@ class RecordRows:
 
 @dataclass(frozen=True, eq=False)
 class Beside:
-    """What the output of one record depends on besides the basis functions: first (T,p1), in place of the
-    first p1 regressors; columns (T,q), with coefficients that all records share."""
+    """What the output of one record depends on besides the basis functions, not whitened.
+
+    Attributes
+    ----------
+    first : ndarray, shape (T, p1)
+        In place of the first p1 regressors.
+    columns : ndarray, shape (T, q)
+        With coefficients that all records share.
+    """
 
     first: RealArray
     columns: RealArray
@@ -55,13 +80,31 @@ class Beside:
 
 @dataclass(frozen=True, eq=False)
 class EmbeddingRows:
-    """How to make the matrices; made anew for each pass, so that only one record's are in memory.
+    """How to make the matrices; they are made anew for each pass, so that only one record's are in memory.
 
-    poles: of the regressors (doubled for the tangent method); fir_length: of the kernel; noise: makes the
-    rows white. beside: one per record, or none, whose last n_known columns have coefficients known to
-    one; known_std: of the (whitened) noise, as far as known. missed_above: least frequency of a mode that
-    may be missing, radians a sample. classes: of the rows (T,) of each record, by what errors of the model
-    may depend on.
+    Attributes
+    ----------
+    records : tuple of Record
+        One input, one output each.
+    structure : Structure
+        Integrators, delay, direct term, and which nuisance there is.
+    poles : Poles
+        Of the regressors, in z; doubled for the tangent method.
+    fir_length : int
+        Taps of the kernel.
+    noise : NoiseModel
+        Whitens the rows.
+    beside : tuple of Beside
+        One per record, or none.
+    n_known : int
+        The last so many columns beside have coefficients of zero mean and unit variance.
+    known_std : float or None
+        Standard deviation of the whitened noise, as far as known; with it what is known of coefficients is
+        weighed against the records. None: nothing is taken as known.
+    missed_above : float
+        Least frequency of a mode that may be missing, radians a sample.
+    classes : tuple of ndarray, shape (T,)
+        Class of each row of each record, by what errors of the model may depend on; or none.
     """
 
     records: tuple[Record, ...]
@@ -77,115 +120,178 @@ class EmbeddingRows:
 
     @property
     def n_beside(self) -> int:
-        """Columns beside the basis functions."""
-        return self.beside[0].columns.shape[1] if self.beside else 0
+        """q, columns beside the basis functions."""
+        if not self.beside:
+            return 0
+        return int(self.beside[0].columns.shape[1])
 
     def __iter__(self) -> Iterator[RecordRows]:
+        """Rows of one record after the other."""
         for k, record in enumerate(self.records):
-            yield self._rows(record, self.beside[k] if self.beside else None)
+            beside_record = self.beside[k] if self.beside else None
+            yield self._rows(record, beside_record)
 
     def blocks(self) -> Iterator[RegressionBlock]:
-        """Those of the records, and of what is known of shared coefficients."""
+        """Blocks of the regression: those of the records, and what is known of shared coefficients."""
         yield from self.record_blocks()
         yield from self.known_blocks()
 
     def record_blocks(self) -> Iterator[RegressionBlock]:
-        """Rows with kernel columns; those that are dropped are left out, for they count as data here."""
+        """Rows of each record with kernel columns; those that `first` zeroes are left out, as rows count."""
         for rows in self:
-            dropped = 0 if np.any(rows.first) else len(rows.first)
-            head = Delays(rows.head, self.fir_length, np.zeros((0, self.fir_length)))
-            kernel = Delays(rows.input, self.fir_length, rows.first @ head[:], dropped)
-            used = slice(dropped, None)
+            n_dropped = 0
+            if not np.any(rows.first):
+                n_dropped = len(rows.first)
+            # First rows of the kernel's columns, whitened as those of the regressors are.
+            no_rows = np.zeros((0, self.fir_length))
+            plain_head = Delays(rows.head, self.fir_length, no_rows)
+            kernel = Delays(rows.input, self.fir_length, rows.first @ plain_head[:], n_dropped)
+            used = slice(n_dropped, None)
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel, rows.output[used])
 
     def scores(self, mean: RealArray) -> RealArray:
-        """(M, P): sums over the rows of each class of regressors times what the mean (P+L,) leaves, behind
-        the nuisance."""
+        """Scores (M, P): for each of M classes of rows the product of its regressors and its residuals.
+
+        mean (P+L,): of regressors' coefficients and kernel. The nuisance is projected out of the residuals,
+        and out of those of each class.
+        """
         total = np.zeros(())
         for block, classes in zip(self.record_blocks(), self.classes, strict=True):
-            p, basis = block.regressors.shape[1], nuisance_basis(block.nuisance)
-            rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
-            own = by_class(rest - basis @ (basis.T @ rest), classes)
-            total = total + (own - basis @ (basis.T @ own)).T @ block.regressors
+            p = block.regressors.shape[1]
+            basis = nuisance_basis(block.nuisance)
+            residual = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
+            without_nuisance = residual - basis @ (basis.T @ residual)
+            of_class = by_class(without_nuisance, classes)
+            of_class_without = of_class - basis @ (basis.T @ of_class)
+            total = total + of_class_without.T @ block.regressors
         return total
 
     def known_blocks(self) -> Iterator[RegressionBlock]:
-        """What is known of the shared coefficients: as many measurements of them, each off by one."""
-        if self.known_std is not None:
-            q = self.n_known
-            known = np.zeros((q, self.poles.order + int(self.structure.feedthrough) + self.n_beside))
-            known[:, -q:] = self.known_std * np.eye(q)
-            yield RegressionBlock(np.zeros((q, 0)), known, np.zeros((q, self.fir_length)), np.zeros(q))
+        """What is known of the last n_known coefficients: a measured zero of each, off by one in deviation.
+
+        Nothing where known_std is None.
+        """
+        if self.known_std is None:
+            return
+        q = self.n_known
+        n_direct = int(self.structure.feedthrough)
+        n_columns = self.poles.order + n_direct + self.n_beside
+        regressors = np.zeros((q, n_columns))
+        # In rows whose noise has this deviation, a unit coefficient is one deviation.
+        regressors[:, -q:] = self.known_std * np.eye(q)
+        yield RegressionBlock(np.zeros((q, 0)), regressors, np.zeros((q, self.fir_length)), np.zeros(q))
 
     def pair_blocks(self) -> Iterator[RecordRows]:
-        """Rows with the signal that drives one more pair after all the poles in place of the input."""
+        """Rows whose input is what drives one more pair after all the poles: behind their all-pass."""
         for rows in self:
-            signal, head = (all_pass_signal(self.poles, part) for part in (rows.input, rows.head))
+            signal = all_pass_signal(self.poles, rows.input)
+            head = all_pass_signal(self.poles, rows.head)
             yield replace(rows, input=signal, head=head)
 
     def _rows(self, record: Record, beside: Beside | None) -> RecordRows:
-        """Matrices of one record, every column whitened. Columns driven by the input from rest commute with
-        A(q): for them the input is filtered, but for the first rows."""
-        structure, noise = self.structure, self.noise
+        """Matrices of one record, every column whitened.
+
+        Columns driven by the input from rest commute with the whitening filter: for them the input is
+        filtered once, but for the first rows.
+        """
+        structure = self.structure
+        noise = self.noise
         delay = structure.input_delay_samples
         first = noise.first_rows
-        unknown = structure.estimate_offset and structure.estimate_initial_state and not structure.integrators
-        level = level_before(record.input[:, 0]) if unknown else 0.0
+        n_first = len(first)
+
+        # The level at which the input stood before the record is a free offset and initial state of the
+        # output: where both are estimated it is taken off, so that the input begins near zero.
+        level = 0.0
+        level_is_free = structure.estimate_offset and structure.estimate_initial_state
+        if level_is_free and not structure.integrators:
+            level = level_before(record.input[:, 0])
         plain = driving_input(record.input[:, 0] - level, structure.integrators, delay)
-        head = plain[: len(first)]
-        u = plain if noise.is_white else noise.filtered(plain)
-        regressors = self._driven(u)
-        if first.size:
-            regressors[: len(first)] = first @ self._driven(head)
+        head = plain[:n_first]
+        filtered = plain if noise.is_white else noise.filtered(plain)
+
+        regressors = self._driven(filtered)
+        if n_first:
+            regressors[:n_first] = first @ self._driven(head)
         if beside is not None:
-            more = noise.whiten(answered(np.column_stack([beside.first, beside.columns]), delay))
-            p = beside.first.shape[1]
-            regressors = np.column_stack([more[:, :p], regressors[:, p:], more[:, p:]])
-        known = nuisance_columns(
+            plain_columns = np.column_stack([beside.first, beside.columns])
+            white_columns = noise.whiten(answered(plain_columns, delay))
+            p1 = beside.first.shape[1]
+            regressors = np.column_stack([white_columns[:, :p1], regressors[:, p1:], white_columns[:, p1:]])
+
+        nuisance = nuisance_columns(
             self.poles, plain.size, structure.n_polynomials, structure.estimate_initial_state
         )
+        output = answered(stabilised(record.output[:, 0], structure.unstable), delay)
         return RecordRows(
-            nuisance=noise.whiten(known),
+            nuisance=noise.whiten(nuisance),
             regressors=regressors,
-            output=noise.whiten(answered(stabilised(record.output[:, 0], structure.unstable), delay)),
-            input=u,
+            output=noise.whiten(output),
+            input=filtered,
             head=head,
             first=first,
         )
 
     def _driven(self, u: RealArray) -> RealArray:
+        """Basis functions driven by u (T,) from rest, (T, P), and u itself where there is a direct term."""
         columns = regressor(self.poles, u)
-        return np.column_stack([columns, u]) if self.structure.feedthrough else columns
+        if self.structure.feedthrough:
+            columns = np.column_stack([columns, u])
+        return columns
 
 
 def gls_residuals(
     rows: EmbeddingRows, reduced: ReducedRegression, kernel: KernelPosterior
 ) -> tuple[list[RealArray], list[RealArray]]:
-    """y minus posterior mean and nuisance, unwhitened, one array per record; and what the fit has absorbed.
-    rows: of the fit, with its noise model. Neglected: the kernel's share of the absorption."""
+    """Residuals of a fit, not whitened, and what the fit has absorbed of the noise.
+
+    Parameters
+    ----------
+    rows : EmbeddingRows
+        Of the fit, with the noise model that it used.
+    reduced : ReducedRegression
+        Of these rows.
+    kernel : KernelPosterior
+        Of that regression.
+
+    Returns
+    -------
+    residuals : list of ndarray, shape (T,)
+        One per record: y minus posterior mean and nuisance, output units.
+    absorbed : list of ndarray, shape (T, r)
+        One per record: columns Z, Z Z^T the share of the noise's covariance that the fit took off
+        (`autoregression.absorbed_gradient`). Neglected: the kernel's share of it.
+    """
+    noise = rows.noise
     mean, _ = joint_factor(reduced, kernel)
     p = reduced.n_columns
     scale = np.linalg.norm(reduced.r11, axis=0)
-    residuals, absorbed = [], []
+    residuals = []
+    absorbed = []
     # What is known beforehand is no record and leaves nothing.
     for block in replace(rows, noise=WHITE_NOISE).record_blocks():
-        rest = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
+        residual = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
         shared = block.regressors[:, reduced.kept] / scale
-        local = np.zeros((rest.size, 0))
+        local = np.zeros((residual.size, 0))
         length = np.linalg.norm(block.nuisance, axis=0)
-        nuisance = block.nuisance[:, length > 0] / length[length > 0]
+        nonzero = length > 0
+        nuisance = block.nuisance[:, nonzero] / length[nonzero]
         if nuisance.shape[1]:
             # Fitted where it was estimated, in the whitened rows, and taken off the plain ones.
-            u, d, vt = np.linalg.svd(rows.noise.whiten(nuisance), full_matrices=False)
+            u, d, vt = np.linalg.svd(noise.whiten(nuisance), full_matrices=False)
             rank = int(np.count_nonzero(d > RANK * d[0]))
             local = nuisance @ (vt[:rank].T / d[:rank])
-            fitted = local @ (u[:, :rank].T @ rows.noise.whiten(np.column_stack([rest, shared])))
-            rest = rest - fitted[:, 0]
+            white = noise.whiten(np.column_stack([residual, shared]))
+            fitted = local @ (u[:, :rank].T @ white)
+            residual = residual - fitted[:, 0]
             shared = shared - fitted[:, 1:]
-        theirs = solve_triangular((reduced.r11 / scale).T, shared.T, lower=True, check_finite=False).T
-        residuals.append(rest)
-        columns = np.column_stack([local, theirs])
-        if rows.noise.drops_start:
-            columns = rows.noise.coloured(rows.noise.whiten(columns))
+        residuals.append(residual)
+
+        # Columns of the regressors for innovations of unit variance: F R11^-1.
+        scaled_triangle = (reduced.r11 / scale).T
+        of_regressors = solve_triangular(scaled_triangle, shared.T, lower=True, check_finite=False).T
+        columns = np.column_stack([local, of_regressors])
+        if noise.drops_start:
+            columns = noise.coloured(noise.whiten(columns))
         absorbed.append(columns)
     return residuals, absorbed
