@@ -1,9 +1,10 @@
 """Several operating conditions, one uncertain plant: scatter between conditions as part of the uncertainty.
 
-Random effects: G_i = G + d_i, d_i ~ N(0, T), each measured with covariance P_i. The plant met next is G + d,
-whose covariance around the mean of K estimates is T + (T + mean P) / K. P_i from the residuals of one record
-holds for a linear arm in stationary noise; where an experiment was repeated, `repeat_posteriors` takes the
-scatter from the other repeats.
+Random effects: in condition i the response is G_i = G + d_i, d_i ~ N(0, T), and it is measured with
+covariance P_i. The plant met next is G + d, whose covariance around the mean of K estimates is
+T + (T + mean P) / K (`combine_posteriors`; Hotelling's prediction region where K is small). P_i from the
+residuals of one record (`record_posteriors`) holds for a linear arm in stationary noise. Where an experiment
+was repeated, `repeat_posteriors` takes the scatter from the other repeats, which needs neither.
 """
 
 from __future__ import annotations
@@ -22,39 +23,94 @@ from ident.data.record import Record
 from ident.uncertainty.embedding import common_fir_length, tangent, tangent_rows
 from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 
-# Errors count together for so many time constants of the slowest pole, at most a share of a record.
-_TIME_CONSTANTS, _LONGEST_WINDOW = 3.0, 0.1
+# Errors at two times count together up to so many time constants of the slowest pole: e^-3 = 5 % of its
+# motion is left then.
+_TIME_CONSTANTS = 3.0
+# They count together over this share of a record at most: ten stretches are the least to take a scatter from.
+_LONGEST_WINDOW = 0.1
+# Magnitude that the slowest pole is taken to have at least, so that it has a time constant: one of .1 is over
+# within a sample or two, and the window of one row then stays.
+_FASTEST_POLE = 0.1
+# Groups of so many repeats predict one by the others; two of them would differ by a single number.
+_FEWEST_REPEATS = 3
+# Conditions from which Hotelling's region is given: at 95 % it makes ellipses 3.1 times as wide for four, and
+# 11.5 times for three, which would say nothing.
+_FEWEST_CONDITIONS = 4
+# What posteriors must share, beside their poles, for their coefficients to mean the same.
+_SHARED_FIELDS = ("dt_s", "fir_length", "has_feedthrough", "integrators", "input_delay_samples")
 
 
 def record_posteriors(
     records: Sequence[Record], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[ResponsePosterior]:
-    """`tangent` for every record, all with the model's poles and one fir_length, fit to be combined:
-    averaging over a missed mode is off, for it would give each its own further poles."""
+    """Posterior of the response (`tangent`) from every record by itself, fit to be combined.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        One input, one output each, sampled as the model.
+    model : GobfModel
+        Of it the poles and the structure matter: all posteriors have its poles, twice.
+    options : EmbeddingOptions, optional
+        Averaging over a missed mode is off here, for it would give each record further poles of its own.
+
+    Returns
+    -------
+    list of ResponsePosterior
+        One per record, with one fir_length: the shortest that a record can carry.
+
+    Raises
+    ------
+    ValueError
+        As `tangent`.
+    """
     options = options or EmbeddingOptions()
-    length = min(common_fir_length([record], model.poles.doubled(), options) for record in records)
-    shared = options.model_copy(update={"fir_length": length, "prior_missed_mode": 0.0})
-    return [tangent([record], model, shared) for record in records]
+    poles = model.poles.doubled()
+    length = min(common_fir_length([record], poles, options) for record in records)
+    shared_options = options.model_copy(update={"fir_length": length, "prior_missed_mode": 0.0})
+    return [tangent([record], model, shared_options) for record in records]
 
 
 def repeat_posteriors(
     groups: Sequence[Sequence[Record]], model: GobfModel, options: EmbeddingOptions | None = None
 ) -> list[list[ResponsePosterior]]:
-    """`record_posteriors` of repeats, each with the covariance that the others of its group predict.
+    """Posteriors of repeats (`record_posteriors`), each with the covariance that its group's others predict.
 
+    Parameters
+    ----------
+    groups : sequence of sequence of Record
+        Each group repeats one experiment.
+    model, options
+        As `record_posteriors`.
+
+    Returns
+    -------
+    list of list of ResponsePosterior
+        As the groups. Groups of one or two keep the covariance of each record's own residuals.
+
+    Raises
+    ------
+    ValueError
+        As `tangent`.
+
+    Notes
+    -----
     The error of an estimate is a sum over time of the noise with known weights; noise: what the residuals of
     the other repeats around their common model differ by. Products of the summands are added up to three time
     constants of the slowest pole apart, with weights that fall linearly (Newey and West, Econometrica 55(3),
-    1987), which needs no stationarity. Groups of two keep the covariance of each record's own residuals.
+    1987), which needs no stationarity.
     """
-    flat = iter(record_posteriors([record for group in groups for record in group], model, options))
-    theirs = [[next(flat) for _ in group] for group in groups]
-    return [
-        _predicted_by_others(group, posteriors, model, options or EmbeddingOptions())
-        if len(group) > 2
-        else posteriors
-        for group, posteriors in zip(groups, theirs, strict=True)
-    ]
+    options = options or EmbeddingOptions()
+    # All records at once, so that they get one fir_length.
+    records = [record for group in groups for record in group]
+    posteriors = iter(record_posteriors(records, model, options))
+    predicted = []
+    for group in groups:
+        of_group = [next(posteriors) for _ in group]
+        if len(group) >= _FEWEST_REPEATS:
+            of_group = _predicted_by_others(group, of_group, model, options)
+        predicted.append(of_group)
+    return predicted
 
 
 def _predicted_by_others(
@@ -63,28 +119,47 @@ def _predicted_by_others(
     model: GobfModel,
     options: EmbeddingOptions,
 ) -> list[ResponsePosterior]:
-    rows = [_linear_rows(*pair, model, options) for pair in zip(group, posteriors, strict=True)]
-    n_rows = min(output.size for _, output in rows)
-    columns, outputs = zip(*((x[-n_rows:], y[-n_rows:]) for x, y in rows), strict=True)
-    memory = -_TIME_CONSTANTS / np.log(max(float(np.abs(model.poles.values).max()), 0.1))
+    """The posteriors of three or more repeats, each with the covariance of its error as the others show it.
+
+    group and posteriors: one entry per repeat, in the same order. The means stay.
+    """
+    # The last rows of all repeats, as many as the shortest has.
+    columns: list[RealArray] = []
+    outputs: list[RealArray] = []
+    for record, posterior in zip(group, posteriors, strict=True):
+        record_columns, record_output = _linear_rows(record, posterior, model, options)
+        columns.append(record_columns)
+        outputs.append(record_output)
+    n_rows = min(output.size for output in outputs)
+    columns = [record_columns[-n_rows:] for record_columns in columns]
+    outputs = [output[-n_rows:] for output in outputs]
+
+    slowest = max(float(np.abs(model.poles.values).max()), _FASTEST_POLE)
+    memory = -_TIME_CONSTANTS / np.log(slowest)
     window = int(np.clip(memory, 1, _LONGEST_WINDOW * n_rows))
+
     predicted = []
     for k, posterior in enumerate(posteriors):
         others = [j for j in range(len(group)) if j != k]
+        n_others = len(others)
+        # What the others leave of their common model, and by how much they differ in it: their noise, whose
+        # mean was taken off, as an unbiased deviation.
         common = np.mean([posteriors[j].mean for j in others], axis=0)
         residuals = np.stack([outputs[j] - columns[j] @ common for j in others])
-        noise = (residuals - residuals.mean(axis=0)) * np.sqrt(len(others) / (len(others) - 1))
+        noise = (residuals - residuals.mean(axis=0)) * np.sqrt(n_others / (n_others - 1))
         factors = []
-        for j, differs in zip(others, noise, strict=True):
+        for j, own_noise in zip(others, noise, strict=True):
             # Coefficients = mean + F F^T / s^2 X^T noise, F the factor of their covariance.
             factor = posteriors[j].covariance_factor
             report = posteriors[j].report
             assert report is not None
-            # Sums over every stretch of `window` rows, those that reach over the ends too.
-            total = np.cumsum((columns[j] @ factor) * differs[:, None], axis=0)
-            summed = np.vstack([total, np.repeat(total[-1:], window - 1, axis=0)])
+            # Sums over every stretch of `window` rows, those that reach over the ends too: their outer
+            # products, added up, are the products of summands with weights that fall linearly.
+            total = np.cumsum((columns[j] @ factor) * own_noise[:, None], axis=0)
+            after_end = np.repeat(total[-1:], window - 1, axis=0)
+            summed = np.vstack([total, after_end])
             summed[window:] -= total[:-1]
-            weights = triangle_of(summed).T / (np.sqrt(window * len(others)) * report.noise_std**2)
+            weights = triangle_of(summed).T / (np.sqrt(window * n_others) * report.noise_std**2)
             factors.append(factor @ weights)
         predicted.append(replace(posterior, covariance_factor=np.hstack(factors)))
     return predicted
@@ -93,15 +168,22 @@ def _predicted_by_others(
 def _linear_rows(
     record: Record, posterior: ResponsePosterior, model: GobfModel, options: EmbeddingOptions
 ) -> tuple[RealArray, RealArray]:
-    """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance."""
+    """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance.
+
+    posterior: made from this record by `record_posteriors`; of it the noise model and the order of the
+    coefficients matter: basis functions, kernel, unstable poles.
+    """
     assert posterior.report is not None
-    rows = tangent_rows([record], model, options.model_copy(update={"fir_length": posterior.fir_length}))
+    same_length = options.model_copy(update={"fir_length": posterior.fir_length})
+    rows = tangent_rows([record], model, same_length)
     (block,) = replace(rows, noise=posterior.report.noise).blocks()
-    basis, off = np.split(block.regressors, [block.regressors.shape[1] - model.unstable.order], axis=1)
-    both = np.column_stack([basis, block.kernel[:], off, block.output])
+    # Columns of unstable poles stand last among the coefficients, but before the kernel among the rows.
+    n_basis = block.regressors.shape[1] - model.unstable.order
+    basis, of_unstable = np.split(block.regressors, [n_basis], axis=1)
+    everything = np.column_stack([basis, block.kernel[:], of_unstable, block.output])
     nuisance = nuisance_basis(block.nuisance)
-    both = both - nuisance @ (nuisance.T @ both)
-    return both[:, :-1], both[:, -1]
+    everything = everything - nuisance @ (nuisance.T @ everything)
+    return everything[:, :-1], everything[:, -1]
 
 
 def combine_posteriors(
@@ -109,40 +191,62 @@ def combine_posteriors(
 ) -> ResponsePosterior:
     """Posterior of the response in a condition like these, from one posterior per condition.
 
-    Mean of the K means; covariance (1 + 1/K) w S + mean P / K, S the sample covariance between the means:
-    noise is counted once too often in directions that differ, which is safe. S has rank K - 1. w = 1 takes S
-    as known; with small_sample_level it gives Hotelling's prediction region for one more condition, w = 2 (K
-    - 1) / (K - 2) F(2, K - 2) / chi2(2), and needs K >= 4. All must share poles, structure and fir_length,
-    else ValueError.
+    Parameters
+    ----------
+    posteriors : sequence of ResponsePosterior
+        K >= 2, with the same poles, structure, sampling time and fir_length.
+    small_sample_level : float, optional
+        Level, below 1, at which the ellipses of one more condition hold although the scatter is known from K
+        conditions only; needs K >= 4. None takes the scatter as known.
+
+    Returns
+    -------
+    ResponsePosterior
+        Its mean is the mean of the K means. Its report is the first one's, with the name of the method, the
+        noise and the rows of all.
+
+    Raises
+    ------
+    ValueError
+        If there are too few posteriors, or they do not share what they must.
+
+    Notes
+    -----
+    Covariance (1 + 1/K) w S + mean P / K, S the sample covariance between the means, of rank K - 1: noise is
+    counted once too often in directions that differ, which is safe. w = 1, or that of Hotelling's prediction
+    region for one more condition, w = 2 (K - 1) / (K - 2) F(2, K - 2) / chi2(2).
     """
-    if len(posteriors) < 2:
-        raise ValueError(f"a scatter between conditions needs at least two; got {len(posteriors)}")
+    count = len(posteriors)
+    if count < 2:
+        raise ValueError(f"a scatter between conditions needs at least two; got {count}")
     first = posteriors[0]
     for other in posteriors[1:]:
-        same = (
-            np.array_equal(first.poles.values, other.poles.values)
-            and np.array_equal(first.unstable.values, other.unstable.values)
-            and all(
-                getattr(first, name) == getattr(other, name)
-                for name in ("dt_s", "fir_length", "has_feedthrough", "integrators", "input_delay_samples")
-            )
-        )
-        if not same:
+        same_poles = np.array_equal(first.poles.values, other.poles.values)
+        same_unstable = np.array_equal(first.unstable.values, other.unstable.values)
+        same_fields = all(getattr(first, name) == getattr(other, name) for name in _SHARED_FIELDS)
+        if not (same_poles and same_unstable and same_fields):
             raise ValueError("the posteriors differ in poles, structure, sampling time or fir_length")
-    count = len(posteriors)
+    if small_sample_level is not None and count < _FEWEST_CONDITIONS:
+        raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
+
     means = np.stack([posterior.mean for posterior in posteriors])
     mean = means.mean(axis=0)
-    if small_sample_level is not None and count < 4:
-        raise ValueError(f"a small-sample region needs at least four conditions; got {count}")
     # Hotelling's prediction region over the chi-square ellipse.
-    wider = 1.0 if small_sample_level is None else hotelling_widening(count - 1, small_sample_level)
+    wider = 1.0
+    if small_sample_level is not None:
+        wider = float(hotelling_widening(count - 1, small_sample_level))
     between = (means - mean).T * np.sqrt(wider * (1 + 1 / count) / (count - 1))
     within = np.hstack([posterior.covariance_factor for posterior in posteriors]) / count
-    report = first.report and replace(
-        first.report,
-        method=f"{first.report.method}, {count} conditions",
-        noise_std=float(np.sqrt(np.mean([p.report.noise_std**2 for p in posteriors if p.report]))),
-        n_rows=sum(p.report.n_rows for p in posteriors if p.report),
-    )
+    # One triangle in place of a factor with the columns of all conditions.
     factor = np.asarray(np.linalg.qr(np.hstack([between, within]).T, mode="r")).T
+
+    report = first.report
+    if report is not None:
+        reports = [posterior.report for posterior in posteriors if posterior.report]
+        report = replace(
+            report,
+            method=f"{report.method}, {count} conditions",
+            noise_std=float(np.sqrt(np.mean([each.noise_std**2 for each in reports]))),
+            n_rows=sum(each.n_rows for each in reports),
+        )
     return replace(first, mean=mean, covariance_factor=factor, report=report)
