@@ -1,4 +1,10 @@
-"""A low-order nominal model placed where the posterior is, not only where a least-squares fit left it."""
+"""A low-order nominal model placed where the posterior is, not only where a least-squares fit left it.
+
+A design needs a model of few poles beside the ellipses. `nominal_near` takes given poles and finds the
+coefficients that are closest to the posterior mean, in units of the ellipses (weighted least squares over
+frequencies). `nominals_near` goes on to better poles and more of them, for a caller that stops at the first
+model that is good enough. `NominalAgreement` says how far a nominal is from the ellipses' centres.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +22,7 @@ from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.fit.frf_regression import THINNEST, fit_response, prepare_response
+from ident.fit.frf_regression import THINNEST, FrfRegression, fit_response, prepare_response
 from ident.search.pole_search import PoleSearch
 
 # A model of a loop's logs outside most of its own ellipses explains nothing: machines whose certificates held
@@ -27,9 +33,28 @@ MOST_INSIDE_PERCENT = 50.0
 def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike) -> GobfModel:
     """GOBF model on given poles whose response stays closest to the posterior mean, in units of its ellipses.
 
-    Coefficients (and the direct term, where the posterior has one) minimise the sum over omega (F,) of e^T
-    P^-1 e, e the error of (Re, Im), P the posterior covariance. Raises ValueError when omega has too few
-    frequencies.
+    Parameters
+    ----------
+    posterior : ResponsePosterior
+        Gives structure, names and unstable poles of the model, too.
+    poles : Poles
+        In z, as many as the model gets.
+    omega_rad_s : array_like, shape (F,)
+        Frequencies at which the responses are compared, rad/s.
+
+    Returns
+    -------
+    GobfModel
+
+    Raises
+    ------
+    ValueError
+        When there are too few frequencies for the coefficients.
+
+    Notes
+    -----
+    Coefficients (and the direct term, where the posterior has one) minimise the sum over omega of e^T P^-1 e,
+    e the error of (Re, Im), P the posterior covariance.
     """
     return next(nominals_near(posterior, poles, omega_rad_s))
 
@@ -37,53 +62,93 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
 def nominals_near(
     posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.ArrayLike
 ) -> Iterator[GobfModel]:
-    """The nearest models (`nominal_near`) on given poles, on each taken twice, on those moved to where the
-    posterior has them, and with ever one pair more (`PoleSearch`), up to twice the given order and a pair;
-    unstable poles stay."""
+    """Nearest models (`nominal_near`) on better and better poles, one after the other.
+
+    Parameters
+    ----------
+    posterior, poles, omega_rad_s
+        As `nominal_near`.
+
+    Yields
+    ------
+    GobfModel
+        On the given poles, on each taken twice, on those moved to where the posterior has them, and with ever
+        one pair more (`PoleSearch`), up to twice the given order and a pair; unstable poles stay.
+
+    Raises
+    ------
+    ValueError
+        When there are too few frequencies for the coefficients.
+    """
+    data = _regression(posterior, omega_rad_s)
+    n_coefficients = poles.order + data.feedthrough
+    if data.y.size < n_coefficients:
+        raise ValueError(f"{data.z.size} frequencies do not determine {n_coefficients} coefficients")
+
+    # An integrator's pole at z = 0 is its zero, no dynamics: it is held, as are unstable poles. What is held
+    # stands first among the poles, in its own digits.
+    n_deadbeat = int(np.count_nonzero(poles.real == 0))
+    of_integrators = Poles(np.zeros(min(posterior.integrators, n_deadbeat)))
+    held = of_integrators.appended(posterior.unstable)
+    known = IdentOptions(integrators=of_integrators.order).with_unstable(posterior.unstable)
+    search = PoleSearch(data, known)
+
+    yield _nearest(data, poles, posterior)
+    yield _nearest(data, poles.doubled(), posterior)
+    start = held.appended(poles.without(held))
+    moved = search.descend(start, "nominal").poles
+    yield _nearest(data, moved, posterior)
+    while moved.order <= 2 * poles.order:
+        moved = search.add_pair(moved).poles
+        yield _nearest(data, moved, posterior)
+
+
+def _regression(posterior: ResponsePosterior, omega_rad_s: npt.ArrayLike) -> FrfRegression:
+    """The posterior's mean at omega (F,) as a measured response, with its ellipses as covariances.
+
+    Ellipses are at least `THINNEST` of the response wide, so that none is without weight.
+    """
     response = posterior.at(omega_rad_s)
+    thinnest = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
     data = prepare_response(
-        replace(
-            response,
-            covariance=response.covariance
-            + (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2),
-        ),
+        replace(response, covariance=response.covariance + thinnest),
         integrators=posterior.integrators,
         delay_samples=posterior.input_delay_samples,
         feedthrough=posterior.has_feedthrough,
     )
-    if data.y.size < poles.order + data.feedthrough:
-        raise ValueError(
-            f"{data.z.size} frequencies do not determine {poles.order + data.feedthrough} coefficients"
-        )
-    # An integrator's pole at z = 0 is its zero, no dynamics. What is held stands first, in its own digits.
-    held = Poles(np.zeros(min(posterior.integrators, int(np.count_nonzero(poles.real == 0)))))
-    known = IdentOptions(integrators=held.order).with_unstable(posterior.unstable)
-    data = replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
-    search, held = PoleSearch(data, known), held.appended(posterior.unstable)
-    tried: tuple[Poles, ...] = (poles, poles.doubled())
-    while True:
-        for each in tried:
-            fit = fit_response(data, each)
-            yield GobfModel(
-                poles=each,
-                coefficients=fit.coefficients,
-                dt_s=posterior.dt_s,
-                feedthrough=fit.feedthrough,
-                integrators=posterior.integrators,
-                input_delay_samples=posterior.input_delay_samples,
-                input_name=posterior.input_name,
-                output_name=posterior.output_name,
-                unstable=posterior.unstable,
-            )
-        if search.minima and each.order > 2 * poles.order:
-            return
-        start = held.appended(poles.without(held))
-        tried = ((search.add_pair(each) if search.minima else search.descend(start, "nominal")).poles,)
+    # Basis functions of a plant with unstable poles stand behind the inverse of their all-pass.
+    return replace(data, common=data.common / all_pass_response(posterior.unstable, data.z))
+
+
+def _nearest(data: FrfRegression, poles: Poles, posterior: ResponsePosterior) -> GobfModel:
+    """Model on these poles that is nearest to the data, with structure and names of the posterior."""
+    fit = fit_response(data, poles)
+    return GobfModel(
+        poles=poles,
+        coefficients=fit.coefficients,
+        dt_s=posterior.dt_s,
+        feedthrough=fit.feedthrough,
+        integrators=posterior.integrators,
+        input_delay_samples=posterior.input_delay_samples,
+        input_name=posterior.input_name,
+        output_name=posterior.output_name,
+        unstable=posterior.unstable,
+    )
 
 
 @dataclass(frozen=True)
 class NominalAgreement:
-    """How far the nominal model of the design is from the ellipses' centres, in ellipses."""
+    """How far the nominal model of the design is from the ellipses' centres, in ellipses.
+
+    Attributes
+    ----------
+    share_inside_percent : float
+        Share of the frequencies at which the nominal lies inside its ellipse.
+    largest_distance : float
+        Largest distance from the centre; 1 is the ellipse itself.
+    at_rad_s : float
+        Frequency of that distance, rad/s.
+    """
 
     share_inside_percent: float
     largest_distance: float
@@ -93,7 +158,7 @@ class NominalAgreement:
     def of(
         cls, frequency: FrequencyUncertainty, nominal: Callable[[RealArray], ComplexArray]
     ) -> NominalAgreement:
-        """Of a nominal response, rad/s (F,) to G (F,), over the frequencies of the ellipses."""
+        """Agreement of a nominal response, rad/s (F,) to G (F,), over the frequencies of the ellipses."""
         distance = frequency.normalised_distance(nominal(frequency.omega_rad_s))
         worst = int(np.argmax(distance))
         return cls(
@@ -107,5 +172,11 @@ class NominalAgreement:
         """What to say of a nominal that lies outside most of its ellipses; empty for others."""
         if self.share_inside_percent >= MOST_INSIDE_PERCENT:
             return []
-        told = {"outside_percent": 100 - self.share_inside_percent, "times": self.largest_distance}
-        return [finding(FindingKind.NOMINAL_OUTSIDE, **told, at_rad_s=self.at_rad_s)]
+        return [
+            finding(
+                FindingKind.NOMINAL_OUTSIDE,
+                outside_percent=100 - self.share_inside_percent,
+                times=self.largest_distance,
+                at_rad_s=self.at_rad_s,
+            )
+        ]
