@@ -4,13 +4,18 @@ To first order G - G0 = K(w) n with n of unit normals, from the Gauss-Newton cov
 free residues. With free residues at given poles it would be (noise covariance) x (input covariance P): G = G0
 + Lo D Li with Lo Lo^H the noise covariance, Li^H Li = P, D of independent complex normals. Poles and shapes
 add terms that are no such product. Lo stays, P is the mean over whitened outputs, and the ball |D|_F <=
-radius is as large as holds G: the quantile of a sum of weighted squares.
+radius is as large as holds G: the quantile of a sum of weighted squares. `matrix_posterior` makes a
+`MatrixPosterior` from records and their identification; its `at` gives the balls (`MatrixUncertainty`) at any
+frequency, and its `input_factor` Li as a state space for a controller's design.
+
+Neglected: second order in the noise, and what the choice of order and shapes adds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -26,17 +31,41 @@ from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
 from ident.uncertainty.autoregression import fit_autoregression
 
-_AROUND = 41  # frequencies around a mode, beside those of the grid, whose largest radius stands for all
-_AR_ORDER = 16  # at most, of the noise
-_DRAWS = 20_000  # of the sum of squares: its 95 % quantile then is right to about 1 %
+# Frequencies around a mode, beside those of the grid, whose largest radius stands for all.
+_AROUND_MODE = 41
+# Half widths of a mode's peak that they reach to either side; they are a quarter of one apart.
+_HALF_WIDTHS = 5
+# Share of the Nyquist frequency up to which radii are looked at: at it the response is real, and its
+# covariance singular.
+_NEAR_NYQUIST = 0.999
+# Largest order of the noise model of an output; the data choose up to it.
+_AR_ORDER = 16
+# Rows of the longest record for each order that is tried.
+_ROWS_PER_ORDER = 20
+# Draws of the sum of squares: its 95 % quantile then is right to about 1 %.
+_DRAWS = 20_000
+# Share of the lowest frequency asked for down to which an integrator is one; see `input_factor`.
+_INTEGRATES_TO = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class MatrixUncertainty:
-    """|Lo^-1 (G - G0) Li^-1|_F <= radius at every frequency.
+    """Balls |Lo^-1 (G - G0) Li^-1|_F <= radius, one at each frequency.
 
-    omega_rad_s (F,), centre (F, Y, U), output_factor Lo (Y, Y) in units of the outputs, input_factor Li
-    (F, U, U), radius (F,), dt_s, level: probability of holding the response, frequency by frequency.
+    Attributes
+    ----------
+    omega_rad_s : ndarray, shape (F,)
+    centre : ndarray, shape (F, Y, U), complex
+        G0, in units of the outputs per unit of the inputs.
+    output_factor : ndarray, shape (Y, Y)
+        Lo, in units of the outputs.
+    input_factor : ndarray, shape (F, U, U), complex
+        Li, per unit of the inputs.
+    radius : ndarray, shape (F,)
+    dt_s : float
+        Sampling time.
+    level : float
+        Probability of holding the response, frequency by frequency.
     """
 
     omega_rad_s: RealArray
@@ -52,22 +81,44 @@ class MatrixUncertainty:
         lock(self, "centre", "input_factor", dtype=np.complex128)
 
     def distance(self, response: ComplexArray) -> RealArray:
-        """|Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); up to 1 inside."""
-        left = np.linalg.solve(self.output_factor, response - self.centre)
-        inside = left @ np.linalg.inv(self.input_factor)
-        return np.asarray(np.linalg.norm(inside, axis=(1, 2)) / self.radius)
+        """Distance |Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); 1 is the ball."""
+        by_output = np.linalg.solve(self.output_factor, response - self.centre)
+        normalised = by_output @ np.linalg.inv(self.input_factor)
+        return np.asarray(np.linalg.norm(normalised, axis=(1, 2)) / self.radius)
 
     def holds(self, response: ComplexArray) -> npt.NDArray[np.bool_]:
         """Whether each response (F, Y, U) lies in its ball, (F,)."""
         return np.asarray(self.distance(response) <= 1)
 
 
+class InputFactor(NamedTuple):
+    """Stable state space of Li: x+ = A x + B u, Li u = C x + D u, at the model's sampling time.
+
+    a (n, n), b (n, U), c (m, n), d (m, U): as a state space Li has m outputs, up to one for each state and
+    input, with the same Li^H Li = P.
+    """
+
+    a: RealArray
+    b: RealArray
+    c: RealArray
+    d: RealArray
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class MatrixPosterior(Shown):
     """What records say of a matrix response, at any frequency: `at`.
 
-    model; output_factor Lo (Y, Y); modes, on outputs made white by it; covariance_factor of their numbers;
-    level: probability of holding the response, frequency by frequency.
+    Attributes
+    ----------
+    model : MimoModel
+    output_factor : ndarray, shape (Y, Y)
+        Lo, in units of the outputs.
+    modes : ModalFit
+        On outputs made white by Lo; of it matters how each of its P numbers changes the response.
+    covariance_factor : ndarray, shape (P, P')
+        Of these numbers.
+    level : float
+        Probability of holding the response, frequency by frequency.
     """
 
     model: MimoModel
@@ -78,80 +129,144 @@ class MatrixPosterior(Shown):
 
     @property
     def dt_s(self) -> float:
+        """Sampling time, s."""
         return self.model.dt_s
 
-    def input_factor(self, lowest_rad_s: float) -> tuple[RealArray, RealArray, RealArray, RealArray]:
-        """Stable state space (A, B, C, D) of Li without its radius, exact at all frequencies: Li^H Li = P.
+    def input_factor(self, lowest_rad_s: float) -> InputFactor:
+        """State space of Li without its radius, exact at all frequencies: Li^H Li = P.
 
-        An integrator is one down to a thousandth of lowest_rad_s; below, its uncertainty stays as there.
+        Parameters
+        ----------
+        lowest_rad_s : float
+            Lowest frequency that matters, rad/s. An integrator is one down to a thousandth of it; below, its
+            uncertainty stays as there, so that the state space is stable.
         """
-        a, b, rows = self.modes.response_states()
-        rows = np.einsum("pyn,pq->qyn", rows, self.covariance_factor).reshape(-1, rows.shape[2])
-        triangle: RealArray = np.asarray(np.linalg.qr(rows / np.sqrt(len(self.model.outputs)), mode="r"))
+        a, b, changes = self.modes.response_states()
+        n_outputs = len(self.model.outputs)
+        # A triangle of the rows of all outputs and all normals has the same C^H C as they, over the outputs.
+        by_normal = np.einsum("pyn,pq->qyn", changes, self.covariance_factor)
+        rows = by_normal.reshape(-1, changes.shape[2])
+        triangle: RealArray = np.asarray(np.linalg.qr(rows / np.sqrt(n_outputs), mode="r"))
         n, n_inputs = b.shape
-        c, d = triangle[:, :n], triangle[:, n:]
+        c = triangle[:, :n]
+        d = triangle[:, n:]
         for _ in range(self.model.integrators):
             # s+ = (1 - small) s + u, out = (1 - small) s + u: z/(z - 1 + small) in front of every input.
-            kept = 1 - 1e-3 * lowest_rad_s * self.dt_s
-            a = np.block([[a, kept * b], [np.zeros((n_inputs, n)), kept * np.eye(n_inputs)]])
-            b, c = np.vstack([b, np.eye(n_inputs)]), np.hstack([c, kept * d])
+            pole = 1 - _INTEGRATES_TO * lowest_rad_s * self.dt_s
+            below = np.zeros((n_inputs, n))
+            a = np.block([[a, pole * b], [below, pole * np.eye(n_inputs)]])
+            b = np.vstack([b, np.eye(n_inputs)])
+            c = np.hstack([c, pole * d])
             n += n_inputs
-        return a, b, c, d
+        return InputFactor(a, b, c, d)
 
     def largest_radius(self, lowest_rad_s: float) -> float:
-        """Of the balls from lowest_rad_s to the Nyquist frequency, on a grid with points around modes."""
-        poles, nyquist = self.model.poles, 0.999 * np.pi / self.dt_s
-        around = [
-            omega * (1 + zeta * np.linspace(-5, 5, _AROUND))
-            for omega, zeta in zip(poles.omega_rad_s(self.dt_s), poles.zeta(), strict=True)
-        ]
-        grid = np.unique(np.concatenate([np.geomspace(lowest_rad_s, nyquist, FREQUENCIES), *around]))
-        return float(np.max(self.at(grid[(grid >= lowest_rad_s) & (grid <= nyquist)]).radius))
+        """Largest radius of the balls from lowest_rad_s to the Nyquist frequency, on a grid.
+
+        The grid has points around the modes, where the radius changes fast.
+        """
+        poles = self.model.poles
+        nyquist = _NEAR_NYQUIST * np.pi / self.dt_s
+        half_widths = np.linspace(-_HALF_WIDTHS, _HALF_WIDTHS, _AROUND_MODE)
+        frequencies = [np.geomspace(lowest_rad_s, nyquist, FREQUENCIES)]
+        for omega, zeta in zip(poles.omega_rad_s(self.dt_s), poles.zeta(), strict=True):
+            frequencies.append(omega * (1 + zeta * half_widths))
+        grid = np.unique(np.concatenate(frequencies))
+        inside = (grid >= lowest_rad_s) & (grid <= nyquist)
+        return float(np.max(self.at(grid[inside]).radius))
 
     def at(self, omega_rad_s: RealArray) -> MatrixUncertainty:
-        """Balls at omega (F,), up to pi/dt (above 0 with integrators)."""
-        omega, model = np.asarray(omega_rad_s, dtype=np.float64), self.model
+        """Balls at frequencies (F,), rad/s, up to pi/dt, and above 0 with integrators.
+
+        Raises
+        ------
+        ValueError
+            Where the model leaves some input without uncertainty.
+        """
+        model = self.model
+        n_outputs = len(model.outputs)
+        omega = np.asarray(omega_rad_s, dtype=np.float64)
         front = front_response(omega, model.dt_s, model.integrators, model.input_delay_samples)
-        columns = self.modes.response_columns(omega) @ self.covariance_factor * front[:, None, None, None]
-        covariance = np.einsum("fyup,fyvp->fuv", columns.conj(), columns) / len(model.outputs)
+
+        # Change of the response (F, Y, U, P') with each unit normal, outputs white.
+        changes = self.modes.response_columns(omega) @ self.covariance_factor
+        changes = changes * front[:, None, None, None]
+        # P, (F, U, U), the mean over outputs, and Li as its upper triangle: Li^H Li = P.
+        covariance = np.einsum("fyup,fyvp->fuv", changes.conj(), changes) / n_outputs
         try:
-            upper = np.linalg.cholesky(covariance).conj().swapaxes(1, 2)
+            lower = np.linalg.cholesky(covariance)
         except np.linalg.LinAlgError:
-            least = omega[np.argmin(np.linalg.eigvalsh(covariance)[:, 0])]
+            smallest = np.linalg.eigvalsh(covariance)[:, 0]
+            worst = omega[np.argmin(smallest)]
             raise ValueError(
-                f"at {least:.3g} rad/s the model leaves some input without uncertainty: poles that nearly "
+                f"at {worst:.3g} rad/s the model leaves some input without uncertainty: poles that nearly "
                 "cancel, mostly below the excited band; give n_real and n_pairs, or excite lower frequencies"
             ) from None
-        turned = np.einsum("fyup,fuv->fyvp", columns, np.linalg.inv(upper))
-        flat = turned.reshape(omega.size, -1, turned.shape[-1])
-        weights = np.linalg.svd(np.concatenate([flat.real, flat.imag], axis=1), compute_uv=False) ** 2
-        squares = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1])) ** 2
-        radius: RealArray = np.sqrt(np.quantile(weights @ squares.T, self.level, axis=1)).astype(np.float64)
-        return MatrixUncertainty(
-            omega, model.frequency_response(omega), self.output_factor, upper, radius, model.dt_s, self.level
-        )
+        upper = lower.conj().swapaxes(1, 2)
+
+        # |D|_F^2 is a sum of squares of unit normals, weighted by the squared singular values of K Li^-1.
+        normalised = np.einsum("fyup,fuv->fyvp", changes, np.linalg.inv(upper))
+        by_normal = normalised.reshape(omega.size, -1, normalised.shape[-1])
+        real_and_imaginary = np.concatenate([by_normal.real, by_normal.imag], axis=1)
+        weights = np.linalg.svd(real_and_imaginary, compute_uv=False) ** 2
+        # The same draws each time: equal questions have equal answers.
+        normals = np.random.default_rng(0).standard_normal((_DRAWS, weights.shape[1]))
+        sums = weights @ (normals**2).T
+        radius: RealArray = np.sqrt(np.quantile(sums, self.level, axis=1)).astype(np.float64)
+        centre = model.frequency_response(omega)
+        return MatrixUncertainty(omega, centre, self.output_factor, upper, radius, model.dt_s, self.level)
 
 
 def matrix_posterior(
     records: Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
 ) -> MatrixPosterior:
-    """Posterior of the matrix response of an `identify_mimo`, first order in the noise, whose colour is that
-    of the residuals (an autoregression of each output), for the order and the shapes that were chosen. Raises
-    ValueError if the records are not its own, or poles repeat."""
-    model, structure = identification.model, identification.structure
+    """Posterior of the matrix response of an `identify_mimo`, to first order in the noise.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        Those that the identification was made from.
+    identification : MimoIdentification
+        Its model, its residuals, and which modes have one shape; order and shapes are taken as right.
+    level : float
+        Probability of holding the response, frequency by frequency.
+
+    Returns
+    -------
+    MatrixPosterior
+
+    Raises
+    ------
+    ValueError
+        If the records are not its own, or poles repeat.
+
+    Notes
+    -----
+    The colour of the noise is that of the residuals: an autoregression of each output, after Lo made them
+    independent of each other.
+    """
+    model = identification.model
     factor: RealArray = np.linalg.cholesky(identification.noise_covariance).astype(np.float64)
     white: RealArray = np.linalg.inv(factor).astype(np.float64)
-    data = prepare_outputs(whitened(records, white), structure)
-    rows = sum(len(part) for part in identification.residuals)
-    if data.each[0].n_samples != rows:
+    data = prepare_outputs(whitened(records, white), identification.structure)
+    n_rows = sum(len(residual) for residual in identification.residuals)
+    n_given = data.each[0].n_samples
+    if n_given != n_rows:
         raise ValueError(
-            f"the records have {data.each[0].n_samples} rows, the identification {rows}: expected the "
+            f"the records have {n_given} rows, the identification {n_rows}: expected the "
             "records it was made from"
         )
-    own = np.einsum("xy,yub->xub", white, model.coefficients)
-    modes = modes_of(model.poles, own, identification.n_fixed, identification.rank_one or None)
+    white_coefficients = np.einsum("xy,yub->xub", white, model.coefficients)
+    rank_one = identification.rank_one or None
+    modes = modes_of(model.poles, white_coefficients, identification.n_fixed, rank_one)
     fit = ModalFit(data, modes)
-    each = [(residual @ white.T).T for residual in identification.residuals]
-    order = min(_AR_ORDER, max(1, max(one.shape[1] for one in each) // 20))
-    noise = [fit_autoregression([one[k] for one in each], order) for k in range(len(white))]
+
+    # One noise model for each output, from the residuals of all records.
+    white_residuals = [(residual @ white.T).T for residual in identification.residuals]
+    longest = max(residual.shape[1] for residual in white_residuals)
+    order = min(_AR_ORDER, max(1, longest // _ROWS_PER_ORDER))
+    noise = []
+    for k in range(len(white)):
+        residuals_of_output = [residual[k] for residual in white_residuals]
+        noise.append(fit_autoregression(residuals_of_output, order))
     return MatrixPosterior(model, factor, fit, fit.covariance_factor(noise), level)
