@@ -3,18 +3,18 @@
 A pole pair is stable when its counterpart in the fit with one pair less lies within 1 % in frequency and 5 %
 in damping (Peeters and De Roeck, Mechanical Systems and Signal Processing 13(6), 1999; their mode shapes need
 several sensors). Each order is grown from the one below, so that a pair on a peak of the noise stays, too.
-Hence a pair has to be needed: without it Ne ln(J0/J1) exceeds 4 ln Ne, the criterion of the order (design
-4.3).
+Hence a pair has to be needed: without it Ne ln(J0/J1) exceeds 4 ln Ne, the criterion of the order selection,
+with J1 and J0 the sums of squares with and without it and Ne the number of independent samples.
+`stabilisation` makes the fits and compares them; `Stabilisation.columns` are the modes that stayed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from ident.basis.options import IdentOptions
 from ident.coloured_noise import prewhitened
@@ -27,13 +27,18 @@ from ident.identification import Identification
 from ident.search.order_selection import Progress
 from ident.search.pole_search import PoleSearch
 
-FREQUENCY_TOLERANCE = 0.01  # Peeters and De Roeck, see above
-DAMPING_TOLERANCE = 0.05  # the same
-
-_BEYOND_CHOSEN = 3  # pairs: stable in two fits beyond the model's shows in these
+# Relative difference in frequency up to which a pair has stayed (Peeters and De Roeck, see above).
+FREQUENCY_TOLERANCE = 0.01
+# Relative difference in damping up to which a pair has stayed (Peeters and De Roeck, see above).
+DAMPING_TOLERANCE = 0.05
+# Pairs beyond the model's that are tried: a mode that is stable in two fits beyond it shows in these.
+_BEYOND_CHOSEN = 3
 # More samples than this say no more about which modes stay, and a dozen fits of order 20 take their time.
 _MOST_SAMPLES = 10_000
-_MOST_PAIRS = 12  # as many as `IdentOptions.n_pairs` takes
+# Pairs that are tried at most, as many as `IdentOptions.n_pairs` takes.
+_MOST_PAIRS = 12
+# Factor on ln Ne that the gain of a needed pair exceeds, as in `search.order_selection`.
+_NEEDED = 4
 
 
 class StableMode(NamedTuple):
@@ -45,11 +50,31 @@ class StableMode(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stabilisation:
-    """Pole pairs (K,) of fits with 0, 1, 2 ... pairs (S,), and rss (S,) of each fit.
+    """Fits with 0, 1, 2 ... pole pairs, and of each of their K pole pairs whether it stays and is needed.
 
-    n_real: real poles of every fit, known ones not counted; chosen: pairs of the model. By pole pair: n_pairs
-    of its fit, ascending; omega_rad_s, zeta; previous, index of its counterpart with one pair less within
-    `FREQUENCY_TOLERANCE`, else -1; same_damping, within `DAMPING_TOLERANCE`; needed by the data in that fit.
+    Attributes
+    ----------
+    rss : ndarray, shape (S,)
+        Sum of squares of each of the S fits, output units squared.
+    n_real : int
+        Real poles of every fit, known ones not counted.
+    chosen : int
+        Pairs of the model.
+    n_pairs : ndarray of int, shape (K,)
+        Pairs of the fit that the pair is from, ascending.
+    omega_rad_s, zeta : ndarray, shape (K,)
+        Natural frequency and damping ratio.
+    previous : ndarray of int, shape (K,)
+        Index of the counterpart with one pair less, within `FREQUENCY_TOLERANCE`; -1 without one.
+    same_damping : ndarray of bool, shape (K,)
+        Whether the counterpart's damping is within `DAMPING_TOLERANCE`.
+    needed : ndarray of bool, shape (K,)
+        Whether the data would miss the pair in its fit.
+
+    Raises
+    ------
+    ValueError
+        If the arrays do not have one entry per pole pair.
     """
 
     rss: RealArray
@@ -66,27 +91,32 @@ class Stabilisation:
         lock(self, "rss", "omega_rad_s", "zeta")
         lock(self, "n_pairs", "previous", dtype=np.int64)
         lock(self, "same_damping", "needed", dtype=np.bool_)
-        each = (self.omega_rad_s, self.zeta, self.previous, self.same_damping, self.needed)
-        if any(array.shape != self.n_pairs.shape for array in each):
+        per_pair = (self.omega_rad_s, self.zeta, self.previous, self.same_damping, self.needed)
+        if any(array.shape != self.n_pairs.shape for array in per_pair):
             raise ValueError("need one entry per pole pair (K,)")
 
     @property
     def stable(self) -> BoolArray:
-        """(K,): same frequency and same damping as with one pair less."""
-        return np.asarray((self.previous >= 0) & self.same_damping)
+        """Whether each pair has the same frequency and damping as with one pair less, (K,)."""
+        has_counterpart = self.previous >= 0
+        return np.asarray(has_counterpart & self.same_damping)
 
     def columns(self) -> tuple[StableMode, ...]:
         """Modes that are stable and needed in at least two fits, by frequency."""
+        # Pairs that are each other's counterparts are a chain, named by its first pair. Fits ascend, so that
+        # a counterpart has been given its chain already.
         chain = np.arange(self.n_pairs.size)
-        for k in range(self.n_pairs.size):  # ascending: the counterpart has been given its chain already
+        for k in range(self.n_pairs.size):
             if self.previous[k] >= 0:
                 chain[k] = chain[self.previous[k]]
         modes = []
-        for start in np.unique(chain):
-            here = np.flatnonzero((chain == start) & self.stable & self.needed)
-            if here.size > 1:  # in one fit alone nothing has stayed
-                omega, zeta = np.mean(self.omega_rad_s[here]), np.mean(self.zeta[here])
-                modes.append(StableMode(float(omega), float(zeta)))
+        for first in np.unique(chain):
+            in_column = np.flatnonzero((chain == first) & self.stable & self.needed)
+            # In a single fit nothing has stayed.
+            if in_column.size > 1:
+                omega = float(np.mean(self.omega_rad_s[in_column]))
+                zeta = float(np.mean(self.zeta[in_column]))
+                modes.append(StableMode(omega, zeta))
         return tuple(sorted(modes))
 
 
@@ -98,33 +128,55 @@ def stabilisation(
     max_pairs: int | None = None,
     progress: Progress | None = None,
 ) -> Stabilisation:
-    """Fits with 0, 1, ... max_pairs pole pairs around an identification `found` of these records and options.
+    """Fits with 0, 1, ... max_pairs pole pairs around an identification of these records, compared.
 
-    max_pairs: default three more than were chosen, at most twelve; the data may end it earlier. Real poles
-    and structure are those of the model, at its number of pairs the poles, too. Long records are thinned.
+    Parameters
+    ----------
+    records : sequence of Record
+        One input, one output each. Long ones are thinned.
+    found : Identification
+        Of these records and options: its noise model, structure and number of real poles hold for every fit,
+        its poles are a start for the fit with as many pairs.
+    options : IdentOptions, optional
+    max_pairs : int, optional
+        Default three more than were chosen, at most twelve; the data may end it earlier.
+    progress : callable, optional
+        Told the share that is done, 0 to 1, and what is being done.
+
+    Returns
+    -------
+    Stabilisation
     """
     options = options or IdentOptions()
     records = [prewhitened(record, found.noise) for record in records]
     part, in_mid_record = thinned(records, min(options.search_samples, _MOST_SAMPLES))
-    structure = replace(found.structure, estimate_initial_state=True) if in_mid_record else found.structure
+    structure = found.structure
+    if in_mid_record:
+        structure = replace(structure, estimate_initial_state=True)
     data = prepare(part, structure)
     search = PoleSearch(data, options)
     fixed_real, fixed_pairs = search.fixed.counts
     n_real = found.model.poles.real.size - fixed_real
     chosen = found.model.poles.pairs.size - fixed_pairs
-    most = min(chosen + _BEYOND_CHOSEN, _MOST_PAIRS) if max_pairs is None else max_pairs
+    if max_pairs is None:
+        max_pairs = min(chosen + _BEYOND_CHOSEN, _MOST_PAIRS)
+
+    # Each fit grows from the one with a pair less.
+    explained = EXPLAINED * float(data.y @ data.y)
     fits: list[Refined] = []
-    for count in range(most + 1):
+    for count in range(max_pairs + 1):
         if progress is not None:
-            progress(count / (most + 1), f"{count} pole pairs")
-        if not data.n_samples > 2 * data.n_parameters(search.fixed.order + n_real + 2 * count):
+            progress(count / (max_pairs + 1), f"{count} pole pairs")
+        n_poles = search.fixed.order + n_real + 2 * count
+        if not data.n_samples > 2 * data.n_parameters(n_poles):
             break
-        if fits and fits[-1].rss <= EXPLAINED * float(data.y @ data.y):
+        if fits and fits[-1].rss <= explained:
             break
         end = search.joint(n_real, 0) if count == 0 else search.add_pair(fits[-1].poles)
         if count == chosen:
-            known = search.descend(found.model.poles, "the model's own poles")
-            end = min(known, end, key=lambda candidate: candidate.rss)
+            # The poles of the model may be the better end.
+            from_model = search.descend(found.model.poles, "the model's own poles")
+            end = min(from_model, end, key=lambda candidate: candidate.rss)
         fits.append(end)
     return _compared(data, fits, n_real, chosen, fixed_pairs)
 
@@ -132,37 +184,70 @@ def stabilisation(
 def _compared(
     data: Regression, fits: Sequence[Refined], n_real: int, chosen: int, fixed_pairs: int
 ) -> Stabilisation:
-    columns: list[tuple[npt.NDArray[Any], ...]] = [(np.zeros(0),) * 6]
-    start, omega_before, zeta_before = 0, np.zeros(0), np.zeros(0)
+    """The pairs of all fits with their counterparts, and whether each is needed.
+
+    fits: with 0, 1, 2 ... pairs beside the first fixed_pairs, which are known and not drawn. n_real, chosen:
+    as in `Stabilisation`.
+    """
+    # A sum of squares below what counts as explained is rounding, and so would be a ratio of two.
+    smallest = float(np.finfo(np.float64).tiny)
+    floor = max(EXPLAINED * float(data.y @ data.y), smallest)
+    n_pairs: list[RealArray] = [np.zeros(0)]
+    omegas: list[RealArray] = [np.zeros(0)]
+    zetas: list[RealArray] = [np.zeros(0)]
+    previous: list[RealArray] = [np.zeros(0)]
+    same_damping: list[BoolArray] = [np.zeros(0, dtype=np.bool_)]
+    needed: list[BoolArray] = [np.zeros(0, dtype=np.bool_)]
+    first_of_previous = 0
     for count, end in enumerate(fits):
-        order = np.argsort(end.poles.omega_rad_s(data.dt_s)[fixed_pairs:]) + fixed_pairs
-        omega, zeta = end.poles.omega_rad_s(data.dt_s)[order], end.poles.zeta()[order]
+        # The drawn pairs of this fit, by frequency.
+        all_omega = end.poles.omega_rad_s(data.dt_s)
+        order = np.argsort(all_omega[fixed_pairs:]) + fixed_pairs
+        omega = all_omega[order]
+        zeta = end.poles.zeta()[order]
+
+        # Their counterparts in the fit with one pair less.
+        omega_before = omegas[-1]
+        zeta_before = zetas[-1]
         match = _counterparts(omega, omega_before)
-        known, same = match >= 0, np.zeros(omega.size, dtype=np.bool_)
-        there = zeta_before[match[known]]
-        same[known] = np.abs(zeta[known] - there) < DAMPING_TOLERANCE * there
-        previous = np.where(known, match + start - omega_before.size, -1)
+        has_counterpart = match >= 0
+        zeta_of_match = zeta_before[match[has_counterpart]]
+        away = np.abs(zeta[has_counterpart] - zeta_of_match)
+        same = np.zeros(omega.size, dtype=np.bool_)
+        same[has_counterpart] = away < DAMPING_TOLERANCE * zeta_of_match
+        index = np.where(has_counterpart, match + first_of_previous, -1)
+        first_of_previous += omega_before.size
+
         # Whether the data miss each pair when it is taken out and the other poles stay where they are.
-        worth = data.colour(data.residual(end.poles)).effective_samples
-        floor = max(EXPLAINED * float(data.y @ data.y), float(np.finfo(np.float64).tiny))
-        without = [max(fit(data, end.poles.without_pair(index)).rss, floor) for index in order]
-        columns.append(
-            (
-                np.full(omega.size, count),
-                omega,
-                zeta,
-                previous,
-                same,
-                np.asarray(worth * np.log(np.array(without) / max(end.rss, floor)) > 4 * np.log(worth)),
-            )
-        )
-        start, omega_before, zeta_before = start + omega.size, omega, zeta
-    rss = np.array([end.rss for end in fits])
-    return Stabilisation(rss, n_real, chosen, *map(np.concatenate, zip(*columns, strict=True)))
+        independent_samples = data.colour(data.residual(end.poles)).effective_samples
+        without = [max(fit(data, end.poles.without_pair(pair)).rss, floor) for pair in order]
+        ratio = np.array(without) / max(end.rss, floor)
+        gain = independent_samples * np.log(ratio)
+
+        n_pairs.append(np.full(omega.size, count))
+        omegas.append(omega)
+        zetas.append(zeta)
+        previous.append(index)
+        same_damping.append(same)
+        needed.append(np.asarray(gain > _NEEDED * np.log(independent_samples)))
+    return Stabilisation(
+        rss=np.array([end.rss for end in fits]),
+        n_real=n_real,
+        chosen=chosen,
+        n_pairs=np.concatenate(n_pairs),
+        omega_rad_s=np.concatenate(omegas),
+        zeta=np.concatenate(zetas),
+        previous=np.concatenate(previous),
+        same_damping=np.concatenate(same_damping),
+        needed=np.concatenate(needed),
+    )
 
 
 def _counterparts(omega: RealArray, before: RealArray) -> IntArray:
-    """For each frequency the index of its counterpart, nearest first and each used once; -1 without one."""
+    """Index of the counterpart of each frequency among those before, nearest first, each used once.
+
+    omega (K,), before (L,), rad/s; (K,), -1 where none within `FREQUENCY_TOLERANCE` is left.
+    """
     match = np.full(omega.size, -1)
     if before.size == 0:
         return match
