@@ -131,9 +131,9 @@ def test_what_cannot_be_combined_is_refused():
     rng = np.random.default_rng(4)
     one = condition(rng)[1]
     other = ResponsePosterior(Poles([0.8, 0.7, 0.1]), one.mean, one.covariance_factor, DT)
-    with pytest.raises(ValueError, match="at least two"):
+    with pytest.raises(ValueError, match=r"two.* 1$"):
         combine_posteriors([one])
-    with pytest.raises(ValueError, match="differ in poles"):
+    with pytest.raises(ValueError, match="poles"):
         combine_posteriors([one, other])
-    with pytest.raises(ValueError, match="at least four"):
+    with pytest.raises(ValueError, match=r"four.* 3$"):
         combine_posteriors([one, one, one], small_sample_level=0.95)

@@ -6,9 +6,21 @@ from scipy import signal
 
 from ident import GobfModel, IdentOptions, Poles, Record, band_limited, identify
 from ident.basis.options import EmbeddingOptions
-from ident.uncertainty import embedding
 from ident.uncertainty.autoregression import fit_autoregression
-from ident.uncertainty.embedding import tangent, tangent_beside
+from ident.uncertainty.embedding import tangent, tangent_beside, tangent_rows
+from ident.uncertainty.embedding_algebra import (
+    alternating_factor,
+    conditional_posterior,
+    evaluate_grid,
+    exponential_factor,
+    grid_weights,
+    joint_factor,
+    kernel_grid,
+    kernel_spectrum,
+    reduce_regression,
+    tc_factor,
+)
+from ident.uncertainty.embedding_rows import Beside
 from tests.ident.test_embedding_algebra import dense_posterior
 from validation.paper.classical import classical
 
@@ -83,8 +95,8 @@ def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
         fast = np.argsort(np.argsort(np.abs(np.gradient(y)))) * 8 // n
         y = y * (1 + share * (fast >= 4)) + 0.01 * rng.standard_normal(n)
         records, nothing = [Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], np.zeros((n, 0))
-        beside = [embedding.Beside(nothing, nothing)]
-        found = [tangent_beside(records, model, beside, classes=given)[0] for given in ([], [fast])]
+        beside = [Beside(nothing, nothing)]
+        found = [tangent_beside(records, model, beside, classes=given).response for given in ([], [fast])]
         widths.append([np.median(one.at(OMEGA).ellipse(0.95).semi_major) for one in found])
     plain, wider = np.median(widths, axis=0)
     assert plain <= wider < 1.6 * plain if share == 0 else wider > 2.5 * plain
@@ -170,8 +182,11 @@ def dense(records, poles, structure, alpha, lam, s2, length):
     return mean[wanted], covariance[wanted, wanted]
 
 
+SHAPES = [tc_factor, exponential_factor, alternating_factor]
+
+
 @pytest.mark.parametrize("structure", [(0, 0, False), (0, 2, True), (1, 1, True)])
-def test_whole_path_equals_dense_formulas(structure, monkeypatch):
+def test_whole_path_equals_dense_formulas(structure):
     integrators, delay, direct = structure
     rng = np.random.default_rng(5)
     poles, length = np.array([0.8, 0.3]), 15
@@ -184,20 +199,34 @@ def test_whole_path_equals_dense_formulas(structure, monkeypatch):
         records.append(Record("r", u, y, DT, ("u",), ("y",)))
     model = GobfModel(Poles(poles), np.zeros(2), DT, integrators=integrators, input_delay_samples=delay)
     options = EmbeddingOptions(fir_length=length, feedthrough=direct, prior_missed_mode=0.0)
-    one = lambda grid, _: ((grid.log_likelihood == grid.log_likelihood.max()).astype(float), 0.0)  # noqa: E731
-    monkeypatch.setattr(embedding, "grid_weights", one)  # the likeliest alone, as in the dense formulas
-    posterior = tangent(records, model, options)
-    report = posterior.report
-    assert report.n_rows == 160 - 2 * delay - 2 * (max(1, integrators) + 4)
-    mean, covariance = dense(
-        records, np.repeat(poles, 2), structure, report.alpha, report.lam, report.noise_std**2, length
+
+    # Of one kernel the rows of the records give what the dense formulas give.
+    reduced = reduce_regression(tangent_rows(records, model, options).blocks())
+    lam, energy = 0.7, np.array([30.0])
+    spectrum = kernel_spectrum(reduced, lam, tc_factor(lam, length))
+    grid = evaluate_grid(reduced, [spectrum], energy, np.ones(1))
+    kernel = conditional_posterior(grid, np.ones((1, 1)), 0.0)
+    mean, factor = joint_factor(reduced, kernel)
+    dense_mean, dense_covariance = dense(
+        records, np.repeat(poles, 2), structure, kernel.alpha, lam, kernel.noise_variance, length
     )
+    posterior = tangent(records, model, options)
     rows = posterior.frequency_rows(np.array([1.0, 30.0, 400.0]))
-    np.testing.assert_allclose(rows @ posterior.mean, rows @ mean, rtol=1e-7)
-    ours = rows @ posterior.covariance_factor @ posterior.covariance_factor.T @ rows.conj().T
-    theirs = rows @ covariance @ rows.conj().T
+    np.testing.assert_allclose(rows @ mean, rows @ dense_mean, rtol=1e-7)
+    ours = rows @ factor @ factor.T @ rows.conj().T
+    theirs = rows @ dense_covariance @ rows.conj().T
     # 1e-7: the pseudo-inverse of the dense path squares the condition of the doubled regressors.
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-7 * np.abs(theirs).max())
+
+    # The posterior is the average of such ones.
+    grid = kernel_grid(reduced, SHAPES, order_given=False)
+    kernel = conditional_posterior(grid, *grid_weights(grid, options.no_remainder))
+    mean, factor = joint_factor(reduced, kernel)
+    np.testing.assert_allclose(posterior.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(posterior.covariance_factor, factor, rtol=1e-12)
+    report = posterior.report
+    assert report.noise_std == pytest.approx(np.sqrt(kernel.noise_variance))
+    assert report.n_rows == 160 - 2 * delay - 2 * (max(1, integrators) + 4)
 
 
 def test_initial_state_and_offset_do_not_disturb_the_estimate():
@@ -214,14 +243,14 @@ def test_initial_state_and_offset_do_not_disturb_the_estimate():
 def test_bad_input_is_refused():
     arm = random_arm(np.random.default_rng(8), n_samples=300)
     model = arm.model()
-    with pytest.raises(ValueError, match="at least one record"):
+    with pytest.raises(ValueError, match="record"):
         tangent([], model)
-    with pytest.raises(ValueError, match="dt_s"):
+    with pytest.raises(ValueError, match=rf"dt_s = {DT}, .* {2 * DT}"):
         tangent([arm.record], GobfModel(model.poles, np.zeros(8), 2 * DT))
-    with pytest.raises(ValueError, match="do not determine"):
+    with pytest.raises(ValueError, match=r"400 .*fir_length"):
         tangent([arm.record], model, EmbeddingOptions(fir_length=400))
     wide = Record("w", np.zeros((50, 2)), np.zeros((50, 1)), DT, ("a", "b"), ("y",))
-    with pytest.raises(ValueError, match="one input"):
+    with pytest.raises(ValueError, match=r"record 'w'.*'a', 'b'"):
         tangent([wide], model)
     short = tangent([arm.record], model)
     assert 0 < short.fir_length < 150
@@ -236,7 +265,7 @@ def test_autoregression_finds_order_and_coefficients():
     # sd of an AR coefficient is at most 1 / sqrt(8000) = 0.011
     np.testing.assert_allclose(found.a_polynomial, true, atol=0.045)
     assert fit_autoregression([rng.standard_normal(5000)], 8).is_white
-    with pytest.raises(ValueError, match="more than 16 samples"):
+    with pytest.raises(ValueError, match=r"order 8.*16"):
         fit_autoregression([np.zeros(10)], 8)
 
 

@@ -82,5 +82,5 @@ def test_known_poles_are_not_drawn():
 
 
 def test_shapes_are_checked(p2_plot):
-    with pytest.raises(ValueError, match="per pole pair"):
+    with pytest.raises(ValueError, match="pole pair"):
         replace(p2_plot, zeta=p2_plot.zeta[:-1])
