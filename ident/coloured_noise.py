@@ -44,7 +44,8 @@ _ROWS_PER_ORDER = 13
 _RESIDUAL_ORDER = 12
 # Level over the median of a smoothed spectrum from which on a line is no white noise: a mean over twelve
 # independent lines, as many as there are among 25 of a spectrum padded to twice its length, exceeds twice its
-# median in 0.4 % of places.
+# median in 0.4 % of places. Halved or
+# doubled, both modes are still found under dry friction (tests/ident/test_coloured_noise.py).
 _FLOOR_OVER_MEDIAN = 2
 
 

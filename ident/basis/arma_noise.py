@@ -21,9 +21,9 @@ from ident.data.arrays import RealArray, lock
 # Share of its beginning below which the memory of 1 / C counts as gone. Whitening and the expansion of A / C
 # are exact to this share. Halved in its exponent, a zero at .9 needs 100 first rows in place of 200.
 _DIED_OUT = 1e-9
-# Rows that the memory of 1 / C may last: their covariance is factored, which takes a tenth of a second for so
-# many, and eight times as long for twice as many. It allows zeros up to .9897.
-_LONGEST_MEMORY = 2000
+# Rows that the memory of 1 / C may last, which allows zeros up to .9795: their covariance is factored, which
+# takes a tenth of a second for so many, and eight times as long for twice as many.
+_LONGEST_MEMORY = 1000
 
 
 @dataclass(frozen=True, eq=False)

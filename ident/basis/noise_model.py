@@ -21,8 +21,7 @@ from ident.data.arrays import RealArray
 # Largest over smallest variance among the directions of a record's first rows up to which they are whitened.
 # Beyond it they are left out: the start of a record is never quite stationary, and whitening would multiply
 # what is not by up to the root of this number, 100. From 1e2 to 1e8 no ellipse of ten simulated arms in noise
-# with a pole at .9 moved by 1 %; records filtered to a narrow band, whose noise models have 1e7 and more,
-# need the limit (tests/ident/test_embedding.py).
+# with a pole at .9 moved by 1 %.
 LARGEST_CONDITION = 1e4
 
 

@@ -24,14 +24,16 @@ from ident.uncertainty.embedding import common_fir_length, tangent, tangent_rows
 from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 
 # Errors at two times count together up to so many time constants of the slowest pole: e^-3 = 5 % of its
-# motion is left then.
+# motion is left then. Halved or doubled, the predicted scatter of 72 sweeps stays within the limits of
+# tests/ident/test_conditions.py.
 _TIME_CONSTANTS = 3.0
-# They count together over this share of a record at most: ten stretches are the least to take a scatter from.
+# They count together over this share of a record at most: ten stretches are few to take a scatter from.
+# Halved, the predicted scatter of 72 sweeps stays within the limits of tests/ident/test_conditions.py.
 _LONGEST_WINDOW = 0.1
 # Magnitude that the slowest pole is taken to have at least, so that it has a time constant: one of .1 is over
 # within a sample or two, and the window of one row then stays.
 _FASTEST_POLE = 0.1
-# Groups of so many repeats predict one by the others; two of them would differ by a single number.
+# Repeats of a group from which on one is predicted by the others: a single other has nothing to differ from.
 _FEWEST_REPEATS = 3
 # Conditions from which Hotelling's region is given: at 95 % it makes ellipses 3.1 times as wide for four, and
 # 11.5 times for three, which would say nothing.

@@ -62,17 +62,18 @@ from ident.uncertainty.undetected_mode import (
 )
 
 # Taps of the kernel, as far as the records can carry it. Halved or doubled, the median ellipse of twenty
-# simulated arms moved by .1 %, and the time doubles with it.
+# simulated arms moved by .1 %; the time grows with it.
 _DEFAULT_FIR_LENGTH = 150
-# Taps of the kernel for a measured frequency response, as far as the frequencies can carry it: some hundred
-# frequencies are measured, where records have thousands of rows.
+# Taps of the kernel for a measured frequency response, as far as the frequencies can carry it. Chosen;
+# a measured response has some hundred points, where records have thousands of rows.
 _FRF_FIR_LENGTH = 60
 # Rows, or frequencies, for each tap: a kernel that is as long as the data are would explain all of them.
+# Chosen; it acts on records of fewer than some 500 rows.
 _ROWS_PER_TAP = 3
 # Slow, alike, near Nyquist: the rest stands anywhere (Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
 _SHAPES = (tc_factor, exponential_factor, alternating_factor)
 # Modes that the embedding adds at most: coloured noise hides them from a search that takes it for white. Of
-# twenty simulated arms none asked for a second one.
+# twenty simulated arms none asked for a second one; coloured noise that is taken for white asks for four.
 _MOST_ADDED = 5
 # Share of the output that is nothing beside its noise: a deviation of coefficients that is as good as none.
 _FREE = 1e-9
@@ -365,7 +366,7 @@ def _noise_std(rows: EmbeddingRows, stacked: StackedBlocks) -> float:
     nearly_free = replace(rows, known_std=_FREE * size)
     reduced = reduce_stacked(stack_blocks(nearly_free.known_blocks(), stacked))
     freedom = max(reduced.degrees_of_freedom - reduced.fir_length, 1)
-    return float(np.sqrt(reduced.rest / freedom))
+    return float(np.sqrt(reduced.unexplained / freedom))
 
 
 def tangent_rows(

@@ -139,6 +139,7 @@ class EmbeddingRows:
     def record_blocks(self) -> Iterator[RegressionBlock]:
         """Rows of each record with kernel columns; those that `first` zeroes are left out, as rows count."""
         for rows in self:
+            # A row of zeros agrees with everything, but would count among the degrees of freedom.
             n_dropped = 0
             if not np.any(rows.first):
                 n_dropped = len(rows.first)
@@ -159,8 +160,10 @@ class EmbeddingRows:
         for block, classes in zip(self.record_blocks(), self.classes, strict=True):
             p = block.regressors.shape[1]
             basis = nuisance_basis(block.nuisance)
+            # What the mean leaves, without what offset and initial state may be.
             residual = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
             without_nuisance = residual - basis @ (basis.T @ residual)
+            # A class by itself is no longer orthogonal to the nuisance.
             of_class = by_class(without_nuisance, classes)
             of_class_without = of_class - basis @ (basis.T @ of_class)
             total = total + of_class_without.T @ block.regressors
@@ -210,9 +213,11 @@ class EmbeddingRows:
         head = plain[:n_first]
         filtered = plain if noise.is_white else noise.filtered(plain)
 
+        # The first rows of these columns are those of the plain input, whitened by the matrix.
         regressors = self._driven(filtered)
         if n_first:
             regressors[:n_first] = first @ self._driven(head)
+        # Columns that no input drives are whitened as they are.
         if beside is not None:
             plain_columns = np.column_stack([beside.first, beside.columns])
             white_columns = noise.whiten(answered(plain_columns, delay))
@@ -270,8 +275,9 @@ def gls_residuals(
     absorbed = []
     # What is known beforehand is no record and leaves nothing.
     for block in replace(rows, noise=WHITE_NOISE).record_blocks():
+        # The residual, and the regressors scaled to length 1, before the nuisance is taken off both.
         residual = block.output - block.regressors @ mean[:p] - block.kernel @ mean[p:]
-        shared = block.regressors[:, reduced.kept] / scale
+        shared = block.regressors[:, reduced.in_use] / scale
         local = np.zeros((residual.size, 0))
         length = np.linalg.norm(block.nuisance, axis=0)
         nonzero = length > 0
@@ -291,6 +297,7 @@ def gls_residuals(
         scaled_triangle = (reduced.r11 / scale).T
         of_regressors = solve_triangular(scaled_triangle, shared.T, lower=True, check_finite=False).T
         columns = np.column_stack([local, of_regressors])
+        # Where rows were left out, the columns are what their whitened rows make from rest.
         if noise.drops_start:
             columns = noise.coloured(noise.whiten(columns))
         absorbed.append(columns)

@@ -35,12 +35,12 @@ from ident.uncertainty.autoregression import fit_autoregression
 _AROUND_MODE = 41
 # Half widths of a mode's peak that they reach to either side; they are a quarter of one apart.
 _HALF_WIDTHS = 5
-# Share of the Nyquist frequency up to which radii are looked at: at it the response is real, and its
-# covariance singular.
+# Share of the Nyquist frequency up to which radii are looked at: at it the response is real, and its ball is
+# that of half as many numbers.
 _NEAR_NYQUIST = 0.999
-# Largest order of the noise model of an output; the data choose up to it.
+# Largest order of the noise model of an output; BIC chooses up to it. Chosen.
 _AR_ORDER = 16
-# Rows of the longest record for each order that is tried.
+# Rows of the longest record for each order that is tried. Chosen.
 _ROWS_PER_ORDER = 20
 # Draws of the sum of squares: its 95 % quantile then is right to about 1 %.
 _DRAWS = 20_000

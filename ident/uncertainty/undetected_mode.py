@@ -46,8 +46,8 @@ _DECAY = 2.0
 # Periods that the slowest candidate makes in the record. The damping that `_DECAY` asks for is then still
 # light: 2 / (2 pi 6) = 0.053.
 _FEWEST_PERIODS = 6.0
-# Highest frequency of a candidate, rad/sample: 0.9 of Nyquist's, where a hold and a sensor's filter leave
-# little. Measured: at .8 or .99 of it, the median ellipse stays to .1 % and coverage to .1 %.
+# Highest frequency of a candidate, rad/sample: 0.9 of Nyquist's. Measured: at .8 or .99 of it, the median
+# ellipse stays to .1 % and coverage to .1 %.
 _HIGHEST = 0.9 * np.pi
 # Half bandwidths between neighbours in frequency: a mode half way loses a tenth of its energy to the nearest.
 # Measured: doubled, coverage of arms with a mode left out falls by .9 %; halved, nothing is gained.
@@ -61,8 +61,8 @@ _NEGLIGIBLE = 1e-4
 # Pairs that are kept at most: 24 columns of the posterior beside the 150 of its kernel. Measured: with 24 the
 # median ellipse stays to .1 %; six make single ones up to 26 % smaller.
 _MOST_PAIRS = 12
-# Samples of a record that stand in memory for all pairs at a time: a few megabytes, and the sums of products
-# over them stay in a processor's cache.
+# Samples of a record that stand in memory for all pairs at a time: a few megabytes, whatever the length of
+# the records. No number depends on it but by rounding.
 _BLOCK = 512
 # Share of the energy of a pair's columns that is rounding, after all else has been projected off them.
 # Measured: from 1e-12 to 1e-7 no ellipse moves by 1 %.
@@ -72,7 +72,7 @@ _ROUNDING = 1e-9
 _DISTINGUISHABLE = 1e-6
 # Rounds of `refined_pair`, each of half the step of the one before: the last step is 1/64 of a spacing.
 _REFINEMENTS = 6
-# Damping ratios between which a pair is refined: from that of a bell to that of a mode with hardly a peak.
+# Damping ratios between which a pair is refined: at .6 a mode has hardly a peak. Chosen.
 _REFINED_ZETA = (1e-3, 0.6)
 # Largest share of a residual that counts as explained: a double tells the rest from none.
 _MOST_EXPLAINED = 1 - 1e-15
@@ -253,7 +253,7 @@ def pair_statistics(
         # Orthonormal nuisance, regressors and output of this record.
         basis = nuisance_basis(block.nuisance)
         n_nuisance = basis.shape[1]
-        regressors = block.regressors[:, reduced.kept]
+        regressors = block.regressors[:, reduced.in_use]
         # Twice is enough: the second pass takes off what rounding left of the first.
         for _ in range(2):
             regressors = regressors - basis @ (basis.T @ regressors)
@@ -300,7 +300,7 @@ def pair_statistics(
         gram=symmetric - onto_regressors.transpose(0, 2, 1) @ onto_regressors,
         projection=inner[:, n_regressors].reshape(-1, 2),
         onto_regressors=onto_regressors,
-        residual=reduced.rest + float(reduced.z @ reduced.z),
+        residual=reduced.unexplained + float(reduced.z @ reduced.z),
         size=size,
     )
 

@@ -221,5 +221,5 @@ def test_a_record_longer_than_a_piece_is_reduced_as_if_it_were_whole():
     np.testing.assert_allclose(np.abs(reduced.r11), np.abs(triangle[:2, :2]), atol=1e-9)
     np.testing.assert_allclose(np.abs(reduced.r12), np.abs(triangle[:2, 2:5]), atol=1e-9)
     np.testing.assert_allclose(np.abs(reduced.r22), np.abs(triangle[2:5, 2:5]), atol=1e-9)
-    assert reduced.rest == pytest.approx(triangle[-1, -1] ** 2, rel=1e-10)
+    assert reduced.unexplained == pytest.approx(triangle[-1, -1] ** 2, rel=1e-10)
     assert reduced.n_rows == n - 1
