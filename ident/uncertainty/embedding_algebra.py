@@ -63,7 +63,8 @@ _LARGEST_ENERGY = 1e12
 _NEGLIGIBLE_WEIGHT = 1e-6
 # Least trace by which an energy is divided: a kernel that the input does not excite has scale infinity.
 _SMALLEST_TRACE = 1e-300
-# Share of the largest eigenvalue of a covariance below which a direction is rounding.
+# Share of the largest eigenvalue of a covariance below which a direction is rounding. From 1e-17 to
+# 1e-13 no ellipse of eight simulated arms moved by 1 %.
 _ROUNDING = 1e-15
 
 

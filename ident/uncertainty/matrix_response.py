@@ -38,7 +38,8 @@ _HALF_WIDTHS = 5
 # Share of the Nyquist frequency up to which radii are looked at: at it the response is real, and its ball is
 # that of half as many numbers.
 _NEAR_NYQUIST = 0.999
-# Largest order of the noise model of an output; BIC chooses up to it. Chosen.
+# Largest order of the noise model of an output; BIC chooses up to it. With half
+# of it balls hold the response as often as the tests ask for (tests/ident/test_several_outputs.py).
 _AR_ORDER = 16
 # Rows of the longest record for each order that is tried. Chosen.
 _ROWS_PER_ORDER = 20

@@ -71,8 +71,10 @@ _ROUNDING = 1e-9
 # Measured: from 1e-8 to 1e-4 no ellipse moves by 1 %.
 _DISTINGUISHABLE = 1e-6
 # Rounds of `refined_pair`, each of half the step of the one before: the last step is 1/64 of a spacing.
+# Measured on eight of the arms: with three rounds no ellipse moves by more than 1 %.
 _REFINEMENTS = 6
-# Damping ratios between which a pair is refined: at .6 a mode has hardly a peak. Chosen.
+# Damping ratios between which a pair is refined: at .6 a mode has hardly a peak. Measured on eight
+# of the arms: with 1e-4 to .9 no ellipse moves by 1 %.
 _REFINED_ZETA = (1e-3, 0.6)
 # Largest share of a residual that counts as explained: a double tells the rest from none.
 _MOST_EXPLAINED = 1 - 1e-15
