@@ -1,8 +1,14 @@
-"""What a loop of several joints has to do: one `Specification` per joint, and the controller's structure."""
+"""What a loop of several joints has to do: one `Specification` per joint, and the controller's structure.
+
+A joint is an output and an actuator with the same number. A matrix design reads of it what can be said of one
+channel: bandwidth, modulus margin, effort, limits. `weights` makes diagonal weights of them, one per
+requirement; `pattern` says which entries of the controller may differ from zero. `gram` is what the worst
+case needs of a diagonal weight.
+"""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -13,15 +19,37 @@ from control_design.specification.requirement import constant_weight
 from control_design.specification.specification import Specification, SpecificationError
 from ident.data.settings import Settings
 
-_READ = {
-    "bandwidth_rad_s", "integrator", "low_frequency_rejection", "modulus_margin", "effort_limit",
-    "effort_rolloff_rad_s", "input_limit", "rate_limit", "sensitivity_weight", "effort_weight",
+# Keys of a joint's specification that a matrix design reads; every other key is refused.
+_KEYS_OF_A_JOINT = {
+    "bandwidth_rad_s",
+    "integrator",
+    "low_frequency_rejection",
+    "modulus_margin",
+    "effort_limit",
+    "effort_rolloff_rad_s",
+    "input_limit",
+    "rate_limit",
+    "sensitivity_weight",
+    "effort_weight",
     "computational_delay_samples",
-}  # fmt: skip
+}
+
+
+class ChannelWeights(NamedTuple):
+    """Diagonal weight of one requirement.
+
+    signal: "y", a weight on S with one entry per output, or "u", on K S with one per actuator. weights: the
+    entries W(s), None where nothing is asked of a channel.
+    """
+
+    signal: str
+    weights: tuple[RationalWeight | None, ...]
 
 
 class MultivariableSpecification(Settings):
-    """joints[i] says what is asked of output i (bandwidth, modulus margin, integrator) and of actuator i
+    """Requirements on a loop with several inputs and outputs.
+
+    joints[i] says what is asked of output i (bandwidth, modulus margin, integrator) and of actuator i
     (effort, limits); with more outputs than actuators, or fewer, the longer of the two counts.
 
     The weighted sensitivity is W1 S with W1 = diag of the joints' tracking weights, the effort W3 K S alike,
@@ -39,25 +67,34 @@ class MultivariableSpecification(Settings):
     )
 
     @model_validator(mode="after")
-    def _read_keys_only(self) -> MultivariableSpecification:
+    def _only_keys_that_are_read(self) -> MultivariableSpecification:
+        """Return self; ValueError for a key that no matrix design reads, or delays that differ."""
         for number, joint in enumerate(self.joints):
-            left = sorted(joint.model_fields_set - _READ)
-            if left:
-                raise ValueError(f"joints[{number}]: {left[0]} is not part of a design for several joints")
-        if len({joint.computational_delay_samples for joint in self.joints}) > 1:
+            unread = sorted(joint.model_fields_set - _KEYS_OF_A_JOINT)
+            if unread:
+                raise ValueError(f"joints[{number}]: {unread[0]} is not part of a design for several joints")
+        delays = {joint.computational_delay_samples for joint in self.joints}
+        if len(delays) > 1:
             raise ValueError("computational_delay_samples must be the same for all joints")
         return self
 
     @property
     def computational_delay_samples(self) -> int:
+        """Samples between measuring and applying the commands, the same for all joints."""
         return self.joints[0].computational_delay_samples
 
     def pattern(self, inputs: int, outputs: int) -> Boolean:
-        """Entries of K that may differ from zero, (U, Y)."""
-        if len(self.joints) != max(inputs, outputs):
+        """Entries of K that may differ from zero, (U, Y), for U inputs and Y outputs of the plant.
+
+        Raises
+        ------
+        SpecificationError
+            The number of joints is not max(U, Y), or the structure has another shape or no entry.
+        """
+        n_joints = max(inputs, outputs)
+        if len(self.joints) != n_joints:
             raise SpecificationError(
-                f"{max(inputs, outputs)} joints needed for {inputs} inputs and {outputs} outputs; "
-                f"got {len(self.joints)}"
+                f"{n_joints} joints needed for {inputs} inputs and {outputs} outputs; got {len(self.joints)}"
             )
         if self.structure == "full":
             return np.ones((inputs, outputs), dtype=bool)
@@ -67,30 +104,49 @@ class MultivariableSpecification(Settings):
                     f"decentralised needs as many inputs as outputs; got {inputs}, {outputs}"
                 )
             return np.eye(inputs, dtype=bool)
-        found = np.array(self.structure, dtype=bool)
-        if found.shape != (inputs, outputs) or not found.any():
+        stated = np.array(self.structure, dtype=bool)
+        if stated.shape != (inputs, outputs) or not stated.any():
             raise SpecificationError(
-                f"structure must be ({inputs}, {outputs}) and not empty; got {found.shape}"
+                f"structure must be ({inputs}, {outputs}) and not empty; got {stated.shape}"
             )
-        return found
+        return stated
 
-    def weights(self, inputs: int, outputs: int) -> dict[str, tuple[str, tuple[RationalWeight | None, ...]]]:
-        """By requirement: "y" (on S) or "u" (on K S) and a weight per channel (None: not asked)."""
-        joints = self.joints
-        found: dict[str, tuple[str, tuple[RationalWeight | None, ...]]] = {
-            "tracking": ("y", tuple(joint.tracking_weight() for joint in joints[:outputs])),
-            "effort": ("u", tuple(joint.limit_weight() for joint in joints[:inputs])),
-            "modulus": ("y", tuple(constant_weight(joint.modulus_margin) for joint in joints[:outputs])),
+    def weights(self, inputs: int, outputs: int) -> dict[str, ChannelWeights]:
+        """Weights of the requirements "tracking", "effort" and "modulus" that are asked of some channel.
+
+        inputs, outputs: numbers U and Y of the plant; joints beyond them are left out.
+        """
+        at_outputs = self.joints[:outputs]
+        at_inputs = self.joints[:inputs]
+        tracking = tuple(joint.tracking_weight() for joint in at_outputs)
+        effort = tuple(joint.limit_weight() for joint in at_inputs)
+        modulus = tuple(constant_weight(joint.modulus_margin) for joint in at_outputs)
+        by_requirement = {
+            "tracking": ChannelWeights("y", tracking),
+            "effort": ChannelWeights("u", effort),
+            "modulus": ChannelWeights("y", modulus),
         }
-        return {name: each for name, each in found.items() if any(w is not None for w in each[1])}
+        asked = {}
+        for name, channels in by_requirement.items():
+            if any(weight is not None for weight in channels.weights):
+                asked[name] = channels
+        return asked
 
     def limits(self, inputs: int) -> tuple[tuple[float | None, ...], tuple[float | None, ...]]:
-        """Input and rate limit of every actuator."""
-        used = self.joints[:inputs]
-        return tuple(joint.input_limit for joint in used), tuple(joint.rate_limit for joint in used)
+        """Input limits and rate limits of the U actuators, in input units (per second); None: no limit."""
+        at_inputs = self.joints[:inputs]
+        input_limits = tuple(joint.input_limit for joint in at_inputs)
+        rate_limits = tuple(joint.rate_limit for joint in at_inputs)
+        return input_limits, rate_limits
 
 
 def gram(weights: tuple[RationalWeight | None, ...], s: Complex) -> Real:
-    """W^H W (F, n, n) of a diagonal weight at complex s (F,)."""
-    sizes = [np.zeros(s.size) if w is None else np.abs(w.at(s)) ** 2 for w in weights]
-    return np.asarray(np.stack(sizes, axis=-1)[..., None] * np.eye(len(weights)))
+    """W^H W (F, n, n) of a diagonal of n weights at complex s (F,); zero where a weight is None."""
+    squares: list[Real] = []
+    for weight in weights:
+        if weight is None:
+            squares.append(np.zeros(s.size))
+        else:
+            squares.append(np.abs(weight.at(s)) ** 2)
+    diagonals = np.stack(squares, axis=-1)
+    return np.asarray(diagonals[..., None] * np.eye(len(weights)))
