@@ -1,16 +1,21 @@
 """Certificate of one controller for plants with several inputs and outputs.
 
-Between grid points: with the scalings of `scaled_bound` held fixed, the scaled gain is a rational matrix, and
-the frequencies at which its largest singular value crosses a level are the imaginary eigenvalues of a
-Hamiltonian matrix (Boyd, Balakrishnan and Kabamba, 1989). Pieces without a crossing, each with scalings of
-its own, cover all frequencies.
+For every plant it computes the closed-loop poles, the winding of det(I + G K), the worst case of each
+requirement on a dense grid (the D-scaled bound of `plants.scaled_bound`) and disk margins. It then bounds
+each worst case between the grid points: with the scalings held fixed, the scaled gain is a rational matrix in
+Tustin's s, and the frequencies at which its largest singular value crosses a level are the imaginary
+eigenvalues of a Hamiltonian matrix (Boyd, Balakrishnan and Kabamba, Math. Control Signals Systems 2, 1989).
+Pieces without a crossing, each with scalings of its own, are joined until they cover all frequencies.
+`certify_multivariable` is the entry; `_verdict` makes the steps for one plant, `_scaled_loop` builds the
+rational matrix, `_bound_ends_at` joins the pieces. Neglected: rounding of double precision.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -31,47 +36,119 @@ from control_design.plants.scaled_bound import (
     structured_norm,
 )
 from control_design.plants.weights import RationalWeight
-from control_design.specification.multivariable import MultivariableSpecification, gram
+from control_design.specification.multivariable import ChannelWeights, MultivariableSpecification, gram
 from ident.data.shown import Shown
 
-_PIECES = 3000  # at most, of one requirement
-_CROSSES = 1e-6  # relative real part below which an eigenvalue counts as imaginary
-_AT_ONE = 1e-7  # distance from z = 1 of an integrator
+# Pieces, at most, into which the frequencies of one requirement are cut: a limit of work, as each takes the
+# eigenvalues of a matrix of twice the loop's states. With a tenth of it no test of this module moves.
+_MOST_PIECES = 3000
+# Real part, as a share of the modulus, below which an eigenvalue of the Hamiltonian counts as imaginary. A
+# double imaginary eigenvalue splits by the root of the rounding error, 1e-8: this is a hundred times that.
+# A larger share shortens the pieces and never makes a bound wrong; up to 1e-4 no test moves.
+_IMAGINARY_SHARE = 1e-6
+# Distance from z = 1 below which a pole counts as an integrator. Rounding moves a double one by 1e-8, and a
+# pole at 1e-5 rad per sample is a slow one. From 1e-9 to 1e-5 no test moves.
+_INTEGRATOR_DISTANCE = 1e-7
 
-StateSpace = tuple[Real, Real, Real, Real]
+# How far ahead of what is proved, in grid points, the next piece is centred: at first, at least and at most.
+# They set how many pieces are computed, never what they prove.
+_FIRST_STRIDE = 16
+_LEAST_STRIDE = 4
+_LARGEST_STRIDE = 256
+# Where no piece centred on a grid point reaches back to what is proved: centres on the way to the next grid
+# point, as shares of that way.
+_SHARES_OF_A_STEP = (0.3, 0.1, 0.03, 0.01)
+
+# Damping ratio that the grid takes at least for a mode, so that its points do not fall onto one another.
+_LEAST_DAMPING = 1e-5
+# Grid points around each mode of plant, controller and loop.
+_POINTS_PER_MODE = 60
+# The grid begins at this share of the lowest corner frequency of a weight, where that is lower.
+_BELOW_CORNERS = 0.1
+# The grid ends at this share of the Nyquist frequency, where Tustin's s is still finite.
+_SHARE_OF_NYQUIST = 0.999999
+
+# Gain of the weight of a channel on which nothing is asked: zero, which a `RationalWeight` refuses.
+_NO_WEIGHT = 1e-300
+# Smallest size of a weight's roots in rad/s by which its states are scaled; roots at zero have no size.
+_SMALLEST_ROOT_RAD_S = 1e-12
+
+
+class StateSpace(NamedTuple):
+    """Matrices of x' = A x + B u, y = C x + D u, continuous in s (rad/s): (n, n), (n, U), (Y, n), (Y, U)."""
+
+    A: Real
+    B: Real
+    C: Real
+    D: Real
 
 
 @dataclass(frozen=True)
 class DiskMargin:
-    """alpha: every gain and phase within the disk of this size is tolerated in all channels at once
-    (Seiler, Packard and Gahinet, 2020); loops: the same of each channel by itself, the others closed."""
+    """Gain and phase that all channels tolerate at once (Seiler, Packard and Gahinet, IEEE CSM 40, 2020).
+
+    Attributes
+    ----------
+    alpha : float
+        Size of the disk: every factor f with |(1 - f) / (1 + f)| <= alpha / 2 is tolerated, in all channels
+        at once.
+    loops : tuple of float
+        Such a size for each channel by itself, the others closed.
+    """
 
     alpha: float
     loops: tuple[float, ...]
 
     @property
     def gain(self) -> float:
-        """Every channel's gain may be multiplied or divided by this, all at once."""
-        return (2 + self.alpha) / (2 - self.alpha) if self.alpha < 2 else float("inf")
+        """Factor by which every channel's gain may be multiplied or divided, all at once; inf from 2 on."""
+        if self.alpha < 2:
+            return (2 + self.alpha) / (2 - self.alpha)
+        return float("inf")
 
     @property
     def phase_rad(self) -> float:
-        """Phase that every channel may gain or lose, all at once."""
+        """Phase, rad, that every channel may gain or lose, all at once."""
         return 2 * float(np.arctan(self.alpha / 2))
 
 
 @dataclass(frozen=True)
 class MultivariableVerdict:
-    """What was found for one plant.
+    """What was computed for one plant.
 
-    stable: all nominal poles inside the circle, pole_radius the largest. winding: of det(I + G K), a second
-    way to the same. worst: largest worst case of each requirement on the dense grid, worst_at its frequency
-    [rad/s], worst_joint the index of the joint that carries most of it. bounds: upper bound for all
-    frequencies from from_rad_s to Nyquist, inf where none was proved; obstacle says why. stability_radius:
-    factor by which the uncertainty may grow before a member is unstable (inf without uncertainty), on the
-    grid. input_disk, output_disk: of the nominal loop, on the grid.
-    exact: the worst case is exact at a frequency, not an upper bound (up to two blocks). limited: the nominal
-    loop at the controller's limits, None without limits.
+    Attributes
+    ----------
+    plant : str
+        Its name.
+    stable : bool
+        All nominal closed-loop poles lie inside the unit circle.
+    pole_radius : float
+        Largest modulus of these poles.
+    winding : NyquistCount
+        Half turns of det(I + G K): a second way to `stable`.
+    worst, worst_at : dict of str to float
+        By requirement ("tracking", "effort", "modulus"): the largest worst case on the dense grid (at most 1
+        where it is met), and its frequency, rad/s.
+    bounds : dict of str to float
+        By requirement: upper bound of the worst case for all frequencies from `from_rad_s` to Nyquist; inf
+        where none was proved.
+    from_rad_s : float
+        Where the bounds begin; 0 unless a weight integrates or the uncertainty begins later.
+    obstacle : str or None
+        Why a bound is missing.
+    stability_radius : float
+        Factor by which the uncertainty may grow before a member is unstable, on the grid; inf without
+        uncertainty.
+    input_disk, output_disk : DiskMargin
+        Of the nominal loop, opened at the actuators and at the sensors, on the grid.
+    frequencies : int
+        Points of the dense grid.
+    exact : bool
+        The worst case is exact at each frequency (up to two blocks), not an upper bound.
+    worst_joint : dict of str to int
+        By requirement: index of the output or actuator that carries most of the worst case.
+    limited : LimitedLoop or None
+        The nominal loop at the controller's limits; None without limits.
     """
 
     plant: str
@@ -93,19 +170,28 @@ class MultivariableVerdict:
 
     @property
     def proved(self) -> bool:
-        """Stable, and every requirement bounded for all frequencies."""
-        return self.stable and self.winding.matches and bool(np.all(np.isfinite(list(self.bounds.values()))))
+        """Whether the loop is stable by poles and winding, and every requirement has a finite bound."""
+        bounds = list(self.bounds.values())
+        return self.stable and self.winding.matches and bool(np.all(np.isfinite(bounds)))
 
     @property
     def met(self) -> bool:
-        """Proved at or below 1, and the loop at its limits ends where it has to."""
+        """Whether every bound is at most 1, and the loop at its limits ends where it has to."""
         limited_ends = self.limited is None or self.limited.ends
         return self.proved and max(self.bounds.values()) <= 1.0 and limited_ends
 
 
 @dataclass(frozen=True, repr=False)
 class MultivariableCertificate(Shown):
-    """Verdicts by plant; gamma: largest worst case on the grids; met: for every one."""
+    """Verdicts on one controller, a plant each.
+
+    Attributes
+    ----------
+    verdicts : tuple of MultivariableVerdict
+        In the order of the plants.
+    gamma : float
+        Largest worst case of any requirement and plant on the grids; inf where a nominal loop is unstable.
+    """
 
     table_in_notebook = True
 
@@ -113,13 +199,15 @@ class MultivariableCertificate(Shown):
     gamma: float = field(init=False)
 
     def __post_init__(self) -> None:
-        stable = all(each.stable for each in self.verdicts)
-        worst = max(value for each in self.verdicts for value in each.worst.values())
+        """Compute `gamma` from the verdicts."""
+        stable = all(verdict.stable for verdict in self.verdicts)
+        worst = max(value for verdict in self.verdicts for value in verdict.worst.values())
         object.__setattr__(self, "gamma", worst if stable else float("inf"))
 
     @property
     def met(self) -> bool:
-        return all(each.met for each in self.verdicts)
+        """Whether the requirements are proved for every plant."""
+        return all(verdict.met for verdict in self.verdicts)
 
 
 def certify_multivariable(
@@ -129,12 +217,34 @@ def certify_multivariable(
     *,
     dense_points: int = 1500,
 ) -> MultivariableCertificate:
-    """Stability, worst cases for all frequencies, margins: of u = -K y, for every plant by itself.
+    """Stability, worst cases for all frequencies and margins of u = -K y, for every plant by itself.
 
-    A plant whose uncertainty is known on its own frequencies only is certified there. Raises ValueError for a
-    controller that does not fit the plants. Neglected: rounding of double precision.
+    Parameters
+    ----------
+    controller : Controller
+        Discrete, Y errors to U commands, with the delay of the specification.
+    plants : MultivariablePlant or sequence of them
+        Nominal state space and uncertainty of each, U inputs and Y outputs. Where the uncertainty is known
+        on its own frequencies only, the plant is checked there and nothing is proved between them.
+    specification : MultivariableSpecification
+        What is asked of each output and actuator.
+    dense_points : int
+        Logarithmic points of the dense grid; those around modes come on top.
+
+    Returns
+    -------
+    MultivariableCertificate
+
+    Raises
+    ------
+    ValueError
+        The controller's shape, sampling time or computational delay is not that of plant and specification,
+        or the specification has another number of joints.
     """
-    listed = (plants,) if isinstance(plants, MultivariablePlant) else tuple(plants)
+    if isinstance(plants, MultivariablePlant):
+        listed: tuple[MultivariablePlant, ...] = (plants,)
+    else:
+        listed = tuple(plants)
     for plant in listed:
         if controller.D.shape != (plant.inputs, plant.outputs) or not np.isclose(controller.dt_s, plant.dt_s):
             raise ValueError(
@@ -143,275 +253,488 @@ def certify_multivariable(
             )
         if controller.computational_delay_samples != specification.computational_delay_samples:
             raise ValueError("controller and specification differ in computational_delay_samples")
-        specification.pattern(plant.inputs, plant.outputs)  # refuses another number of joints
-    return MultivariableCertificate(
-        tuple(_verdict(controller, p, specification, dense_points) for p in listed)
-    )
+        # Called for its error: another number of joints.
+        specification.pattern(plant.inputs, plant.outputs)
+    verdicts = tuple(_verdict(controller, plant, specification, dense_points) for plant in listed)
+    return MultivariableCertificate(verdicts)
 
 
 def _verdict(
     controller: Controller, plant: MultivariablePlant, specification: MultivariableSpecification, points: int
 ) -> MultivariableVerdict:
-    dt, delay = plant.dt_s, controller.computational_delay_samples
+    """Everything that is checked of one plant; points: logarithmic points of the dense grid."""
+    delay = controller.computational_delay_samples
     poles = NominalLoop(plant, delay).poles(controller.A, controller.B, controller.C, controller.D)
     radius = float(np.max(np.abs(poles), initial=0.0))
+    stable = radius < 1.0
+
+    # Plant, uncertainty and controller at F frequencies.
     weights = specification.weights(plant.inputs, plant.outputs)
-    omega = _grid(controller, plant, poles, weights, points)
-    s = tustin_s(omega, dt)
+    omega = _dense_grid(controller, plant, poles, weights, points)
+    s = tustin_s(omega, plant.dt_s)
     G, seen, entering = plant.blocks(omega, delay)
-    K = controller.response(omega, with_delay=False).reshape(omega.size, plant.inputs, plant.outputs)
+    n_blocks = seen.shape[1]
+    K = _matrix_of(controller, plant, omega)
+    no_weight_on_y = np.zeros((omega.size, plant.outputs, plant.outputs))
+    no_weight_on_u = np.zeros((omega.size, plant.inputs, plant.inputs))
 
-    def rows(of: str, each: tuple[RationalWeight | None, ...]) -> BoundRows:
-        size = gram(each, s)
-        none_y, none_u = (np.zeros((omega.size, n, n)) for n in (plant.outputs, plant.inputs))
-        on_y, on_u = (size, none_u) if of == "y" else (none_y, size)
-        return BoundRows(G, seen, entering, on_y, on_u, False)
+    # Worst case of every requirement over the uncertainty.
+    worst: dict[str, float] = {}
+    worst_at: dict[str, float] = {}
+    worst_joint: dict[str, int] = {}
+    log_scalings: dict[str, Real] = {}
+    for name, asked in weights.items():
+        size = gram(asked.weights, s)
+        if asked.signal == "y":
+            rows = BoundRows(G, seen, entering, size, no_weight_on_u, False)
+        else:
+            rows = BoundRows(G, seen, entering, no_weight_on_y, size, False)
+        bound = scaled_bound(rows, K)
+        at = int(np.argmax(bound.gamma))
+        worst[name] = float(bound.gamma[at])
+        worst_at[name] = float(omega[at])
+        worst_joint[name] = int(largest_channel(rows, K, bound.right)[at])
+        log_scalings[name] = bound.log_t
 
-    worst, worst_at, worst_joint, scalings = {}, {}, {}, {}
-    for name, (of, each) in weights.items():
-        found = scaled_bound(rows(of, each), K)
-        at = int(np.argmax(found.gamma))
-        worst_joint[name] = int(largest_channel(rows(of, each), K, found.right)[at])
-        worst[name], worst_at[name] = float(found.gamma[at]), float(omega[at])
-        scalings[name] = found.log_t
-    at_one = [int(np.sum(np.abs(each - 1) < _AT_ONE)) for each in (plant.poles, controller.poles)]
-    outside = sum(
-        int(np.sum((np.abs(each) >= 1) & (np.abs(each - 1) >= _AT_ONE)))
-        for each in (plant.poles, controller.poles)
-    )
+    # Stability once more, by the winding of det(I + G K).
+    integrators = 0
+    unstable_poles = 0
+    for roots in (plant.poles, controller.poles):
+        at_one = np.abs(roots - 1) < _INTEGRATOR_DISTANCE
+        outside = (np.abs(roots) >= 1) & (np.abs(roots - 1) >= _INTEGRATOR_DISTANCE)
+        integrators += int(np.sum(at_one))
+        unstable_poles += int(np.sum(outside))
 
-    def turned(w: Real) -> Complex:
-        k = controller.response(w, with_delay=False).reshape(w.size, plant.inputs, plant.outputs)
-        own = plant.blocks(w, delay)[0] if plant.own_grid is None else G[np.searchsorted(omega, w)]
-        return np.asarray(np.linalg.det(np.eye(plant.outputs) + own @ k) - 1.0)
+    def determinant_less_one(asked_rad_s: Real) -> Complex:
+        """det(I + G K) - 1 (F,): takes the place of a loop gain L, whose 1 + L is counted."""
+        if plant.own_grid is None:
+            response = plant.blocks(asked_rad_s, delay)[0]
+        else:
+            # Nothing is known between the plant's own frequencies, and only these are asked for.
+            response = G[np.searchsorted(omega, asked_rad_s)]
+        law = _matrix_of(controller, plant, asked_rad_s)
+        return np.asarray(np.linalg.det(np.eye(plant.outputs) + response @ law) - 1.0)
 
     winding = nyquist_count(
-        turned, omega, integrators=sum(at_one), unstable_poles=outside, refinable=plant.own_grid is None
+        determinant_less_one,
+        omega,
+        integrators=integrators,
+        unstable_poles=unstable_poles,
+        refinable=plant.own_grid is None,
     )
-    stable = radius < 1.0
+
+    # The bounds begin at zero frequency, unless a weight is infinite there or the ball says nothing there.
+    start = 0.0
+    if any(_integrates(asked) for asked in weights.values()):
+        start = float(omega[0])
+    if plant.ball is not None:
+        start = max(start, plant.ball.lowest_rad_s)
     bounds = dict.fromkeys(weights, float("inf"))
     obstacle: str | None = None
-    integrates = any(
-        np.any(np.roots(w.denominator) == 0) for _, e in weights.values() for w in e if w is not None
-    )
-    start = max(float(omega[0]) if integrates else 0.0, plant.ball.lowest_rad_s if plant.ball else 0.0)
     if plant.own_grid is not None:
         obstacle = "the uncertainty is known on its own frequencies only"
     elif not stable:
         obstacle = "the nominal loop is unstable"
     else:
-        for name, (of, each) in weights.items():
+        for name, asked in weights.items():
             if not np.isfinite(worst[name]):
                 obstacle = f"{name}: some member of the uncertainty is unstable at {worst_at[name]:.4g} rad/s"
                 continue
             level = worst[name] * (1 + EXCESS)
             if worst[name] <= 1.0 < level:
+                # A requirement that is met has to stay met, and the limit 1 is a bound that says so.
                 level = max(1.0, worst[name] * (1 + LEAST_EXCESS))
-            system, sizes = _scaled_loop(controller, plant, of, each)
-            stopped = _covered(system, sizes, level, np.abs(s), scalings[name], start)
-            bounds[name] = level if stopped is None else float("inf")
-            if stopped is not None:
-                obstacle = f"{name}: no bound found beyond {stopped:.4g} rad/s"
+            loop = _scaled_loop(controller, plant, asked)
+            ends_at = _bound_ends_at(loop, level, np.abs(s), log_scalings[name], start)
+            if ends_at is None:
+                bounds[name] = level
+            else:
+                obstacle = f"{name}: no bound found beyond {ends_at:.4g} rad/s"
+
+    # Robust stability by itself: no weight, the uncertainty enlarged until a member is unstable.
+    largest_mu = 0.0
+    if n_blocks:
+        nothing_asked = gram((None,) * plant.outputs, s)
+        unweighted = BoundRows(G, seen, entering, nothing_asked, no_weight_on_u, False)
+        largest_mu = float(np.max(stability_bound(unweighted, K)))
+    stability_radius = float("inf")
+    if largest_mu > 0:
+        stability_radius = 1.0 / largest_mu
+
+    # Disk margins of the nominal loop, and the loop at its limits.
     sensitivity = np.linalg.inv(np.eye(plant.outputs) + G @ K)
-    at_input = np.linalg.inv(np.eye(plant.inputs) + K @ G)
-    blocks = seen.shape[1]
-    mu = stability_bound(rows("y", (None,) * plant.outputs), K) if blocks else np.zeros(1)
-    largest = float(np.max(mu))
+    sensitivity_at_input = np.linalg.inv(np.eye(plant.inputs) + K @ G)
+    limited = None
+    if controller.limited_commands.any():
+        limited = limited_joints(controller, plant)
     return MultivariableVerdict(
-        plant.name, stable, radius, winding, worst, worst_at, bounds, start, obstacle,
-        1.0 / largest if largest > 0 else float("inf"), _disk(at_input), _disk(sensitivity), int(omega.size),
-        blocks <= 2, worst_joint,
-        limited_joints(controller, plant) if controller.limited_commands.any() else None,
-    )  # fmt: skip
-
-
-def _disk(sensitivity: Any) -> DiskMargin:
-    half = sensitivity - 0.5 * np.eye(sensitivity.shape[1])
-    each = np.max(np.abs(np.diagonal(half, axis1=1, axis2=2)), axis=0)
-    return DiskMargin(1.0 / float(np.max(structured_norm(half))), tuple((1.0 / each).tolist()))
-
-
-def _grid(
-    controller: Controller,
-    plant: MultivariablePlant,
-    poles: Complex,
-    weights: dict[str, tuple[str, tuple[RationalWeight | None, ...]]],
-    points: int,
-) -> Real:
-    """Dense frequencies: logarithmic, around modes and zeros, around whatever is near the circle."""
-    dt = plant.dt_s
-    if plant.own_grid is not None:
-        return plant.own_grid[plant.own_grid < np.pi / dt]
-    roots = np.concatenate([plant.poles, plant.zeros, controller.poles, poles])
-    corners = [
-        abs(r) for _, e in weights.values() for w in e if w is not None for r in np.roots(w.denominator) if r
-    ]
-    low = min(0.1 * min(corners, default=np.inf), lowest_rad_s(dt, roots))
-    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in modes_of(roots, dt)]
-    light = [m for m in light if m.omega_rad_s < np.pi / dt]
-    return frequency_grid(
-        0.999999 * np.pi / dt, light, omega_min_rad_s=low, n_log=points, n_mode=60 * len(light),
-        extra=near_the_circle(roots, dt),
-    )  # fmt: skip
-
-
-def _in_s(system: Any, dt_s: float) -> StateSpace:
-    """State space in Tustin's s with the values of the discrete one: the inverse of Tustin's rule."""
-    A, B, C, D = (np.asarray(getattr(system, each), dtype=np.float64) for each in "ABCD")
-    inverse = np.linalg.inv(A + np.eye(A.shape[0]))
-    return (
-        2 / dt_s * (A - np.eye(A.shape[0])) @ inverse,
-        4 / dt_s * inverse @ inverse @ B,
-        C,
-        D - C @ inverse @ B,
+        plant=plant.name,
+        stable=stable,
+        pole_radius=radius,
+        winding=winding,
+        worst=worst,
+        worst_at=worst_at,
+        bounds=bounds,
+        from_rad_s=start,
+        obstacle=obstacle,
+        stability_radius=stability_radius,
+        input_disk=_disk_margin(sensitivity_at_input),
+        output_disk=_disk_margin(sensitivity),
+        frequencies=int(omega.size),
+        # With the performance three blocks: up to there the scaled bound is the worst case itself.
+        exact=n_blocks <= 2,
+        worst_joint=worst_joint,
+        limited=limited,
     )
 
 
-def _weights(weights: tuple[RationalWeight | None, ...]) -> StateSpace:
-    """Diagonal of weights, as a state space in s."""
-    parts = []
+def _matrix_of(controller: Controller, plant: MultivariablePlant, omega_rad_s: Real) -> Complex:
+    """Response K (F, U, Y) of the controller without its delay, which `MultivariablePlant.blocks` holds."""
+    response = controller.response(omega_rad_s, with_delay=False)
+    return response.reshape(omega_rad_s.size, plant.inputs, plant.outputs)
+
+
+def _integrates(asked: ChannelWeights) -> bool:
+    """Whether a weight of any channel has a pole at zero frequency, and is infinite there."""
+    denominators = [weight.denominator for weight in asked.weights if weight is not None]
+    return any(np.any(np.roots(denominator) == 0) for denominator in denominators)
+
+
+def _disk_margin(sensitivity: Any) -> DiskMargin:
+    """Disk margin of a loop with the sensitivity S (F, n, n): 1 / max mu(S - I/2) over the frequencies.
+
+    mu is over a diagonal of complex factors, of one channel by itself the modulus of its diagonal entry.
+    """
+    half = sensitivity - 0.5 * np.eye(sensitivity.shape[1])
+    diagonal = np.diagonal(half, axis1=1, axis2=2)
+    largest_by_channel = np.max(np.abs(diagonal), axis=0)
+    alpha = 1.0 / float(np.max(structured_norm(half)))
+    return DiskMargin(alpha, tuple((1.0 / largest_by_channel).tolist()))
+
+
+def _dense_grid(
+    controller: Controller,
+    plant: MultivariablePlant,
+    loop_poles: Complex,
+    weights: dict[str, ChannelWeights],
+    points: int,
+) -> Real:
+    """Frequencies of the dense check, rad/s, (F,) ascending, below Nyquist.
+
+    They are logarithmic, denser around modes, zeros and whatever is near the circle; of a plant known on its
+    own frequencies only these. loop_poles (n,): of the nominal closed loop. points: logarithmic ones.
+    """
+    dt_s = plant.dt_s
+    nyquist_rad_s = np.pi / dt_s
+    if plant.own_grid is not None:
+        below_nyquist = plant.own_grid < nyquist_rad_s
+        return plant.own_grid[below_nyquist]
+    roots = np.concatenate([plant.poles, plant.zeros, controller.poles, loop_poles])
+
+    # The grid begins below the corners of the weights and below the slowest root.
+    lowest_corner = np.inf
+    for asked in weights.values():
+        for weight in asked.weights:
+            if weight is None:
+                continue
+            corners = np.abs(np.roots(weight.denominator))
+            lowest_corner = np.min(corners, initial=lowest_corner, where=corners > 0)
+    low = min(_BELOW_CORNERS * lowest_corner, lowest_rad_s(dt_s, roots))
+
+    light: list[Mode] = []
+    for mode in modes_of(roots, dt_s):
+        if mode.omega_rad_s < nyquist_rad_s:
+            light.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), _LEAST_DAMPING)))
+    return frequency_grid(
+        _SHARE_OF_NYQUIST * np.pi / dt_s,
+        light,
+        omega_min_rad_s=low,
+        n_log=points,
+        n_mode=_POINTS_PER_MODE * len(light),
+        extra=near_the_circle(roots, dt_s),
+    )
+
+
+def _in_s(system: Any, dt_s: float) -> StateSpace:
+    """State space in Tustin's s of a discrete one, by the inverse of Tustin's rule s = (2/dt)(z - 1)/(z + 1).
+
+    Both have the same value where s and z belong together, so a frequency keeps its response. system: has
+    matrices A, B, C, D, and no eigenvalue of A at -1.
+    """
+    A = np.asarray(system.A, dtype=np.float64)
+    B = np.asarray(system.B, dtype=np.float64)
+    C = np.asarray(system.C, dtype=np.float64)
+    D = np.asarray(system.D, dtype=np.float64)
+    eye = np.eye(A.shape[0])
+    inverse = np.linalg.inv(A + eye)
+    return StateSpace(
+        A=2 / dt_s * (A - eye) @ inverse,
+        B=4 / dt_s * inverse @ inverse @ B,
+        C=C,
+        D=D - C @ inverse @ B,
+    )
+
+
+def _weights_in_s(weights: tuple[RationalWeight | None, ...]) -> StateSpace:
+    """Diagonal of N weights (None: zero) as a state space in s, N inputs and N outputs, in companion form."""
+    parts: list[StateSpace] = []
     for weight in weights:
-        given = weight or RationalWeight(numerator=(1e-300,), denominator=(1.0,))
-        top, bottom = np.array(given.numerator), np.array(given.denominator)
-        n, top = bottom.size - 1, np.concatenate([np.zeros(bottom.size - top.size), top]) / bottom[0]
+        if weight is None:
+            weight = RationalWeight(numerator=(_NO_WEIGHT,), denominator=(1.0,))
+        bottom = np.array(weight.denominator)
+        missing = bottom.size - len(weight.numerator)
+        top = np.concatenate([np.zeros(missing), np.array(weight.numerator)])
+        top = top / bottom[0]
         bottom = bottom / bottom[0]
-        # Unit of time in which the companion form is well scaled.
-        unit = max(float(abs(bottom[-1])) ** (1 / n), 1e-12) if n else 1.0
-        powers = unit ** np.arange(n + 1)
-        b, c = bottom / powers, top / powers
-        A = np.zeros((n, n))
-        A[:-1, 1:] = np.eye(max(n - 1, 0))
-        if n:
+
+        # Unit of time in which the companion form is well scaled: the geometric mean of the roots' sizes.
+        order = bottom.size - 1
+        unit = 1.0
+        if order:
+            unit = max(float(abs(bottom[-1])) ** (1 / order), _SMALLEST_ROOT_RAD_S)
+        powers = unit ** np.arange(order + 1)
+        b = bottom / powers
+        c = top / powers
+
+        A = np.zeros((order, order))
+        A[:-1, 1:] = np.eye(max(order - 1, 0))
+        B = np.zeros((order, 1))
+        if order:
             A[-1] = -b[:0:-1]
-        B = np.zeros((n, 1))
-        B[-1:] = 1.0
+            B[-1] = 1.0
         C = (c[1:] - b[1:] * c[0])[::-1][None, :]
-        parts.append((unit * A, unit * B, C, np.array([[c[0]]])))
+        D = np.array([[c[0]]])
+        parts.append(StateSpace(unit * A, unit * B, C, D))
     return _side_by_side(parts)
 
 
 def _side_by_side(parts: Sequence[StateSpace]) -> StateSpace:
-    """Block-diagonal state space."""
-    stacked = [scipy.linalg.block_diag(*(part[i] for part in parts)) for i in range(4)]
-    n, outputs, inputs = (sum(p[k].shape[a] for p in parts) for k, a in ((0, 0), (3, 0), (3, 1)))
-    shapes = ((n, n), (n, inputs), (outputs, n), (outputs, inputs))
-    A, B, C, D = (part.reshape(shape) for part, shape in zip(stacked, shapes, strict=True))
-    return A, B, C, D
+    """Block-diagonal state space: the parts with their own inputs and outputs, one after the other."""
+    A, B, C, D = (scipy.linalg.block_diag(*blocks) for blocks in zip(*parts, strict=True))
+    n_states = sum(part.A.shape[0] for part in parts)
+    n_outputs, n_inputs = D.shape
+    # `block_diag` gives parts without states other shapes, so the shapes are stated.
+    return StateSpace(
+        A.reshape((n_states, n_states)),
+        B.reshape((n_states, n_inputs)),
+        C.reshape((n_outputs, n_states)),
+        D,
+    )
 
 
-def _scaled_loop(
-    controller: Controller, plant: MultivariablePlant, of: str, weights: tuple[RationalWeight | None, ...]
-) -> tuple[StateSpace, list[tuple[int, int]]]:
-    """Closed loop in s from (w of every block, d) to (z of every block, e); sizes (z, w) of the blocks in the
-    order of `MultivariablePlant.blocks`."""
-    dt, u, y = plant.dt_s, plant.inputs, plant.outputs
-    G = _in_s(plant.delayed(controller.computational_delay_samples), dt)
-    parts = [G, _in_s(controller, dt), _weights(weights)]
-    sizes: list[tuple[int, int]] = []
+class _BlockSize(NamedTuple):
+    """Signals of one block of uncertainty w = Delta z: how many it sees (z) and how many it makes (w)."""
+
+    n_seen: int
+    n_made: int
+
+
+class _ScaledLoop(NamedTuple):
+    """Closed loop in s that waits for scalings and for the blocks of uncertainty.
+
+    system: from (w of every block, disturbance d at the plant's output) to (z of every block, weighted signal
+    e). blocks: their sizes, in the order of `MultivariablePlant.blocks`.
+    """
+
+    system: StateSpace
+    blocks: list[_BlockSize]
+
+
+def _slices(sizes: Iterable[int]) -> list[slice]:
+    """Positions of vectors of these sizes that are stacked, a slice each."""
+    ends = np.cumsum([0, *sizes]).tolist()
+    return [slice(start, stop) for start, stop in pairwise(ends)]
+
+
+def _scaled_loop(controller: Controller, plant: MultivariablePlant, asked: ChannelWeights) -> _ScaledLoop:
+    """Closed loop of one requirement: asked.signal says whether e is a weighted S d ("y") or K S d ("u").
+
+    The parts (plant with delay, controller, weights, ball, weights of the channels' errors) stand side by
+    side; constant matrices say which output goes where, and the loop is then closed at once.
+    """
+    n_u = plant.inputs
+    n_y = plant.outputs
+    n_e = len(asked.weights)
+    parts = [
+        _in_s(plant.delayed(controller.computational_delay_samples), plant.dt_s),
+        _in_s(controller, plant.dt_s),
+        _weights_in_s(asked.weights),
+    ]
+    blocks: list[_BlockSize] = []
     if plant.ball is not None:
-        li = plant.ball.Li
-        parts.append(_in_s(plant.ball.Li, dt))
-        sizes.append((li.noutputs, plant.ball.Lo.shape[1]))
-    errors = plant.input_error or plant.output_error
-    if errors:
-        parts.append(_weights(errors))
-        sizes += [(1, 1)] * len(errors)
+        parts.append(_in_s(plant.ball.Li, plant.dt_s))
+        blocks.append(_BlockSize(n_seen=plant.ball.Li.noutputs, n_made=plant.ball.Lo.shape[1]))
+    channel_errors = plant.input_error or plant.output_error
+    if channel_errors:
+        parts.append(_weights_in_s(channel_errors))
+        blocks += [_BlockSize(n_seen=1, n_made=1)] * len(channel_errors)
     A, B, C, D = _side_by_side(parts)
-    ins = np.cumsum([0, *(part[3].shape[1] for part in parts)])
-    outs = np.cumsum([0, *(part[3].shape[0] for part in parts)])
-    w = np.cumsum([0, *(size[1] for size in sizes), y])
-    z = np.cumsum([0, *(size[0] for size in sizes), len(weights)])
-    # Inputs of the parts = link (their outputs) + enter (w, d); z = see (their outputs) + direct (w, d).
-    link, enter = np.zeros((ins[-1], outs[-1])), np.zeros((ins[-1], w[-1]))
-    see, direct = np.zeros((z[-1], outs[-1])), np.zeros((z[-1], w[-1]))
-    g, k, e = (slice(outs[i], outs[i + 1]) for i in range(3))
-    # Signals of the plant's output: G u + ball + errors + d.
-    at_y, d_y = np.zeros((y, outs[-1])), np.zeros((y, w[-1]))
-    at_y[:, g], d_y[:, w[-2] :] = np.eye(y), np.eye(y)
-    at_u = np.zeros((u, outs[-1]))
-    at_u[:, k] = -np.eye(u)
-    link[ins[0] : ins[1]] = at_u
-    number, block = 3, 0
+
+    # Where the signals of each part, of each block, and last d and e stand in the stacked vectors.
+    inputs_of = _slices(part.D.shape[1] for part in parts)
+    outputs_of = _slices(part.D.shape[0] for part in parts)
+    made_by = _slices([*(block.n_made for block in blocks), n_y])
+    seen_by = _slices([*(block.n_seen for block in blocks), n_e])
+    n_inputs = inputs_of[-1].stop
+    n_outputs = outputs_of[-1].stop
+    n_made = made_by[-1].stop
+    n_seen = seen_by[-1].stop
+
+    # Inputs of the parts = link (their outputs) + enter (w, d); (z, e) = see (their outputs).
+    link = np.zeros((n_inputs, n_outputs))
+    enter = np.zeros((n_inputs, n_made))
+    see = np.zeros((n_seen, n_outputs))
+    direct = np.zeros((n_seen, n_made))
+
+    # The command u = -K y and the loop's output y = G u + d, as rows over the parts' outputs and over (w, d).
+    command = np.zeros((n_u, n_outputs))
+    command[:, outputs_of[1]] = -np.eye(n_u)
+    output = np.zeros((n_y, n_outputs))
+    output[:, outputs_of[0]] = np.eye(n_y)
+    output_of_w = np.zeros((n_y, n_made))
+    output_of_w[:, made_by[-1]] = np.eye(n_y)
+    link[inputs_of[0]] = command
+
     if plant.ball is not None:
-        link[ins[3] : ins[4]] = at_u
-        see[z[0] : z[1], outs[3] : outs[4]] = plant.ball.radius * np.eye(sizes[0][0])
-        d_y[:, w[0] : w[1]] = plant.ball.Lo
-        number, block = 4, 1
-    if plant.input_error:  # w, weighted, joins u at the plant
-        enter[ins[number] : ins[number + 1], w[block] : w[block + u]] = np.eye(u)
-        link[ins[0] : ins[1], outs[number] : outs[number + 1]] = np.eye(u)
-        see[z[block] : z[block + u]] = at_u
-    if plant.output_error:  # sees the plant's own output, weighted
-        link[ins[number] : ins[number + 1], g] = np.eye(y)
-        see[z[block] : z[block + y], outs[number] : outs[number + 1]] = np.eye(y)
-        d_y[:, w[block] : w[block + y]] = np.eye(y)
-    link[ins[1] : ins[2]], enter[ins[1] : ins[2]] = at_y, d_y
-    if of == "y":
-        link[ins[2] : ins[3]], enter[ins[2] : ins[3]] = at_y, d_y
+        # The ball Lo Delta Li sees the command and joins the output.
+        link[inputs_of[3]] = command
+        see[seen_by[0], outputs_of[3]] = plant.ball.radius * np.eye(blocks[0].n_seen)
+        output_of_w[:, made_by[0]] = plant.ball.Lo
+    # The blocks of the channels' errors stand after that of the ball, and their weights are the last part.
+    if plant.input_error:
+        # They see the command, and their w, weighted, joins it at the plant.
+        made_by_errors = slice(made_by[-1].start - n_u, made_by[-1].start)
+        seen_by_errors = slice(seen_by[-1].start - n_u, seen_by[-1].start)
+        enter[inputs_of[-1], made_by_errors] = np.eye(n_u)
+        link[inputs_of[0], outputs_of[-1]] = np.eye(n_u)
+        see[seen_by_errors] = command
+    if plant.output_error:
+        # They see the nominal plant's output, weighted, and join the loop's.
+        made_by_errors = slice(made_by[-1].start - n_y, made_by[-1].start)
+        seen_by_errors = slice(seen_by[-1].start - n_y, seen_by[-1].start)
+        link[inputs_of[-1], outputs_of[0]] = np.eye(n_y)
+        see[seen_by_errors, outputs_of[-1]] = np.eye(n_y)
+        output_of_w[:, made_by_errors] = np.eye(n_y)
+
+    # The controller takes the output; the weights take what the requirement is about.
+    link[inputs_of[1]] = output
+    enter[inputs_of[1]] = output_of_w
+    if asked.signal == "y":
+        link[inputs_of[2]] = output
+        enter[inputs_of[2]] = output_of_w
     else:
-        link[ins[2] : ins[3]] = at_u
-    see[z[-2] :, e] = np.eye(len(weights))
-    solve = np.linalg.inv(np.eye(outs[-1]) - D @ link)
-    out_x, out_w = solve @ C, solve @ D @ enter
-    return (A + B @ link @ out_x, B @ (link @ out_w + enter), see @ out_x, see @ out_w + direct), sizes
+        link[inputs_of[2]] = command
+    see[seen_by[-1], outputs_of[2]] = np.eye(n_e)
+
+    # Close the loop: outputs = C x + D (link outputs + enter w), solved for the outputs.
+    solve = np.linalg.inv(np.eye(n_outputs) - D @ link)
+    outputs_of_x = solve @ C
+    outputs_of_w = solve @ D @ enter
+    closed = StateSpace(
+        A=A + B @ link @ outputs_of_x,
+        B=B @ (link @ outputs_of_w + enter),
+        C=see @ outputs_of_x,
+        D=see @ outputs_of_w + direct,
+    )
+    return _ScaledLoop(closed, blocks)
 
 
-def _covered(
-    system: StateSpace,
-    sizes: list[tuple[int, int]],
+def _bound_ends_at(
+    loop: _ScaledLoop,
     level: float,
     size_s: Real,
     log_t: Real,
     start: float,
 ) -> float | None:
-    """Where the bound `level` could not be continued, |s|; None if it holds from `start` to infinity.
+    """Where |s| (rad/s) the worst case could not be shown to stay below `level`; None if it does everywhere.
 
-    size_s (F,), log_t (F, N): the dense frequencies and their scalings.
+    Parameters
+    ----------
+    loop : _ScaledLoop
+        Of one requirement.
+    level : float
+        The bound that is to be shown, above the worst case on the grid.
+    size_s : (F,) array
+        |s| of the dense grid, rad/s, ascending.
+    log_t : (F, N) array
+        Logarithm of the best scaling of each of the N blocks there.
+    start : float
+        Where the bound has to begin, rad/s. It ends at infinity, which is the Nyquist frequency in z.
+
+    Notes
+    -----
+    Everything from `start` to `covered` is proved. Each piece is an interval around a trial frequency within
+    which the scaled gain does not cross `level`; it counts where it holds `covered`, which then moves to its
+    end. Trials go ahead as far as the last piece suggests, then closer.
     """
-    A, B, C, D = system
-    z = np.repeat(
-        np.arange(len(sizes) + 1), [*(size[0] for size in sizes), C.shape[0] - sum(s[0] for s in sizes)]
-    )
-    w = np.repeat(
-        np.arange(len(sizes) + 1), [*(size[1] for size in sizes), B.shape[1] - sum(s[1] for s in sizes)]
-    )
+    # The block that each scalar signal belongs to. The performance (d and e) counts as one more, the last.
+    A, B, C, D = loop.system
+    n_seen = [block.n_seen for block in loop.blocks]
+    n_made = [block.n_made for block in loop.blocks]
+    block_numbers = np.arange(len(loop.blocks) + 1)
+    block_of_z = np.repeat(block_numbers, [*n_seen, C.shape[0] - sum(n_seen)])
+    block_of_w = np.repeat(block_numbers, [*n_made, B.shape[1] - sum(n_made)])
+
     # Well-scaled coordinates of the states, once.
     _, (scale, _) = scipy.linalg.matrix_balance(A, permute=False, separate=True)
-    A, B, C = A * scale / scale[:, None], B / scale[:, None], C * scale
+    A = A * scale / scale[:, None]
+    B = B / scale[:, None]
+    C = C * scale
 
-    def free(here: float) -> tuple[float, float]:
-        """Interval around |s| = here without a crossing, with scalings between those of its neighbours."""
-        log = [np.interp(np.log(here), np.log(size_s), column) for column in log_t.T]
-        left = np.append(np.exp(-0.5 * np.array(log)), 1.0)[z]
-        right = np.append(np.exp(0.5 * np.array(log)), 1.0 / level)[w]
-        b, c, d = B * right, C * left[:, None], D * left[:, None] * right
-        inner = np.linalg.inv(np.eye(d.shape[1]) - d.T @ d)
-        top = A + b @ inner @ d.T @ c
-        hamiltonian = np.block(
-            [[top, b @ inner @ b.T], [-c.T @ (np.eye(d.shape[0]) + d @ inner @ d.T) @ c, -top.T]]
-        )
-        gain = c @ np.linalg.solve(1j * here * np.eye(A.shape[0]) - A, b) + d
-        if not np.linalg.norm(gain, 2) < 1.0:
-            return here, here
-        found = scipy.linalg.eigvals(hamiltonian)
-        crossing = np.abs(found.imag[np.abs(found.real) <= _CROSSES * np.abs(found)])
-        return float(np.max(crossing[crossing < here], initial=0.0)), float(
-            np.min(crossing[crossing > here], initial=np.inf)
-        )
-
-    covered, stride, pieces = start, 16, 0
-    while pieces < _PIECES:
-        first = min(int(np.searchsorted(size_s, covered)), size_s.size - 1)
-        trials = [size_s[min(first + each, size_s.size - 1)] for each in (stride, stride // 4, 0)]
-        trials += [covered + share * (size_s[first] - covered) for share in (0.3, 0.1, 0.03, 0.01)]
-        for number, here in enumerate(trials):
-            low, high = free(float(here))
+    covered = start
+    stride = _FIRST_STRIDE
+    pieces = 0
+    last = size_s.size - 1
+    while pieces < _MOST_PIECES:
+        first = min(int(np.searchsorted(size_s, covered)), last)
+        trials = [size_s[min(first + ahead, last)] for ahead in (stride, stride // 4, 0)]
+        trials += [covered + share * (size_s[first] - covered) for share in _SHARES_OF_A_STEP]
+        for number, trial in enumerate(trials):
+            # Scalings between those of the neighbouring grid points; that of the performance is 1.
+            centre = float(trial)
+            log_here = [np.interp(np.log(centre), np.log(size_s), column) for column in log_t.T]
+            on_z = np.append(np.exp(-0.5 * np.array(log_here)), 1.0)[block_of_z]
+            on_w = np.append(np.exp(0.5 * np.array(log_here)), 1.0 / level)[block_of_w]
+            scaled = StateSpace(A, B * on_w, C * on_z[:, None], D * on_z[:, None] * on_w)
+            low, high = _interval_below_one(scaled, centre)
             pieces += 1
             if low <= covered < high:
-                covered, stride = high, min(2 * stride, 256) if number == 0 else max(stride // 2, 4)
+                covered = high
+                farthest_trial = number == 0
+                longer = min(2 * stride, _LARGEST_STRIDE)
+                shorter = max(stride // 2, _LEAST_STRIDE)
+                stride = longer if farthest_trial else shorter
                 break
         else:
+            # No trial reaches back to what is proved.
             return covered
         if not np.isfinite(covered):
             return None
     return covered
+
+
+def _interval_below_one(system: StateSpace, centre: float) -> tuple[float, float]:
+    """Ends, rad/s, of the interval around |s| = centre in which the largest singular value stays below 1.
+
+    The end is inf where nothing crosses above; both are `centre` where the value is not below 1 there.
+    Singular values of G(jw) = C (jw - A)^-1 B + D are 1 only where jw is an eigenvalue of
+
+        [[A + B R D^T C, B R B^T], [-C^T (I + D R D^T) C, -(A + B R D^T C)^T]],   R = (I - D^T D)^-1.
+    """
+    A, B, C, D = system
+    n_outputs, n_inputs = D.shape
+    inner = np.linalg.inv(np.eye(n_inputs) - D.T @ D)
+    upper_left = A + B @ inner @ D.T @ C
+    upper_right = B @ inner @ B.T
+    lower_left = -C.T @ (np.eye(n_outputs) + D @ inner @ D.T) @ C
+    hamiltonian = np.block([[upper_left, upper_right], [lower_left, -upper_left.T]])
+    gain = C @ np.linalg.solve(1j * centre * np.eye(A.shape[0]) - A, B) + D
+    if not np.linalg.norm(gain, 2) < 1.0:
+        return centre, centre
+
+    eigenvalues = scipy.linalg.eigvals(hamiltonian)
+    imaginary = np.abs(eigenvalues.real) <= _IMAGINARY_SHARE * np.abs(eigenvalues)
+    crossings = np.abs(eigenvalues.imag[imaginary])
+    low = np.max(crossings, initial=0.0, where=crossings < centre)
+    high = np.min(crossings, initial=np.inf, where=crossings > centre)
+    return float(low), float(high)
