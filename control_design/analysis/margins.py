@@ -1,15 +1,19 @@
 """Gain, phase and delay margins of one loop and over ellipses of the loop gain.
 
-A crossing is a member x of the ellipse K E on the negative real axis (gain) or on the unit circle (phase,
-delay). Between the points of the grid crossings are sought where a quantity is smallest and, of one loop,
-where it changes sign; at zero frequency (without integrators) and at Nyquist the loop is real, and its gain
-limit may lie there without any change of sign.
+A crossing is a loop gain on the negative real axis (gain margin) or on the unit circle (phase and delay
+margin): of one loop its value, of an uncertain one any member of the ellipse K E. `nominal_margins` finds the
+crossings of one loop by changes of sign on a frequency grid; `ellipse_margins` computes the members on the
+axis and on the circle of every ellipse exactly (a segment and a quartic). Between the points of the grid both
+add points where a quantity is smallest, since a crossing may be touched without a change of sign. At zero
+frequency (without integrators) and at Nyquist the loop is real, and its gain limit may lie there; these ends
+are taken by themselves. Neglected: a minimum narrower than the grid shows.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -17,23 +21,62 @@ from scipy.optimize import brentq
 from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import around_maxima, joined
 
-_TOUCHES = 1e-9  # relative distance from the real axis or the unit circle that counts as a crossing without
-# a change of sign: the finest the search between the points resolves
+# Relative distance from the real axis or the unit circle that counts as a crossing without a change of sign:
+# the finest that the search between grid points resolves. From 1e-10 to 1e-8 no test moves.
+_TOUCHES = 1e-9
 # Rounds of the search between grid points. Nine new points between the two neighbours of a minimum leave it
-# two neighbours a fifth as far apart: after four rounds, a 625th.
+# two neighbours a fifth as far apart: after four rounds, a 625th. With two, touched crossings are missed and
+# margins depend on the unit of time (`test_margins`); with eight no test moves.
 _ROUNDS = 4
-# Minima that are searched, the smallest: more of them than a loop of any order here has near -1.
+# Minima that are searched, the smallest: more of them than a loop of any order here has near -1. With a
+# quarter of them no test moves; twice as many take twice the time.
 _MINIMA = 16
-_ROUNDED = 1e-6  # relative; what the search may miss of a smallest value, taken off the margins of ellipses
+# What the search may miss of a smallest value, relative: it is taken off the margins over ellipses, so that
+# they err to the safe side. A minimum seen at a 625th of the grid's distance is missed by far less: with
+# nothing taken off no test moves.
+_MISSED = 1e-6
+
+# Loop values handed to `crossing_margins` lie on the axis or on the circle: these tell which.
+_ON_AXIS = 1e-7
+_ON_CIRCLE = 1e-6
+# Relative imaginary part up to which a loop is real at Nyquist but for rounding: of one loop, whose response
+# has the error of its state space, and of the centre of an ellipse, computed from a product of responses.
+_REAL_LOOP = 1e-9
+_REAL_CENTRE = 1e-6
+
+# Tolerances of `brentq`, relative to the frequency: a few roundings of doubles.
+_FREQUENCY_TOLERANCE = 1e-13
+_LEAST_BRENTQ_TOLERANCE = 1e-14
+
+# Ellipses with a major axis below this have no boundary to speak of; their centre's crossings are sought.
+_LEAST_AXIS = 1e-12
+# Second coefficient of the quartic, as a share of the first, below which a circle is taken for an ellipse.
+_LEAST_SECOND_ORDER = 1e-14
+# Distance from the circle up to which a root of the quartic, and the loop value it gives, lie on it. Where
+# the boundary only touches the circle the root is double: half of its digits are right (1e-8), and
+# eigenvalues lose some more.
+_ROOT_ON_CIRCLE = 1e-5
+
+# Keeps quotients finite where a loop gain is zero.
+_TINY = 1e-300
 
 
 @dataclass(frozen=True)
 class Margins:
     """Margins of a loop; infinity where there is no crossing.
 
-    gain_up: factor the gain may rise (> 1). gain_down: factor it may fall to (< 1; 0 = no lower limit).
-    phase_rad: smallest rotation to -1 either way. delay_s: smallest extra delay to -1. modulus: smallest
-    distance from -1.
+    Attributes
+    ----------
+    gain_up : float
+        Factor by which the gain may rise, above 1.
+    gain_down : float
+        Factor to which the gain may fall, below 1; 0: no lower limit.
+    phase_rad : float
+        Smallest rotation of the loop gain to -1, either way.
+    delay_s : float
+        Smallest extra delay that brings the loop gain to -1.
+    modulus : float
+        Smallest distance of the loop gain from -1.
     """
 
     gain_up: float
@@ -43,7 +86,7 @@ class Margins:
     modulus: float
 
     def worse(self, other: Margins) -> Margins:
-        """The smaller of each."""
+        """Margins that both loops keep: the smaller of each, of `gain_down` the larger."""
         return Margins(
             min(self.gain_up, other.gain_up),
             max(self.gain_down, other.gain_down),
@@ -53,27 +96,61 @@ class Margins:
         )
 
 
+class _Crossing(NamedTuple):
+    """Loop gain on the real axis or on the unit circle, and its frequency, rad/s."""
+
+    omega_rad_s: float
+    value: complex
+
+
 def crossing_margins(x: Complex, omega_rad_s: Real, modulus: float) -> Margins:
-    """Margins of loop values x already on a crossing: real negative ones count for gain, those of size 1 for
-    phase."""
-    real = np.real(x[np.abs(np.imag(x)) <= 1e-7 * np.abs(x)])
-    inside = -real[(real < 0) & (real > -1)]
-    beyond = -real[real < -1]
-    unit = np.abs(np.abs(x) - 1.0) <= 1e-6
-    either, delay = _turns(x[unit], omega_rad_s[unit])
+    """Margins that loop values on crossings leave.
+
+    Parameters
+    ----------
+    x : (N,) complex array
+        Loop gains on the real axis, of which the negative ones count for gain, or on the unit circle.
+    omega_rad_s : (N,) array
+        Their frequencies, above 0.
+    modulus : float
+        The modulus margin, which is passed on.
+
+    Returns
+    -------
+    Margins
+    """
+    # The gain may rise until the value next to -1 from the right reaches it, and fall likewise from the left.
+    size = np.abs(x)
+    on_axis = np.abs(np.imag(x)) <= _ON_AXIS * size
+    real = np.real(x[on_axis])
+    is_beyond = real < -1
+    is_between = np.logical_and(real < 0, real > -1)
+    gain_up = np.inf
+    if np.any(is_between):
+        gain_up = float(1 / np.max(-real[is_between]))
+    gain_down = 0.0
+    if np.any(is_beyond):
+        gain_down = float(1 / np.min(-real[is_beyond]))
+
+    on_circle = np.abs(size - 1.0) <= _ON_CIRCLE
+    rotation_rad, delay_s = _turns(x[on_circle], omega_rad_s[on_circle])
     return Margins(
-        gain_up=float(1 / np.max(inside)) if inside.size else np.inf,
-        gain_down=float(1 / np.min(beyond)) if beyond.size else 0.0,
-        phase_rad=float(np.min(either)) if either.size else np.inf,
-        delay_s=float(np.min(delay)) if delay.size else np.inf,
+        gain_up=gain_up,
+        gain_down=gain_down,
+        phase_rad=float(np.min(rotation_rad, initial=np.inf)),
+        delay_s=float(np.min(delay_s, initial=np.inf)),
         modulus=modulus,
     )
 
 
 def _turns(x: Complex, omega_rad_s: Real) -> tuple[Real, Real]:
-    """Smallest rotation to -1 either way, and extra delay to it, of loop values on the unit circle."""
-    angle = np.mod(np.angle(-x), 2 * np.pi)
-    return np.minimum(angle, 2 * np.pi - angle), angle / omega_rad_s
+    """Rotation (rad) to -1 either way, and extra delay (s) to it, of loop values x on the unit circle.
+
+    Both have the shape of x. A delay turns clockwise only, however long that way is.
+    """
+    clockwise = np.mod(np.angle(-x), 2 * np.pi)
+    either_way = np.minimum(clockwise, 2 * np.pi - clockwise)
+    return either_way, clockwise / omega_rad_s
 
 
 def nominal_margins(
@@ -83,77 +160,128 @@ def nominal_margins(
     refinable: bool = True,
     at_zero: float | None = None,
 ) -> Margins:
-    """Margins of one loop on a grid (F,) that ends at Nyquist, and between its points.
+    """Margins of one loop on a grid, and between its points.
 
-    at_zero: the loop gain at zero frequency, None where it integrates (no finite gain moves a pole through
-    z = 1 then). If refinable the crossings are found to rounding; else they are interpolated.
+    Parameters
+    ----------
+    loop_gain : callable
+        L = G K (N,) at frequencies (N,), rad/s.
+    omega_rad_s : (F,) array
+        Ascending grid above 0 that ends at Nyquist.
+    refinable : bool
+        The loop gain is known between the points: crossings are found to rounding. Else they are interpolated
+        on straight lines.
+    at_zero : float, optional
+        Loop gain at zero frequency; None where the loop integrates (no finite gain moves a pole through z = 1
+        then).
+
+    Returns
+    -------
+    Margins
     """
-    found, modulus = _crossings(loop_gain, omega_rad_s, refinable, loop_gain(omega_rad_s))
-    last = loop_gain(omega_rad_s[-1:])[0]
-    if last.real < 0 and abs(last.imag) <= 1e-9 * abs(last):
-        found.append((float(omega_rad_s[-1]), complex(last.real, 0.0)))
-    if at_zero is not None:
-        modulus = min(modulus, abs(1.0 + at_zero))
-        found.append((0.0, complex(at_zero, 0.0)))
-    ends = [x for omega, x in found if omega == 0.0 and x.real < 0 and abs(x) != 1.0]
-    places = np.array([omega for omega, _ in found if omega > 0.0])
-    inner = crossing_margins(np.array([x for omega, x in found if omega > 0.0], complex), places, modulus)
-    return inner.worse(
-        Margins(
-            min((-1 / x.real for x in ends if x.real > -1), default=np.inf),
-            max((-1 / x.real for x in ends if x.real < -1), default=0.0),
-            np.inf,
-            np.inf,
-            np.inf,
+    crossings, modulus = _crossings(loop_gain, omega_rad_s, refinable, loop_gain(omega_rad_s))
+    at_nyquist = loop_gain(omega_rad_s[-1:])[0]
+    if at_nyquist.real < 0 and abs(at_nyquist.imag) <= _REAL_LOOP * abs(at_nyquist):
+        crossings.append(_Crossing(float(omega_rad_s[-1]), complex(at_nyquist.real, 0.0)))
+    values = np.array([crossing.value for crossing in crossings], complex)
+    places = np.array([crossing.omega_rad_s for crossing in crossings])
+    margins = crossing_margins(values, places, modulus)
+    if at_zero is None:
+        return margins
+
+    # At zero frequency a negative loop gain limits the gain; no rotation or delay changes it.
+    gain_up = np.inf
+    gain_down = 0.0
+    if -1 < at_zero < 0:
+        gain_up = -1 / at_zero
+    elif at_zero < -1:
+        gain_down = -1 / at_zero
+    return margins.worse(Margins(gain_up, gain_down, np.inf, np.inf, abs(1.0 + at_zero)))
+
+
+class _LoopValues(NamedTuple):
+    """One loop at F frequencies: L (F,) complex, and three distances (F,) whose minima are crossings or near.
+
+    off_axis: |Im L| / |L|. off_circle: |log |L||. distance: |1 + L|.
+    """
+
+    loop_gain: Complex
+    off_axis: Real
+    off_circle: Real
+    distance: Real
+
+    @classmethod
+    def of(cls, loop_gain: Complex) -> _LoopValues:
+        """Values of a loop gain (F,)."""
+        size = np.maximum(np.abs(loop_gain), _TINY)
+        return cls(
+            loop_gain=loop_gain,
+            off_axis=np.abs(np.imag(loop_gain)) / size,
+            off_circle=np.abs(np.log(size)),
+            distance=np.abs(1 + loop_gain),
         )
-    )
-
-
-def _off_axis(value: Complex) -> Real:
-    """Relative distance from the real axis."""
-    return np.abs(np.imag(value)) / np.maximum(np.abs(value), 1e-300)
 
 
 def _crossings(
     loop_gain: Callable[[Real], Complex], omega_rad_s: Real, refinable: bool, value: Complex
-) -> tuple[list[tuple[float, complex]], float]:
-    """(frequency, value) of the crossings of one loop, value (F,) on a grid, between the ends of the grid;
-    its least |1 + L|."""
+) -> tuple[list[_Crossing], float]:
+    """Crossings of one loop strictly inside a grid (F,), and its least |1 + L|; value (F,): L on the grid."""
     omega = omega_rad_s
+    values = _LoopValues.of(value)
     if refinable:
+        omega, parts = _refined(lambda new: _LoopValues.of(loop_gain(new)), omega, values, sought=(1, 2, 3))
+        values = _LoopValues(*parts)
+        value = values.loop_gain
 
-        def sizes(x: Complex) -> tuple[Real, ...]:
-            return x.real, x.imag, _off_axis(x), np.abs(np.log(np.maximum(np.abs(x), 1e-300))), np.abs(1 + x)
+    def between(side: Callable[[complex], float], k: int) -> _Crossing:
+        """Crossing between the points k and k + 1 of the grid, at which `side` has different signs."""
+        low = float(omega[k])
+        high = float(omega[k + 1])
+        if not refinable:
+            side_low = side(complex(value[k]))
+            side_high = side(complex(value[k + 1]))
+            share = side_low / (side_low - side_high)
+            step = value[k + 1] - value[k]
+            return _Crossing(low + share * (high - low), complex(value[k] + share * step))
 
-        omega, parts = _refined(lambda w: sizes(loop_gain(w)), omega, sizes(value), (2, 3, 4))
-        value = parts[0] + 1j * parts[1]
+        def side_at(place: float) -> float:
+            return side(complex(loop_gain(np.array([place]))[0]))
 
-    def refine(function: Callable[[complex], float], k: int) -> tuple[float, complex]:
-        low, high = float(omega[k]), float(omega[k + 1])
-        if refinable:
+        if not side_at(low) * side_at(high) < 0:
+            # A sign that rounding makes: one of the ends is the crossing.
+            return _Crossing(low, complex(value[k]))
+        tolerance = _FREQUENCY_TOLERANCE * high
+        place = float(brentq(side_at, low, high, xtol=tolerance, rtol=_LEAST_BRENTQ_TOLERANCE))
+        return _Crossing(place, complex(loop_gain(np.array([place]))[0]))
 
-            def at(w: float) -> complex:
-                return complex(loop_gain(np.array([w]))[0])
+    # Crossings of the negative real axis: where the imaginary part changes sign, or touches zero.
+    sign = np.sign(np.imag(value))
+    changes_sign = sign[:-1] * sign[1:] < 0
+    is_negative = np.minimum(value.real[:-1], value.real[1:]) < 0
+    on_axis: list[_Crossing] = []
+    for k in np.flatnonzero(changes_sign & is_negative):
+        on_axis.append(between(lambda x: x.imag, int(k)))
+    touches_axis = values.off_axis[1:-1] <= _TOUCHES
+    for k in np.flatnonzero(touches_axis) + 1:
+        on_axis.append(_Crossing(float(omega[k]), value[k]))
 
-            ends = function(at(low)), function(at(high))
-            if not ends[0] * ends[1] < 0:  # a sign that rounding makes: one of the ends is the crossing
-                return low, complex(value[k])
-            place = float(brentq(lambda w: function(at(w)), low, high, xtol=1e-13 * high, rtol=1e-14))
-            return place, at(place)
-        a, b = function(complex(value[k])), function(complex(value[k + 1]))
-        share = a / (a - b)
-        return low + share * (high - low), complex(value[k] + share * (value[k + 1] - value[k]))
+    # Crossings of the unit circle, likewise.
+    outside = np.abs(value) - 1.0
+    crosses_circle = outside[:-1] * outside[1:] < 0
+    on_circle: list[_Crossing] = []
+    for k in np.flatnonzero(crosses_circle):
+        on_circle.append(between(lambda x: abs(x) - 1.0, int(k)))
+    touches_circle = np.abs(outside[1:-1]) <= _TOUCHES
+    for k in np.flatnonzero(touches_circle) + 1:
+        on_circle.append(_Crossing(float(omega[k]), value[k]))
 
-    imag, size = np.imag(value), np.abs(value) - 1.0
-    turns = np.flatnonzero(np.sign(imag[:-1]) * np.sign(imag[1:]) < 0)
-    turns = turns[np.minimum(value.real[turns], value.real[turns + 1]) < 0]
-    on_axis = [refine(lambda v: v.imag, int(k)) for k in turns]
-    on_axis += [(float(omega[k]), value[k]) for k in np.flatnonzero(_off_axis(value)[1:-1] <= _TOUCHES) + 1]
-    on_circle = [refine(lambda v: abs(v) - 1.0, int(k)) for k in np.flatnonzero(size[:-1] * size[1:] < 0)]
-    on_circle += [(float(omega[k]), value[k]) for k in np.flatnonzero(np.abs(size[1:-1]) <= _TOUCHES) + 1]
-    found = [(place, complex(x.real, 0.0)) for place, x in on_axis]
-    found += [(place, complex(x / abs(x))) for place, x in on_circle]
-    return found, float(np.min(np.abs(1 + value)))
+    # What rounding leaves between them and the axis or circle goes.
+    crossings: list[_Crossing] = []
+    for place, x in on_axis:
+        crossings.append(_Crossing(place, complex(x.real, 0.0)))
+    for place, x in on_circle:
+        crossings.append(_Crossing(place, complex(x / abs(x))))
+    return crossings, float(np.min(values.distance))
 
 
 def ellipse_margins(
@@ -164,135 +292,230 @@ def ellipse_margins(
     between: Callable[[Real], tuple[Complex, Ellipses]] | None = None,
     at_zero: bool = False,
 ) -> Margins:
-    """Smallest margins over all members of K E; distance (F,) is dist(-1, K E) at the grid's frequencies.
+    """Smallest margins over all members of the ellipses K E.
 
-    loop_gain (F,): what multiplies the member. between: the same and the ellipses at other frequencies, with
-    which the smallest values are sought between the points and rounded to the safe side by `_ROUNDED`; None
-    where nothing is known there. at_zero: the members are finite at zero frequency, which `between` (or the
-    first point) then answers for.
+    Parameters
+    ----------
+    loop_gain : (F,) complex array
+        What multiplies the member: K with its delay.
+    ellipses : Ellipses
+        E on the grid: `omega_rad_s` (F,), `centre`, semi-axes and direction of each.
+    distance : (F,) array
+        Distance of -1 from K E on the grid.
+    between : callable, optional
+        Such a factor and the ellipses at other frequencies: the smallest values are then sought between the
+        points and rounded to the safe side by `_MISSED`. None where nothing is known there.
+    at_zero : bool
+        The members are finite at zero frequency, for which `between` (or the first point) then answers.
+
+    Returns
+    -------
+    Margins
+        Without any margin (1, 1, 0, 0, 0) where an ellipse reaches -1.
     """
+    no_margin = Margins(1.0, 1.0, 0.0, 0.0, 0.0)
     modulus = float(np.min(distance))
     if modulus <= 0:
-        return Margins(1.0, 1.0, 0.0, 0.0, 0.0)
+        return no_margin
     grid = ellipses.omega_rad_s
-    if between is None:
-        values = _members(loop_gain, ellipses)
-    else:
-        centre = _centre(loop_gain, ellipses)
-        crossings, _ = _crossings(lambda w: _centre(*between(w)), grid, True, centre)
-        crossed = np.setdiff1d([w for w, _ in crossings], grid)
-        values = _members(loop_gain, ellipses)
+    members = _members(loop_gain, ellipses)
+    if between is not None:
+        # The crossings of the centre join the grid: there the thinnest ellipses have members on a crossing.
+        centre_on_grid = _centre(loop_gain, ellipses)
+        crossings, _ = _crossings(lambda new: _centre(*between(new)), grid, True, centre_on_grid)
+        crossed = np.setdiff1d([crossing.omega_rad_s for crossing in crossings], grid)
+        parts: tuple[Any, ...] = members
         if crossed.size:
-            grid, values = joined(grid, values, crossed, _members(*between(crossed)))
-        grid, values = _refined(lambda w: _members(*between(w)), grid, values, (0, 1, 2, 3, 4, 5))
-    up, down, phase, delay = (float(np.min(value)) for value in values[:4])
+            grid, parts = joined(grid, parts, crossed, _members(*between(crossed)))
+        every_value = tuple(range(len(parts)))
+        _, parts = _refined(lambda new: _members(*between(new)), grid, parts, sought=every_value)
+        members = _MemberValues(*parts)
+    up = float(np.min(members.up))
+    down = float(np.min(members.down))
+    phase_rad = float(np.min(members.rotation_rad))
+    delay_s = float(np.min(members.delay_s))
+
+    # At Nyquist and at zero frequency the loop is real.
     ends = [(loop_gain[-1:], ellipses.subset(np.array([-1])))]
     if at_zero and between is not None:
         ends.append(between(np.zeros(1)))
-    for factor, members in ends:
-        # Where the loop is real the ellipse lies along the axis, and its imaginary part is rounding.
-        centre, major, minor = _axes(factor, members)
-        if members.omega_rad_s[0] > 0 and abs(centre[0].imag) > 1e-6 * abs(centre[0]):
-            continue  # no Nyquist frequency: the own grid ends before it
-        reach = np.hypot(major.real, minor.real)
-        low, high = float(centre.real[0] - reach[0]), float(centre.real[0] + reach[0])
-        up = min(up, -1 / low) if -1 < low < 0 else up
-        down = min(down, -high) if high < -1 else down
+    for factor, ellipse in ends:
+        # The ellipse then lies along the real axis, and its imaginary part is rounding.
+        centres, major, minor = _axes(factor, ellipse)
+        centre = centres[0]
+        is_real = abs(centre.imag) <= _REAL_CENTRE * abs(centre)
+        if ellipse.omega_rad_s[0] > 0 and not is_real:
+            # No Nyquist frequency: the own grid of the plant ends before it.
+            continue
+        reach = np.hypot(major.real, minor.real)[0]
+        low = float(centre.real - reach)
+        high = float(centre.real + reach)
+        if -1 < low < 0:
+            up = min(up, -1 / low)
+        if high < -1:
+            down = min(down, -high)
         modulus = min(modulus, max(low + 1.0, -1.0 - high, 0.0))
     if modulus <= 0:
-        return Margins(1.0, 1.0, 0.0, 0.0, 0.0)
-    less = 1.0 if between is None else 1.0 - _ROUNDED
+        return no_margin
+
+    safe_share = 1.0 if between is None else 1.0 - _MISSED
+    gain_down = 0.0
+    if np.isfinite(down):
+        gain_down = min(1.0, 1 / (down * safe_share))
     return Margins(
-        max(1.0, up * less), min(1.0, 1 / (down * less)) if np.isfinite(down) else 0.0, phase * less,
-        delay * less, modulus,
-    )  # fmt: skip
+        gain_up=max(1.0, up * safe_share),
+        gain_down=gain_down,
+        phase_rad=phase_rad * safe_share,
+        delay_s=delay_s * safe_share,
+        modulus=modulus,
+    )
 
 
 def _axes(factor: Complex, ellipses: Ellipses) -> tuple[Complex, Complex, Complex]:
-    """Centre, major and minor semi-axis of K E, complex (F,)."""
+    """Centre, major and minor semi-axis of K E, complex (F,) each; factor (F,): K."""
     turned = factor * ellipses.direction
-    return factor * ellipses.centre, turned * ellipses.semi_major, 1j * turned * ellipses.semi_minor
+    centre = factor * ellipses.centre
+    major = turned * ellipses.semi_major
+    minor = 1j * turned * ellipses.semi_minor
+    return centre, major, minor
 
 
 def _centre(factor: Complex, ellipses: Ellipses) -> Complex:
+    """Centres of K E, complex (F,); factor (F,): K."""
     return np.asarray(factor * ellipses.centre, dtype=np.complex128)
 
 
-def _members(factor: Complex, ellipses: Ellipses) -> tuple[Real, ...]:
-    """Per frequency (F,), inf where no member crosses: smallest 1/|x| of real members between -1 and 0 and
-    |x| of those beyond -1, smallest rotation and delay to -1 on the unit circle; and by how much the ellipse
-    misses the real axis and the unit circle."""
+class _MemberValues(NamedTuple):
+    """Extremes over the members x of each of F ellipses, (F,); inf where no member is on the crossing.
+
+    up: smallest 1/|x| of real members between -1 and 0. down: smallest |x| of real members beyond -1.
+    rotation_rad, delay_s: smallest rotation and delay to -1 of members on the unit circle. off_axis,
+    off_circle: by how much the ellipse misses the real axis and the unit circle, relative, 0 where it does
+    not.
+    """
+
+    up: Real
+    down: Real
+    rotation_rad: Real
+    delay_s: Real
+    off_axis: Real
+    off_circle: Real
+
+
+def _members(factor: Complex, ellipses: Ellipses) -> _MemberValues:
+    """Extremes over the members of every ellipse K E; factor (F,): K."""
     centre, major, minor = _axes(factor, ellipses)
     up, down = _real_axis(centre, major, minor)
-    rotation, delay = _unit_circle(centre, major, minor, ellipses.omega_rad_s)
-    size = np.maximum(np.abs(centre), 1e-300)
-    off_axis = np.maximum(np.abs(centre.imag) - np.hypot(major.imag, minor.imag), 0.0) / size
+    rotation_rad, delay_s = _unit_circle(centre, major, minor, ellipses.omega_rad_s)
+    size = np.maximum(np.abs(centre), _TINY)
+    to_axis = np.abs(centre.imag) - np.hypot(major.imag, minor.imag)
+    off_axis = np.maximum(to_axis, 0.0) / size
     # At least so far from the circle; exact enough to know where to look.
-    off_circle = np.maximum(np.abs(size - 1.0) - np.abs(major), 0.0) / np.maximum(size, 1.0)
-    return up, down, rotation, delay, off_axis, off_circle
+    to_circle = np.abs(size - 1.0) - np.abs(major)
+    off_circle = np.maximum(to_circle, 0.0) / np.maximum(size, 1.0)
+    return _MemberValues(up, down, rotation_rad, delay_s, off_axis, off_circle)
 
 
 def _real_axis(centre: Complex, major: Complex, minor: Complex) -> tuple[Real, Real]:
-    """Of the segment each ellipse cuts out of the real axis: 1/|x| at its end between -1 and 0, |x| at the
-    end beyond -1 (-1 itself lies outside), (F,) each."""
-    p, q = major.imag, minor.imag
-    reach = np.hypot(p, q)
-    up, down = np.full(centre.size, np.inf), np.full(centre.size, np.inf)
-    hit = np.flatnonzero((np.abs(centre.imag) <= reach) & (reach > 0))
-    c, p, q, reach = centre[hit], p[hit], q[hit], reach[hit]
-    # Im = c.imag + reach cos(f - f0) = 0
-    spread = np.arccos(np.clip(-c.imag / reach, -1.0, 1.0))
-    middle = np.arctan2(q, p)
-    ends = [
-        c.real + major.real[hit] * np.cos(f) + minor.real[hit] * np.sin(f)
-        for f in (middle + spread, middle - spread)
-    ]
-    low, high = np.minimum(*ends), np.maximum(*ends)
-    inside, beyond = (low < 0) & (low > -1), high < -1
-    up[hit[inside]], down[hit[beyond]] = -1 / low[inside], -high[beyond]
+    """Ends of the segment that each ellipse cuts out of the real axis, (F,) each; inf where there is none.
+
+    First 1/|x| at its end x between -1 and 0, then |x| at its end beyond -1 (-1 itself lies outside). The
+    boundary is centre + major cos(f) + minor sin(f), centre and semi-axes complex (F,); its imaginary part is
+    Im(centre) + reach cos(f - f0), zero at two angles f.
+    """
+    up = np.full(centre.size, np.inf)
+    down = np.full(centre.size, np.inf)
+    reach = np.hypot(major.imag, minor.imag)
+    meets_axis = np.logical_and(np.abs(centre.imag) <= reach, reach > 0)
+    hit = np.flatnonzero(meets_axis)
+    centre = centre[hit]
+    major = major[hit]
+    minor = minor[hit]
+    cosine = -centre.imag / reach[hit]
+    spread = np.arccos(np.clip(cosine, -1.0, 1.0))
+    middle = np.arctan2(minor.imag, major.imag)
+    first = middle + spread
+    second = middle - spread
+    first_end = centre.real + major.real * np.cos(first) + minor.real * np.sin(first)
+    second_end = centre.real + major.real * np.cos(second) + minor.real * np.sin(second)
+    low = np.minimum(first_end, second_end)
+    high = np.maximum(first_end, second_end)
+    reaches_between = np.logical_and(low < 0, low > -1)
+    lies_beyond = high < -1
+    up[hit[reaches_between]] = -1 / low[reaches_between]
+    down[hit[lies_beyond]] = -high[lies_beyond]
     return up, down
 
 
 def _unit_circle(centre: Complex, major: Complex, minor: Complex, omega: Real) -> tuple[Real, Real]:
-    """Smallest rotation and delay to -1, (F,) each, from points of each ellipse's boundary on the unit
-    circle: roots w = e^{jf} of |c + a w + b/w|^2 = 1 (quartic)."""
+    """Smallest rotation (rad) and delay (s) to -1 of each ellipse's points on the unit circle, (F,) each.
+
+    Inf where the ellipse's boundary does not meet the circle, and at omega = 0. The boundary is c + a w + b/w
+    with w = e^{jf}, a = (major - j minor)/2 and b = (major + j minor)/2. With conj(w) = 1/w the points of
+    modulus 1 are roots of the quartic
+
+        a b* w^4 + (a c* + c b*) w^3 + (|a|^2 + |b|^2 + |c|^2 - 1) w^2 + (a c* + c b*)* w + (a b*)* = 0,
+
+    whose roots are the eigenvalues of a companion matrix.
+    """
+    rotation_rad = np.full(centre.size, np.inf)
+    delay_s = np.full(centre.size, np.inf)
     reach = np.abs(major)
-    rotation, delay = np.full(centre.size, np.inf), np.full(centre.size, np.inf)
-    hit = np.flatnonzero((np.abs(np.abs(centre) - 1.0) <= reach) & (reach > 1e-12) & (omega > 0))
+    near_circle = np.abs(np.abs(centre) - 1.0) <= reach
+    has_boundary = reach > _LEAST_AXIS
+    has_delay = omega > 0
+    hit = np.flatnonzero(near_circle & has_boundary & has_delay)
     if not hit.size:
-        return rotation, delay
+        return rotation_rad, delay_s
     c = centre[hit]
-    a, b = (major[hit] - 1j * minor[hit]) / 2, (major[hit] + 1j * minor[hit]) / 2
+    a = (major[hit] - 1j * minor[hit]) / 2
+    b = (major[hit] + 1j * minor[hit]) / 2
+    # Coefficients of w^4, w^3 and w^2, divided by w^2: of second, first and zeroth order.
     second = a * np.conj(b)
     first = a * np.conj(c) + c * np.conj(b)
-    zeroth = np.abs(c) ** 2 + np.abs(a) ** 2 + np.abs(b) ** 2 - 1.0 + 0j
+    squares = np.abs(c) ** 2 + np.abs(a) ** 2 + np.abs(b) ** 2
+    zeroth = squares - 1.0 + 0j
     # Circles (b = 0) have no second-order term; a tiny one keeps the companion form and sends two roots away.
-    second = np.where(np.abs(second) < 1e-14 * np.abs(first), 1e-14 * np.abs(first) + 1e-300, second)
+    least_second = _LEAST_SECOND_ORDER * np.abs(first)
+    second = np.where(np.abs(second) < least_second, least_second + _TINY, second)
     companion = np.zeros((c.size, 4, 4), dtype=np.complex128)
-    companion[:, 1, 0] = companion[:, 2, 1] = companion[:, 3, 2] = 1.0
-    for row, coefficient in enumerate([np.conj(second), np.conj(first), zeroth, first]):
+    for row in range(1, 4):
+        companion[:, row, row - 1] = 1.0
+    lower_coefficients = [np.conj(second), np.conj(first), zeroth, first]
+    for row, coefficient in enumerate(lower_coefficients):
         companion[:, row, 3] = -coefficient / second
     w = np.linalg.eigvals(companion)
-    on = np.abs(np.abs(w) - 1.0) < 1e-5  # a tangent crossing is a double root: half the digits
-    w = np.where(on, w / np.maximum(np.abs(w), 1e-300), 1.0)
+
+    # Roots on the circle are points of the boundary; their loop values are checked once more.
+    size = np.abs(w)
+    is_angle = np.abs(size - 1.0) < _ROOT_ON_CIRCLE
+    w = np.where(is_angle, w / np.maximum(size, _TINY), 1.0)
     x = c[:, None] + a[:, None] * w + b[:, None] / w
-    good = on & (np.abs(np.abs(x) - 1.0) < 1e-5)
-    either, late = _turns(np.where(good, x, 1.0), omega[hit][:, None])
-    rotation[hit] = np.min(np.where(good, either, np.inf), axis=1)
-    delay[hit] = np.min(np.where(good, late, np.inf), axis=1)
-    return rotation, delay
+    gives_crossing = np.abs(np.abs(x) - 1.0) < _ROOT_ON_CIRCLE
+    is_crossing = is_angle & gives_crossing
+    # Elsewhere a 1, whose turn is not used.
+    safe_x = np.where(is_crossing, x, 1.0)
+    rotations, delays = _turns(safe_x, omega[hit][:, None])
+    rotation_rad[hit] = np.min(np.where(is_crossing, rotations, np.inf), axis=1)
+    delay_s[hit] = np.min(np.where(is_crossing, delays, np.inf), axis=1)
+    return rotation_rad, delay_s
 
 
 def _refined(
-    evaluate: Callable[[Real], tuple[Real, ...]],
+    evaluate: Callable[[Real], tuple[Any, ...]],
     omega: Real,
-    values: tuple[Real, ...],
+    values: tuple[Any, ...],
     sought: tuple[int, ...],
-) -> tuple[Real, tuple[Real, ...]]:
-    """Grid and values with more points between the neighbours of the smallest local minima of the values
-    sought."""
+) -> tuple[Real, tuple[Any, ...]]:
+    """Grid and values with more points around the smallest local minima of some of the values.
+
+    evaluate: the values (N,) at new frequencies (N,), rad/s. omega (F,), values (F,) each: the grid, and what
+    holds there. sought: positions of the values whose minima count. `_ROUNDS` times, nine points are put
+    between the neighbours of each of the `_MINIMA` smallest minima.
+    """
     for _ in range(_ROUNDS):
-        new = around_maxima(omega, [-values[which] for which in sought], _MINIMA)
+        depths = [-values[which] for which in sought]
+        new = around_maxima(omega, depths, _MINIMA)
         if not new.size:
             break
         omega, values = joined(omega, values, new, evaluate(new))
