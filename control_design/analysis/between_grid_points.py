@@ -43,16 +43,16 @@ from control_design.plants.set_expansion import Expand, SetExpansion, expandable
 from control_design.specification import Specification
 from control_design.specification.requirement import WeightedRequirement
 
-# Excess of a bound over the dense maximum, relative, at which an interval is good enough: the pages say 0.2 %,
-# the tests ask for 0.5 %. Halved, the proofs of three loops of the tests need at most 7 % more intervals.
+# Excess of a bound over the dense maximum, relative, at which an interval is good enough: the pages say 0.2
+# %, the tests ask for 0.5 %. Halved, the proofs of three loops of the tests need at most 7 % more intervals.
 EXCESS = 0.002
 # Such an excess where a dense maximum lies closer than `EXCESS` under its limit 1, which the bound must not
 # exceed. Chosen; it is below `_PROOF_SLACK`, with which a requirement counts as met.
 LEAST_EXCESS = 1e-5
 # Limit of work, and of memory: a proof that needs more is given up. With a tenth of it no test moves.
 _MOST_INTERVALS = 60_000
-# Parts into which an interval is cut that is not good enough. With two or six no test moves, and the number of
-# intervals changes by 2 %.
+# Parts into which an interval is cut that is not good enough. With two or six no test moves, and the number
+# of intervals changes by 2 %.
 _PARTS = 3
 # Largest relative disagreement of zeros and poles with the state space that a proof allows: far below
 # `EXCESS`. The flexible link of the tests shows 8e-7, an arm with one mode 2e-10.
@@ -298,8 +298,8 @@ class _Loop:
 def _normal(point: Complex, shape: Real) -> Complex:
     """Unit normals (F,) complex from ellipses e^T P^-1 e <= 1 at the origin towards points (F,).
 
-    shape: P (F, 2, 2). The normal is (P + t)^-1 point, normalised, t the `secular_root`. Any normal gives a valid bound; that of
-    a point inside the ellipse means nothing.
+    shape: P (F, 2, 2). The normal is (P + t)^-1 point, normalised, t the `secular_root`. Any normal gives a
+    valid bound; that of a point inside the ellipse means nothing.
     """
     major, minor, axis = _axes(shape)
     # Lengths in units of the largest: squares of squares stay far from the ends of the number range.
@@ -317,7 +317,8 @@ def _normal(point: Complex, shape: Real) -> Complex:
 def _axes(shape: Real) -> tuple[Real, Real, Complex]:
     """Semi-axes, the larger first, and direction of the larger one, (F,) each, of e^T P^-1 e <= 1.
 
-    shape: P (F, 2, 2). They are roots of the eigenvalues of P, and the angle of its first eigenvector as a complex number of modulus one.
+    shape: P (F, 2, 2). They are roots of the eigenvalues of P, and the angle of its first eigenvector as a
+    complex number of modulus one.
     """
     a = shape[:, 0, 0]
     b = shape[:, 0, 1]

@@ -1,10 +1,17 @@
-"""Closed-loop simulation on anything that can be sampled: the nonlinear arm, a linear model, later a real
-machine."""
+"""Closed-loop simulation on anything that can be sampled, and what a run tells: step metrics, measured S.
+
+A machine is measured every dt_s and holds its command until the next sample: the nonlinear arm, a linear
+model (`LinearMachine`), a real machine. `simulate` runs one loop u = K (r - y) on it, with limits,
+quantisation, delay and disturbances, `simulate_joints` one of several commands; machines that offer the whole
+loop compiled are asked for it, others are stepped sample by sample. `step_metrics` puts a step response into
+numbers. `sensitivity_of` measures S by random-phase multisines (Pintelon and Schoukens, System
+Identification, 2nd ed., ch. 4). Without limits and quantisation the loop is exactly the one of the analysis.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
@@ -19,29 +26,64 @@ from control_design.plants.ellipses import Boolean, Complex, Real
 from ident.data.arrays import COMPILED, INSIDE, kernel_array, lock
 from ident.data.shown import Shown
 
+# Relative difference of two sampling times that counts as none: rounding of decimal numbers.
+_SAME_PERIOD = 1e-9
+# Levels, as shares of a step, between which its rise time is taken: the usual 10 % and 90 %.
+_RISE_FROM = 0.1
+_RISE_TO = 0.9
+# Band around the final value, as a share of a step, in which it counts as settled: the usual 2 %.
+_SETTLING_BAND = 0.02
+# Part of a record, one n-th at its end, over which the steady error is averaged.
+_STEADY_PARTS = 10
+
 
 class MeasuredMachine(Protocol):
     """A machine that is measured every dt_s, and holds its commands until then: one, or one of each joint."""
 
     @property
-    def dt_s(self) -> float: ...
-    def reset(self) -> None: ...
-    def measure(self) -> Real: ...
-    def advance(self, u: Any, /) -> None: ...
+    def dt_s(self) -> float:
+        """Sampling time, s."""
+        ...
+
+    def reset(self) -> None:
+        """Bring it to rest."""
+        ...
+
+    def measure(self) -> Real:
+        """Outputs (Y,) at this sample."""
+        ...
+
+    def advance(self, u: Any, /) -> None:
+        """Hold the command, or commands (U,), for one sample."""
+        ...
 
 
 class SampledMachine(MeasuredMachine, Protocol):
-    """A machine sampled every dt_s: measure at t_k, then hold the input until t_{k+1}. `plant.SampledArm` and
-    `LinearMachine` are; they have the whole loop compiled too, as `in_loop`, which `simulate` then calls."""
+    """A machine with one command: measured at t_k, then holding its input until t_{k+1}.
 
-    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None: ...
+    `plant.SampledArm` and `LinearMachine` are such; they have the whole loop compiled too, as `in_loop`,
+    which `simulate` then calls.
+    """
+
+    def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
+        """Hold the command and a disturbance torque (N m) for one sample."""
+        ...
 
 
 class LinearMachine:
-    """A discrete `control.StateSpace` as a SampledMachine.
+    """A discrete linear system as a machine.
 
-    Inputs: the commands, and optionally one more driven by `hub_torque_Nm`; any number of outputs. D must be
-    zero: a sampled machine cannot answer at t_k to a command that is applied from t_k on.
+    Parameters
+    ----------
+    system : control.StateSpace
+        With dt in seconds. Inputs: the commands, and optionally one more driven by `hub_torque_Nm`; any
+        number of outputs. D must be zero: a sampled machine cannot answer at t_k to a command that is applied
+        from t_k on.
+
+    Raises
+    ------
+    ValueError
+        The system is not discrete, or D is not zero.
     """
 
     def __init__(self, system: control.StateSpace) -> None:
@@ -53,15 +95,19 @@ class LinearMachine:
             raise ValueError(
                 "LinearMachine needs D = 0: the measurement at t_k comes before the command at t_k"
             )
-        self._a, self._b, self._c = (np.array(getattr(system, m), dtype=np.float64, order="C") for m in "ABC")
+        self._a = np.array(system.A, dtype=np.float64, order="C")
+        self._b = np.array(system.B, dtype=np.float64, order="C")
+        self._c = np.array(system.C, dtype=np.float64, order="C")
         self.dt_s = float(system.dt)
         self.reset()
 
     def __init_subclass__(cls) -> None:
-        if {"measure", "advance"} & vars(cls).keys():  # the compiled loop would not know of it
+        """Take the compiled loop from a subclass that measures or advances otherwise, and must be stepped."""
+        if {"measure", "advance"} & vars(cls).keys():
             cls.in_loop = cls.joints_in_loop = None  # type: ignore[assignment]
 
     def reset(self) -> None:
+        """Bring all states to zero."""
         self._x = np.zeros(self._a.shape[0])
 
     def measure(self) -> Real:
@@ -71,7 +117,10 @@ class LinearMachine:
     def advance(self, u: npt.ArrayLike, /, *, hub_torque_Nm: float = 0.0) -> None:
         """Hold the command, or commands (U,), for one sample.
 
-        Raises ValueError if a disturbance torque is given and the system has no input for it.
+        Raises
+        ------
+        ValueError
+            A disturbance torque is given and the system has no input for it.
         """
         drive = np.append(u, hub_torque_Nm)[: self._b.shape[1]]
         self._refuse_torque(hub_torque_Nm)
@@ -87,14 +136,30 @@ class LinearMachine:
         measured: int,
         clip: float = np.inf,
     ) -> tuple[Real, Real, Boolean]:
-        """Outputs (T, Y), commands (T,) and whether they were limited (T,) of a loop, from rest; arguments as
-        of `plant.simulation.SampledArm.in_loop`."""
+        """Outputs (T, Y), commands (T,) and whether these were limited (T,), of a loop from rest.
+
+        Parameters
+        ----------
+        signals : (T, 5) array
+            Set point, what joins the command, what joins the measurement, what joins the applied command, and
+            the hub torque, N m.
+        law, limits : arrays
+            As of `law_arrays`, of one command and one error.
+        steps : (2,) array
+            Quantisation of measurement and command; 0: none.
+        delay : int
+            Computational delay, samples.
+        measured : int
+            Index of the controlled output.
+        clip : float
+            The machine clips its input there.
+        """
         self._refuse_torque(signals[:, 4])
         added = signals[:, 3 : 3 + self._b.shape[1]]
-        y, u, limited = self.joints_in_loop(
+        outputs, commands, limited = self.joints_in_loop(
             signals[:, :3], added, law, limits, steps, delay, np.array([measured]), clip
         )
-        return y, u[:, 0], limited
+        return outputs, commands[:, 0], limited
 
     def joints_in_loop(
         self,
@@ -107,25 +172,57 @@ class LinearMachine:
         measured: npt.NDArray[np.int64],
         clip: float = np.inf,
     ) -> tuple[Real, Real, Boolean]:
-        """The same of a law (`law_arrays`) of errors at the outputs `measured` (M,). given (T, 2 M + U): set
-        points, what joins the commands, what joins the measurements. added (T, inputs)."""
-        n, commands = len(given), limits.size // 2
-        if max(measured) >= len(self._c) or commands > self._b.shape[1]:  # compiled code would not see it
-            raise ValueError(f"the machine has {len(self._c)} outputs and {self._b.shape[1]} inputs only")
-        found = np.empty((n, len(self._c))), np.empty((n, commands)), np.zeros(n, dtype=np.bool_)
-        drive = np.hstack([added, np.zeros((n, self._b.shape[1] - added.shape[1]))])
-        rows = scipy.sparse.csr_array(self._a)  # a kernel of many taps is a shift register
-        machine = rows.data, rows.indices, rows.indptr, self._b, self._c
-        _run(*map(kernel_array, (given, drive, *machine, law, limits, steps)), delay, measured, clip, *found)
-        return found
+        """Outputs (T, Y), commands (T, U) and whether any was limited (T,), of a loop from rest.
+
+        Parameters
+        ----------
+        given : (T, 2 M + U) array
+            Set points (M), what joins the commands (U), what joins the measurements (M).
+        added : (T, inputs) array
+            What joins the applied commands, up to the number of the machine's inputs.
+        law, limits : arrays
+            As of `law_arrays`, of U commands and M errors.
+        steps : (2,) array
+            Quantisation of measurements and commands; 0: none.
+        delay : int
+            Computational delay, samples.
+        measured : (M,) array of int
+            Indices of the controlled outputs.
+        clip : float
+            The machine clips its inputs there.
+
+        Raises
+        ------
+        ValueError
+            The machine has fewer outputs or inputs, which compiled code would not see.
+        """
+        n_samples = len(given)
+        n_outputs = len(self._c)
+        n_inputs = self._b.shape[1]
+        n_commands = limits.size // 2
+        if max(measured) >= n_outputs or n_commands > n_inputs:
+            raise ValueError(f"the machine has {n_outputs} outputs and {n_inputs} inputs only")
+        output = np.empty((n_samples, n_outputs))
+        command = np.empty((n_samples, n_commands))
+        limited = np.zeros(n_samples, dtype=np.bool_)
+        not_added = np.zeros((n_samples, n_inputs - added.shape[1]))
+        drive = np.hstack([added, not_added])
+        # A sparse A, because a model of many taps is a shift register.
+        rows = scipy.sparse.csr_array(self._a)
+        machine = (rows.data, rows.indices, rows.indptr, self._b, self._c)
+        arrays = map(kernel_array, (given, drive, *machine, law, limits, steps))
+        _run(*arrays, delay, measured, clip, output, command, limited)
+        return output, command, limited
 
     def _refuse_torque(self, torque_Nm: npt.ArrayLike) -> None:
+        """Raise ValueError for a disturbance torque, number or (T,), that the system has no input for."""
         if self._b.shape[1] == 1 and np.any(torque_Nm):
             raise ValueError("this LinearMachine has one input; a hub torque needs a second one")
 
 
 @numba.njit(**INSIDE)
 def _along(rows: Any, i: int, values: Any) -> float:
+    """Product of row i of a matrix (R, N) and a vector (N,), summed from left to right."""
     total = 0.0
     for j in range(values.size):
         total += rows[i, j] * values[j]
@@ -151,45 +248,90 @@ def _run(
     command: Any,
     limited: Any,
 ) -> None:
-    """Fill output, command, limited of `LinearMachine.joints_in_loop`; values, columns, starts: rows of the
-    machine's A, as of `scipy.sparse.csr_array`."""
-    n, n_u, n_y = law.shape[0] - command.shape[1], command.shape[1], measured.size
-    x, new, drive = np.zeros(len(b)), np.zeros(len(b)), np.zeros(b.shape[1])
-    own, later, last = np.zeros(law.shape[1]), np.zeros(n), np.zeros(n_u)
+    """Fill output (T, Y), command (T, U) and limited (T,) of `LinearMachine.joints_in_loop`.
+
+    values, columns, starts: rows of the machine's A, as `data`, `indices`, `indptr` of
+    `scipy.sparse.csr_array`; b (n, inputs) and c (Y, n) its other matrices. Other arguments as there. Loops
+    instead of matrix products: for so few rows a call of BLAS costs more than the arithmetic.
+    """
+    n_u = command.shape[1]
+    n_y = measured.size
+    n = law.shape[0] - n_u
+    # The controller's states, errors and what the limits take off: what the rows of the law multiply.
+    signals = np.zeros(law.shape[1])
+    next_states = np.zeros(n)
+    last_command = np.zeros(n_u)
     queue = np.zeros((delay + 1, n_u))
+    x = np.zeros(len(b))
+    next_x = np.zeros(len(b))
+    drive = np.zeros(b.shape[1])
     for k in range(len(given)):
+        # Measure, quantise, and take the errors.
         for i in range(len(c)):
             output[k, i] = _along(c, i, x)
         for i in range(n_y):
             y = output[k, measured[i]] + given[k, n_y + n_u + i]
-            output[k, measured[i]] = y = y if steps[0] == 0 else steps[0] * np.rint(y / steps[0])
-            own[n + i] = given[k, i] - y
+            if steps[0] != 0:
+                y = steps[0] * np.rint(y / steps[0])
+            output[k, measured[i]] = y
+            signals[n + i] = given[k, i] - y
+
+        # Commands, limited in rate and size, quantised and queued for the delay.
         for i in range(n_u):
-            wanted = _along(law, n + i, own) + given[k, n_y + i]
-            u = min(max(wanted, last[i] - limits[n_u + i]), last[i] + limits[n_u + i])
-            last[i] = min(max(u, -limits[i]), limits[i])
-            limited[k] |= last[i] != wanted
-            own[n + n_y + i] = last[i] - wanted
-            queue[k % (delay + 1), i] = last[i] if steps[1] == 0 else steps[1] * np.rint(last[i] / steps[1])
+            wanted = _along(law, n + i, signals) + given[k, n_y + i]
+            lowest = last_command[i] - limits[n_u + i]
+            highest = last_command[i] + limits[n_u + i]
+            u = min(max(wanted, lowest), highest)
+            u = min(max(u, -limits[i]), limits[i])
+            last_command[i] = u
+            if u != wanted:
+                limited[k] = True
+            signals[n + n_y + i] = u - wanted
+            if steps[1] != 0:
+                u = steps[1] * np.rint(u / steps[1])
+            queue[k % (delay + 1), i] = u
             command[k, i] = queue[(k + 1) % (delay + 1), i]
             drive[i] = min(max(command[k, i] + added[k, i], -clip), clip)
+
+        # The controller's next states, and the machine's.
         for i in range(n):
-            later[i] = _along(law, i, own)
-        own[:n] = later
+            next_states[i] = _along(law, i, signals)
+        signals[:n] = next_states
         for i in range(n_u, drive.size):
             drive[i] = added[k, i]
         for i in range(x.size):
-            new[i] = _along(b, i, drive)
+            next_x[i] = _along(b, i, drive)
             for j in range(starts[i], starts[i + 1]):
-                new[i] += values[j] * x[columns[j]]
-        x[:] = new
+                next_x[i] += values[j] * x[columns[j]]
+        x[:] = next_x
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoopTrajectory(Shown):
-    """What happened: time_s (T,), reference (T,), output (T, Y) as measured, command (T,) as applied during
-    [t_k, t_{k+1}), limited (T,) whether a limit was active when the command at t_k was computed; dt_s,
-    measured_index of the controlled output."""
+    """What happened in one run of a loop over T samples.
+
+    Attributes
+    ----------
+    time_s : (T,) array
+        From 0, s.
+    reference : (T,) array
+        Set point, unit of the controlled output.
+    output : (T, Y) array
+        As measured.
+    command : (T,) array
+        As applied during [t_k, t_{k+1}), input unit.
+    limited : (T,) array of bool
+        A limit was active when the command at t_k was computed.
+    dt_s : float
+        Sampling time, s.
+    measured_index : int
+        Column of the controlled output.
+
+    Raises
+    ------
+    ValueError
+        The arrays differ in length, or `output` has no columns.
+    """
 
     time_s: Real
     reference: Real
@@ -200,11 +342,13 @@ class ClosedLoopTrajectory(Shown):
     measured_index: int = 0
 
     def __post_init__(self) -> None:
+        """Make the arrays read-only and check their shapes."""
         lock(self, "time_s", "reference", "output", "command")
         lock(self, "limited", dtype=np.bool_)
-        n = self.time_s.size
-        shapes = {f.name: np.shape(getattr(self, f.name)) for f in fields(self)[:5]}
-        if self.output.ndim != 2 or any(shape[0] != n for shape in shapes.values()):
+        names = ("time_s", "reference", "output", "command", "limited")
+        shapes = {name: np.shape(getattr(self, name)) for name in names}
+        differs = any(shape[0] != self.time_s.size for shape in shapes.values())
+        if self.output.ndim != 2 or differs:
             raise ValueError(f"trajectory needs (T,) arrays and output (T, Y); got {shapes}")
 
     @property
@@ -228,53 +372,82 @@ def simulate(
 ) -> ClosedLoopTrajectory:
     """Run u = K (r - y), with the controller's feed-forward if it has one, on a machine from rest.
 
+    Parameters
+    ----------
+    controller : Controller
+        One error, one command, with its limits and its computational delay.
+    machine : SampledMachine
+        With the controller's sampling time.
+    reference : (T,) array
+        Set point at t_k, unit of the measured output.
+    measured_index : int
+        The machine's output that is controlled.
+    hub_torque_Nm, input_disturbance, output_disturbance : (T,) arrays, optional
+        Torque handed to the machine; added to the applied command; added to the measured output.
+    measurement_step, command_step : float
+        Quantisation (mid-tread rounding) in output and input units; 0: none.
+    clip : float
+        The machine clips its input there without telling the controller; inf: nowhere.
+
+    Returns
+    -------
+    ClosedLoopTrajectory
+
+    Raises
+    ------
+    ValueError
+        Sampling times or lengths do not match, or a value is not finite.
+
+    Notes
+    -----
     At t_k: measure y_k, add output_disturbance, quantise with measurement_step, compute the limited command,
     quantise it with command_step, queue it for t_{k + delay}; then the machine holds the queued command (plus
     input_disturbance) until t_{k+1}. With no limits and no quantisation this is exactly the feedback of K
     z^-delay and the machine used in the loop analysis.
-
-    reference : (T,) array. Set point at t_k, unit of the measured output.
-    hub_torque_Nm, input_disturbance, output_disturbance : (T,) arrays, optional
-        Torque handed to the machine; added to the applied command; added to the measured output.
-    measurement_step, command_step : float
-        Quantisation (mid-tread rounding) in output and input units; 0 = none.
-    clip : float
-        The machine clips its input there without telling the controller; inf = nowhere.
-
-    Raises ValueError if sampling times or lengths do not match, or a value is not finite.
     """
     wanted = _signal("reference", reference, None)
-    n = wanted.size
-    torque = _signal("hub_torque_Nm", hub_torque_Nm, n)
-    added = _signal("input_disturbance", input_disturbance, n)
-    shift = _signal("output_disturbance", output_disturbance, n)
-    if not np.isclose(machine.dt_s, controller.dt_s, rtol=1e-9, atol=0):
+    n_samples = wanted.size
+    torque = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
+    added = _signal("input_disturbance", input_disturbance, n_samples)
+    shift = _signal("output_disturbance", output_disturbance, n_samples)
+    if not np.isclose(machine.dt_s, controller.dt_s, rtol=_SAME_PERIOD, atol=0):
         raise ValueError(
             f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}; sample both with "
             "the period of the loop"
         )
     if not (measurement_step >= 0 and command_step >= 0):
         raise ValueError("measurement_step and command_step must not be negative")
-    time_s = np.asarray(np.arange(n) * controller.dt_s, dtype=np.float64)
-    if (in_loop := getattr(machine, "in_loop", None)) is not None:
-        own = controller.feedforward
-        joins = np.zeros(n) if own is None else own.signal(wanted, controller.dt_s)
-        delay, steps = controller.computational_delay_samples, np.array([measurement_step, command_step])
-        signals = np.column_stack([wanted, joins, shift, added, torque])
-        y, u, at_limit = in_loop(signals, *law_arrays(controller), steps, delay, measured_index, clip)
-        return ClosedLoopTrajectory(time_s, wanted, y, u, at_limit, controller.dt_s, measured_index)
+    time_s = np.asarray(np.arange(n_samples) * controller.dt_s, dtype=np.float64)
+    delay = controller.computational_delay_samples
+
+    # The whole loop compiled, where the machine has it.
+    in_loop = getattr(machine, "in_loop", None)
+    if in_loop is not None:
+        from_feedforward = np.zeros(n_samples)
+        if controller.feedforward is not None:
+            from_feedforward = controller.feedforward.signal(wanted, controller.dt_s)
+        signals = np.column_stack([wanted, from_feedforward, shift, added, torque])
+        law, limits = law_arrays(controller)
+        steps = np.array([measurement_step, command_step])
+        outputs, commands, at_limit = in_loop(signals, law, limits, steps, delay, measured_index, clip)
+        return ClosedLoopTrajectory(
+            time_s, wanted, outputs, commands, at_limit, controller.dt_s, measured_index
+        )
+
+    # Sample by sample.
     machine.reset()
     stepper = controller.stepper()
-    queue = [0.0] * controller.computational_delay_samples
+    queue = [0.0] * delay
     output: list[Real] = []
-    command = np.empty(n)
-    limited = np.zeros(n, dtype=np.bool_)
-    for k in range(n):
+    command = np.empty(n_samples)
+    limited = np.zeros(n_samples, dtype=np.bool_)
+    for k in range(n_samples):
         y = np.array(machine.measure(), dtype=np.float64)
         y[measured_index] += shift[k]
         if measurement_step > 0:
             y[measured_index] = np.round(y[measured_index] / measurement_step) * measurement_step
-        u = stepper.step(float(wanted[k] - y[measured_index]), float(wanted[k]))
+        error = float(wanted[k] - y[measured_index])
+        u = stepper.step(error, float(wanted[k]))
         limited[k] = stepper.limited[0]
         if command_step > 0:
             u = float(np.round(u / command_step) * command_step)
@@ -282,50 +455,96 @@ def simulate(
         applied = queue.pop(0)
         output.append(y)
         command[k] = applied
-        machine.advance(min(max(applied + added[k], -clip), clip), hub_torque_Nm=float(torque[k]))
+        drive = min(max(applied + added[k], -clip), clip)
+        machine.advance(drive, hub_torque_Nm=float(torque[k]))
     return ClosedLoopTrajectory(
         time_s, wanted, np.array(output), command, limited, controller.dt_s, measured_index
     )
 
 
 def law_arrays(controller: Controller) -> tuple[Real, Real]:
-    """For compiled loops of U commands and Y errors: (n + U, n + Y + U), columns A, B, M and C, D, -; limits
-    (2 U,) of the commands and of their changes in a sample."""
+    """Arrays of a controller of n states, U commands and Y errors, for compiled loops.
+
+    Returns
+    -------
+    law : (n + U, n + Y + U) array
+        Rows A, B, M (M the anti-windup gain) above rows C, D, 0.
+    limits : (2 U,) array
+        Of the commands, input units, and of their changes in a sample; inf: none.
+    """
     assert controller.anti_windup_gain is not None
-    n, (commands, errors) = controller.order, controller.D.shape
-    law = np.zeros((n + commands, n + errors + commands))
+    n = controller.order
+    n_commands, n_errors = controller.D.shape
+    law = np.zeros((n + n_commands, n + n_errors + n_commands))
     law[:n] = np.hstack([controller.A, controller.B, controller.anti_windup_gain])
-    law[n:, : n + errors] = np.hstack([controller.C, controller.D])
-    change = controller.limits("rate_limit") * controller.dt_s
-    return law, np.concatenate([controller.limits("input_limit"), change])
+    law[n:, : n + n_errors] = np.hstack([controller.C, controller.D])
+    largest_change = controller.limits("rate_limit") * controller.dt_s
+    limits = np.concatenate([controller.limits("input_limit"), largest_change])
+    return law, limits
 
 
 def simulate_joints(
     controller: Controller, machine: MeasuredMachine, reference: Real, input_disturbance: Real | None = None
 ) -> tuple[Real, Real]:
-    """Run u = K (r - y) from rest for references (T, Y): measured outputs (T, Y), applied commands (T, U).
+    """Run u = K (r - y) of several loops from rest.
 
-    As `simulate`; input_disturbance (T, U) is added to what is applied. Raises ValueError if sampling times
-    or shapes do not match.
+    Parameters
+    ----------
+    controller : Controller
+        Y errors, U commands.
+    machine : MeasuredMachine
+        Y outputs, U inputs, with the controller's sampling time.
+    reference : (T, Y) array
+        Set points.
+    input_disturbance : (T, U) array, optional
+        Added to what is applied.
+
+    Returns
+    -------
+    output : (T, Y) array
+        As measured.
+    command : (T, U) array
+        As applied, without the disturbance.
+
+    Raises
+    ------
+    ValueError
+        Sampling times or shapes do not match.
+
+    Notes
+    -----
+    Order of events as in `simulate`, without quantisation.
     """
-    if not np.isclose(machine.dt_s, controller.dt_s, rtol=1e-9, atol=0):
+    if not np.isclose(machine.dt_s, controller.dt_s, rtol=_SAME_PERIOD, atol=0):
         raise ValueError(f"controller and machine differ in dt_s: {controller.dt_s} and {machine.dt_s}")
-    inputs, outputs = controller.D.shape
-    if reference.ndim != 2 or reference.shape[1] != outputs:
-        raise ValueError(f"reference must be (T, {outputs}); got {reference.shape}")
-    n = reference.shape[0]
-    added = np.zeros((n, inputs)) if input_disturbance is None else input_disturbance
-    if (in_loop := getattr(machine, "joints_in_loop", None)) is not None:
-        given, delay = np.zeros((n, 2 * outputs + inputs)), controller.computational_delay_samples
-        given[:, :outputs] = reference
+    n_commands, n_errors = controller.D.shape
+    if reference.ndim != 2 or reference.shape[1] != n_errors:
+        raise ValueError(f"reference must be (T, {n_errors}); got {reference.shape}")
+    n_samples = reference.shape[0]
+    delay = controller.computational_delay_samples
+    added = input_disturbance
+    if added is None:
+        added = np.zeros((n_samples, n_commands))
+
+    # The whole loop compiled, where the machine has it.
+    in_loop = getattr(machine, "joints_in_loop", None)
+    if in_loop is not None:
+        set_points_first = np.zeros((n_samples, 2 * n_errors + n_commands))
+        set_points_first[:, :n_errors] = reference
         law, limits = law_arrays(controller)
-        output, command, _ = in_loop(given, added, law, limits, np.zeros(2), delay, np.arange(outputs))
+        no_steps = np.zeros(2)
+        output, command, _ = in_loop(
+            set_points_first, added, law, limits, no_steps, delay, np.arange(n_errors)
+        )
         return output, command
+
+    # Sample by sample.
     machine.reset()
     stepper = controller.stepper()
-    queue = [np.zeros(inputs)] * controller.computational_delay_samples
-    output, command = np.empty((n, outputs)), np.empty((n, inputs))
-    for k in range(n):
+    queue = [np.zeros(n_commands)] * delay
+    output = np.empty((n_samples, n_errors))
+    command = np.empty((n_samples, n_commands))
+    for k in range(n_samples):
         output[k] = machine.measure()
         queue.append(stepper.step(reference[k] - output[k]))
         command[k] = queue.pop(0)
@@ -333,29 +552,56 @@ def simulate_joints(
     return output, command
 
 
-def _signal(name: str, value: npt.ArrayLike | None, n: int | None) -> Real:
+def _signal(name: str, value: npt.ArrayLike | None, n_samples: int | None) -> Real:
+    """Signal (T,) from what a user gave; zeros where it is None.
+
+    name: its parameter, for messages. n_samples: T, None where this signal sets it. A record's one column
+    (T, 1) is taken as (T,).
+
+    Raises
+    ------
+    ValueError
+        Another shape, no sample, or a value that is not finite (the message has its index).
+    """
     if value is None:
-        return np.zeros(n or 0)
+        return np.zeros(n_samples or 0)
     array = np.asarray(value, dtype=np.float64)
-    if array.ndim == 2 and array.shape[1] == 1:  # the one column of a record
+    if array.ndim == 2 and array.shape[1] == 1:
         array = array[:, 0]
-    if array.ndim != 1 or array.size == 0 or (n is not None and array.size != n):
-        raise ValueError(f"{name} must be (T,) with T = {n or 'at least 1'}; got {array.shape}")
-    if not np.all(np.isfinite(array)):
-        raise ValueError(
-            f"{name} has a value that is not finite at sample {int(np.argmin(np.isfinite(array)))}"
-        )
+    has_other_length = n_samples is not None and array.size != n_samples
+    if array.ndim != 1 or array.size == 0 or has_other_length:
+        raise ValueError(f"{name} must be (T,) with T = {n_samples or 'at least 1'}; got {array.shape}")
+    is_finite = np.isfinite(array)
+    if not np.all(is_finite):
+        first_bad = int(np.argmin(is_finite))
+        raise ValueError(f"{name} has a value that is not finite at sample {first_bad}")
     return array
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSensitivity:
-    """S measured in closed loop on a machine, from reference to error.
+    """S measured in closed loop on a machine, from reference to error, at F lines.
 
-    omega_rad_s (F,) the excited lines, response (F,) mean over periods and phase draws, std (F,) standard
-    deviation of that mean (of its modulus, nearly), from the scatter between draws, or between periods of a
-    single draw. peak_command and limited_fraction say whether the command stayed within its limits: with a
-    limit active the loop is not the one of the analysis. reference_rms: size of the excitation.
+    Attributes
+    ----------
+    omega_rad_s : (F,) array
+        The excited lines, rad/s.
+    response : (F,) complex array
+        Mean over periods and phase draws.
+    std : (F,) array
+        Standard deviation of that mean (of its modulus, nearly), from the scatter between draws, or between
+        periods of a single draw.
+    reference_rms : float
+        Root mean square of the reference, unit of the output.
+    peak_command : float
+        Largest |command|, input unit.
+    limited_fraction : float
+        Share of samples at which the command was limited: then the loop is not the one of the analysis.
+
+    Raises
+    ------
+    ValueError
+        The arrays differ in shape.
     """
 
     omega_rad_s: Real
@@ -366,6 +612,7 @@ class MeasuredSensitivity:
     limited_fraction: float
 
     def __post_init__(self) -> None:
+        """Make the arrays read-only and check their shapes."""
         lock(self, "omega_rad_s", "std")
         lock(self, "response", dtype=np.complex128)
         if not self.omega_rad_s.shape == self.response.shape == self.std.shape == (self.omega_rad_s.size,):
@@ -373,9 +620,10 @@ class MeasuredSensitivity:
 
     @property
     def peak(self) -> tuple[float, float, float]:
-        """Largest |S| over the lines, its standard deviation, its frequency [rad/s]."""
-        at = int(np.argmax(np.abs(self.response)))
-        return float(np.abs(self.response[at])), float(self.std[at]), float(self.omega_rad_s[at])
+        """Largest |S| over the lines, its standard deviation, and its frequency, rad/s."""
+        size = np.abs(self.response)
+        at = int(np.argmax(size))
+        return float(size[at]), float(self.std[at]), float(self.omega_rad_s[at])
 
 
 def measure_sensitivity(
@@ -389,7 +637,21 @@ def measure_sensitivity(
     clip: float = np.inf,
     **excitation: Any,
 ) -> MeasuredSensitivity:
-    """S measured on a machine: excitation as of `sensitivity_of`, the other keywords as of `simulate`."""
+    """S measured on a machine.
+
+    Parameters
+    ----------
+    controller, machine, measured_index, measurement_step, command_step, clip
+        As of `simulate`.
+    rng : numpy.random.Generator
+        Draws the phases of the excitation.
+    **excitation
+        Keywords of `sensitivity_of`: rms, band_rad_s, period_samples and others.
+
+    Returns
+    -------
+    MeasuredSensitivity
+    """
     run = partial(
         simulate,
         controller,
@@ -414,26 +676,59 @@ def sensitivity_of(
     draws: int = 1,
     lead_in_periods: int = 1,
 ) -> MeasuredSensitivity:
-    """S of a loop that runs a reference (T,) from rest: random-phase multisines, ratio of error to reference.
+    """S of a loop, measured by random-phase multisines: ratio of error to reference at their lines.
 
-    Every draw has phases of its own; its first `lead_in_periods` periods are left out, so that the loop has
-    come to its periodic motion. On a nonlinear machine the mean over draws is the best linear approximation
-    for this spectrum and size, and the scatter between draws holds the distortion.
+    Parameters
+    ----------
+    loop : callable
+        Runs a reference (T,) from rest.
+    rng : numpy.random.Generator
+        Draws the phases.
+    dt_s : float
+        Sampling time of the loop, s.
+    rms : float
+        Root mean square of the reference, unit of the output.
+    band_rad_s : tuple of float
+        Lowest and highest frequency that is excited, with equal amplitudes.
+    period_samples : int
+        Samples of a period; the lines are multiples of 2 pi / (period_samples dt_s).
+    periods, draws : int
+        Periods that count in each draw, and draws with phases of their own.
+    lead_in_periods : int
+        Periods before, which are left out so that the loop has come to its periodic motion.
 
-    Raises ValueError if the band holds no line of the period, or nothing would be left to take a scatter
-    from.
+    Returns
+    -------
+    MeasuredSensitivity
+
+    Raises
+    ------
+    ValueError
+        The band holds no line of the period, nothing would be left to take a scatter from, or rms is not
+        positive.
+
+    Notes
+    -----
+    On a nonlinear machine the mean over draws is the best linear approximation for this spectrum and size,
+    and the scatter between draws holds the distortion.
     """
     if periods < 1 or draws < 1 or periods * draws < 2:
         raise ValueError(f"a scatter needs two periods or two draws; got {periods} and {draws}")
     if not (rms > 0 and np.isfinite(rms)):
         raise ValueError(f"rms must be positive; got {rms}")
+    # Lines below the Nyquist frequency, in the band.
     lines = np.arange(1, (period_samples - 1) // 2 + 1)
     omega = np.asarray(2 * np.pi * lines / (period_samples * dt_s), dtype=np.float64)
-    inside = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])
-    lines, omega = lines[inside], omega[inside]
+    is_excited = (omega >= band_rad_s[0]) & (omega <= band_rad_s[1])
+    lines = lines[is_excited]
+    omega = omega[is_excited]
     if lines.size == 0:
         raise ValueError(f"no line of {period_samples} samples lies in {band_rad_s} rad/s")
-    found, peak, limited = [], 0.0, 0.0
+
+    # Ratios by draw, period and line.
+    by_draw = []
+    peak_command = 0.0
+    limited_fraction = 0.0
     for _ in range(draws):
         spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
         spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
@@ -441,21 +736,45 @@ def sensitivity_of(
         period *= rms / np.sqrt(np.mean(period**2))
         run = loop(np.tile(period, lead_in_periods + periods))
         error = (run.reference - run.measured)[lead_in_periods * period_samples :]
-        by_period = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]
-        found.append(by_period / np.fft.rfft(period)[lines])
-        peak = max(peak, float(np.max(np.abs(run.command))))
-        limited += float(np.mean(run.limited)) / draws
-    ratios = np.array(found)
-    each = ratios.mean(axis=1) if draws > 1 else ratios[0]
-    # Of a complex mean's scatter half lies along the modulus.
-    variance = np.sum(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1) / len(each)
-    std = np.asarray(np.sqrt(0.5 * variance), dtype=np.float64)
-    return MeasuredSensitivity(omega, ratios.mean(axis=(0, 1)), std, rms, peak, limited)
+        error_lines = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]
+        by_draw.append(error_lines / np.fft.rfft(period)[lines])
+        peak_command = max(peak_command, float(np.max(np.abs(run.command))))
+        limited_fraction += float(np.mean(run.limited)) / draws
+    ratios = np.array(by_draw)
+
+    # Scatter of the draws' means, or of the periods of a single draw.
+    samples = ratios.mean(axis=1) if draws > 1 else ratios[0]
+    n_samples = len(samples)
+    squares = np.abs(samples - samples.mean(axis=0)) ** 2
+    variance_of_mean = np.sum(squares, axis=0) / (n_samples - 1) / n_samples
+    # Half of a complex mean's scatter lies along the modulus.
+    std = np.asarray(np.sqrt(0.5 * variance_of_mean), dtype=np.float64)
+    response = ratios.mean(axis=(0, 1))
+    return MeasuredSensitivity(omega, response, std, rms, peak_command, limited_fraction)
 
 
 @dataclass(frozen=True)
 class StepMetrics:
-    """Step response in words; times in s from the step, None where the response never gets there."""
+    """Step response in numbers.
+
+    Attributes
+    ----------
+    step_size : float
+        Of the reference, from its first to its last value, unit of the output.
+    rise_time_s : float or None
+        From 10 % to 90 % of the step, s; None where the response never gets there.
+    overshoot_percent, undershoot_percent : float
+        Largest excess over the final level, and largest motion against the step, in % of it.
+    settling_time_s : float or None
+        From the step to the last time the response enters the band around its final level, s; None where it
+        does not.
+    steady_error : float
+        Mean error over the last tenth of the record, unit of the output.
+    peak_command : float
+        Largest |command|, input unit.
+    limited_fraction : float
+        Share of samples after the step at which the command was limited.
+    """
 
     step_size: float
     rise_time_s: float | None
@@ -467,46 +786,75 @@ class StepMetrics:
     limited_fraction: float
 
 
-def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = 0.02) -> StepMetrics:
-    """Rise time (10-90 %), overshoot, undershoot, settling time (into +-band of the step), steady error, peak
-    command.
+def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SETTLING_BAND) -> StepMetrics:
+    """Rise time, overshoot, undershoot, settling time, steady error and peak command of a step response.
 
-    All are relative to the reference step, from its first to its last value. Time starts at the first sample
-    that differs from the first value. Steady error is the mean error over the last tenth of the record.
+    Parameters
+    ----------
+    trajectory : ClosedLoopTrajectory
+        Its reference changes once: time starts at the first sample that differs from the first value. A
+        reference that stands at one level from the beginning is a step from zero at the first sample.
+    settling_band : float
+        Half width of the band, as a share of the step.
 
-    Raises ValueError if the reference is not a step (no change, or more than one level after the change).
+    Returns
+    -------
+    StepMetrics
+
+    Raises
+    ------
+    ValueError
+        The reference is not a step: it stays at zero, or has more than one level after the change.
     """
-    r, y, t = trajectory.reference, trajectory.measured, trajectory.time_s
-    changed = np.flatnonzero(r != r[0])
-    at = 0 if changed.size == 0 else int(changed[0])
-    size = float(r[-1] - r[0]) if changed.size else float(r[-1])
-    if size == 0.0 or not np.all(r[at:] == r[-1]):
+    reference = trajectory.reference
+    measured = trajectory.measured
+
+    # Where the step begins, from which level, and how large it is.
+    changed = np.flatnonzero(reference != reference[0])
+    at = 0
+    first_level = 0.0
+    if changed.size:
+        at = int(changed[0])
+        first_level = float(reference[0])
+    size = float(reference[-1] - first_level)
+    if size == 0.0 or not np.all(reference[at:] == reference[-1]):
         raise ValueError("step_metrics needs a reference that steps once to a new level")
-    progress = (y[at:] - (float(r[0]) if changed.size else 0.0)) / size
-    time = t[at:] - t[at]
-    ten, ninety = _first_crossing(time, progress, 0.1), _first_crossing(time, progress, 0.9)
+    progress = (measured[at:] - first_level) / size
+    time = trajectory.time_s[at:] - trajectory.time_s[at]
+
+    rise_begins = _first_crossing(time, progress, _RISE_FROM)
+    rise_ends = _first_crossing(time, progress, _RISE_TO)
+    rise_time_s = None
+    if rise_begins is not None and rise_ends is not None:
+        rise_time_s = rise_ends - rise_begins
+
+    # Settled one sample after the last one outside the band.
     outside = np.flatnonzero(np.abs(progress - 1.0) > settling_band)
+    settling_time_s: float | None
     if outside.size == 0:
-        settling: float | None = 0.0
+        settling_time_s = 0.0
     elif outside[-1] + 1 < progress.size:
-        settling = float(time[outside[-1] + 1])
+        settling_time_s = float(time[outside[-1] + 1])
     else:
-        settling = None
-    tail = max(1, progress.size // 10)
+        settling_time_s = None
+
+    tail = max(1, progress.size // _STEADY_PARTS)
+    excess = float(np.max(progress)) - 1.0
+    lowest = float(np.min(progress))
     return StepMetrics(
         step_size=size,
-        rise_time_s=None if ten is None or ninety is None else ninety - ten,
-        overshoot_percent=100.0 * max(0.0, float(np.max(progress)) - 1.0),
-        undershoot_percent=100.0 * max(0.0, -float(np.min(progress))),
-        settling_time_s=settling,
-        steady_error=float(np.mean(r[-tail:] - y[-tail:])),
+        rise_time_s=rise_time_s,
+        overshoot_percent=100.0 * max(0.0, excess),
+        undershoot_percent=100.0 * max(0.0, -lowest),
+        settling_time_s=settling_time_s,
+        steady_error=float(np.mean(reference[-tail:] - measured[-tail:])),
         peak_command=float(np.max(np.abs(trajectory.command))),
         limited_fraction=float(np.mean(trajectory.limited[at:])),
     )
 
 
 def _first_crossing(time: Real, value: Real, level: float) -> float | None:
-    """First time the signal reaches the level, interpolated between samples."""
+    """First time (s) at which a signal (T,) reaches a level, interpolated; None if it never does."""
     above = np.flatnonzero(value >= level)
     if above.size == 0:
         return None
@@ -514,4 +862,5 @@ def _first_crossing(time: Real, value: Real, level: float) -> float | None:
     if k == 0:
         return float(time[0])
     share = (level - value[k - 1]) / (value[k] - value[k - 1])
-    return float(time[k - 1] + share * (time[k] - time[k - 1]))
+    step = time[k] - time[k - 1]
+    return float(time[k - 1] + share * step)
