@@ -3,8 +3,11 @@
 Ellipses at 95 % per frequency do not hold a whole response with 95 %, and a band that does (simultaneous
 coverage) is wider than the worst case needs: a response may leave its ellipses where nothing is at stake.
 What is calibrated here is the statement that counts: P(gamma(G) <= gamma of the ellipses) = coverage,
-gamma(G) the largest weighted value of one sampled response G. The quantile of gamma(G) over draws is met by
-the worst case of ellipses at one level, found by bisection: the worst case grows with the level.
+gamma(G) the largest weighted value of one sampled response G. `SampledLoop` draws responses of one plant and
+gives gamma(G); `joint_coverage` takes the quantile over draws and finds by bisection the level of the
+ellipses whose worst case meets it, which works as the worst case grows with the level. `unstable_draws`
+collects sampled responses that a controller does not stabilise. Assumed: the posterior is right, and its
+draws are independent between plants and channels.
 """
 
 from __future__ import annotations
@@ -28,11 +31,43 @@ from control_design.plants.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
 from ident.uncertainty import ResponsePosterior
 
-_CHUNK = 250  # draws at a time: bounds the memory
-_LARGEST_RADIUS = 8.0  # standard deviations: level 1 - 1e-14
+# Draws that are made together: they bound the memory. Another number draws other responses from one seed.
+_CHUNK = 250
+# Fewest draws: of a hundred the share that counts at 95 % is known to 2 %.
+_FEWEST_DRAWS = 100
+
+# Radius of the ellipses, in standard deviations, between which the calibrated one is sought: from a point to
+# a level of 1 - 1e-14, where the levels of doubles end. With a largest one of 4 or 16 no test moves.
+_SMALLEST_RADIUS = 1e-3
+_LARGEST_RADIUS = 8.0
+# Relative accuracy of that radius, and the most halvings of the way between, which reach it anywhere.
+_RADIUS_ACCURACY = 1e-6
+_MOST_HALVINGS = 60
+# Largest level: a double below 1 with which the radius is still finite.
+_LARGEST_LEVEL = 1 - 1e-15
+
+# Grid of a sampled loop: logarithmic points, and points per mode. A thousand frequencies in all, since every
+# draw has them. The worst case that the draws are compared with is taken on the same grid.
+_LOG_POINTS = 500
+_POINTS_PER_MODE = 80
+# Damping ratio that the grid takes at least for a mode.
+_LEAST_DAMPING = 1e-3
+# Parts into which each step of that grid is cut where the winding of a draw is doubtful.
+_PARTS_OF_A_STEP = 10
+# Grid of a guard: fine enough to count the winding of a response whose modes have moved.
+_GUARD_LOG_POINTS = 1200
+_GUARD_POINTS_PER_MODE = 400
+
+# Ratio of axes below which an ellipse counts as a line, whose short axis says nothing about a distance: the
+# response is real there.
+_THIN = 1e-6
+# Keeps quotients finite.
+_TINY = 1e-300
 
 Responses = Callable[[Real], Complex]
+"""Function of omega (F,), rad/s, that gives the same posterior samples (D, F) at every call."""
 Draw = Callable[[np.random.Generator, int], Responses]
+"""Function of a generator and a number of draws D that draws such samples."""
 
 
 @runtime_checkable
@@ -47,12 +82,25 @@ class ResponseDraws(Protocol):
 class JointCoverage:
     """Calibrated level of the ellipses.
 
-    coverage: probability asked for. gamma: its quantile of gamma(G) over the draws, which is the worst case
-    of ellipses at `level` (per frequency; near 0 where gamma hardly depends on the plant). given_level,
-    gamma_given, coverage_given: the level the plants came with, its worst case and the share of draws within
-    that. simultaneous_given: share of draws that stay inside the ellipses of the given level at all grid
-    frequencies; simultaneous_level: level at which that share is `coverage`. stable_share: draws whose 1 + K
-    G winds as a stable loop's. Sampling error of the coverage: sqrt(coverage (1 - coverage)/draws).
+    Attributes
+    ----------
+    coverage : float
+        Probability asked for.
+    draws : int
+        Number of sampled responses. Sampling error of the coverage: sqrt(coverage (1 - coverage) / draws).
+    gamma : float
+        Quantile of gamma(G) over the draws at `coverage`.
+    level : float
+        Level (per frequency) of the ellipses whose worst case is `gamma`; near 0 where gamma hardly depends
+        on the plant.
+    given_level, gamma_given, coverage_given : float
+        The level the plants came with, its worst case, and the share of draws within that.
+    simultaneous_given : float
+        Share of draws that stay inside the ellipses of the given level at all grid frequencies.
+    simultaneous_level : float
+        Level at which that share is `coverage`.
+    stable_share : float
+        Share of draws whose 1 + K G winds as a stable loop's.
     """
 
     coverage: float
@@ -76,134 +124,221 @@ def joint_coverage(
     coverage: float = 0.95,
     draws: int = 4000,
 ) -> JointCoverage:
-    """Calibrate the per-frequency level so that the worst case holds with probability `coverage`.
+    """Per-frequency level of the ellipses with which the worst case holds with probability `coverage`.
 
-    Several plants are drawn independently of one another, and so are the measured and the performance channel
-    of one plant; gamma(G) is then the largest over all of them. gamma(G) is taken on a grid of about a
-    thousand frequencies, as is the worst case it is compared with.
+    Parameters
+    ----------
+    controller : Controller
+    plants : sequence of UncertainPlant
+        They are drawn independently of one another, and so are the measured and the performance channel of
+        one plant; gamma(G) is the largest over all of them.
+    specification : Specification
+        Its weighted requirements make gamma.
+    rng : numpy.random.Generator
+    coverage : float
+        In (0, 1).
+    draws : int
+        Number of sampled responses, at least 100.
 
-    Raises ValueError if coverage is outside (0, 1), draws is below 100 or an uncertainty cannot be drawn from
-    (a response known on its own frequencies only says nothing about their correlation).
+    Returns
+    -------
+    JointCoverage
+
+    Raises
+    ------
+    ValueError
+        Coverage is outside (0, 1), there are too few draws or no plants, or an uncertainty cannot be drawn
+        from (a response known on its own frequencies only says nothing about their correlation).
+
+    Notes
+    -----
+    gamma(G) is taken on a grid of about a thousand frequencies, as is the worst case it is compared with.
     """
     if not 0 < coverage < 1:
         raise ValueError(f"joint coverage must lie in (0, 1); got {coverage}")
-    if draws < 100:
-        raise ValueError(f"joint coverage needs at least 100 draws; got {draws}")
+    if draws < _FEWEST_DRAWS:
+        raise ValueError(f"joint coverage needs at least {_FEWEST_DRAWS} draws; got {draws}")
     if not plants:
         raise ValueError("joint coverage needs at least one plant")
     loops = [SampledLoop(controller, plant, specification) for plant in plants]
-    gammas, stable, distances = zip(*(loop.gamma(rng, draws) for loop in loops), strict=True)
-    gamma, outside = np.max(gammas, axis=0), np.max(distances, axis=0)
-    # The worst case at a radius is compared in standard deviations, common to all plants.
+    samples = [loop.gamma(rng, draws) for loop in loops]
+    gammas, stables, distances = zip(*samples, strict=True)
+    gamma = np.max(gammas, axis=0)
     wanted = float(np.quantile(gamma, coverage, method="higher"))
-    given = [radius_of(loop.plant.level) for loop in loops]
-    at_given = max(loop.worst(radius) for loop, radius in zip(loops, given, strict=True))
-    low, high = 1e-3, _LARGEST_RADIUS
-    for _ in range(60):
+
+    # Radius of the ellipses, in standard deviations and common to all plants, whose worst case is the
+    # quantile.
+    low = _SMALLEST_RADIUS
+    high = _LARGEST_RADIUS
+    for _ in range(_MOST_HALVINGS):
         middle = 0.5 * (low + high)
         if max(loop.worst(middle) for loop in loops) < wanted:
             low = middle
         else:
             high = middle
-        if high - low < 1e-6 * high:
+        if high - low < _RADIUS_ACCURACY * high:
             break
+
+    # What the given level is worth.
+    given_radii = [radius_of(loop.plant.level) for loop in loops]
+    gamma_given = max(loop.worst(radius) for loop, radius in zip(loops, given_radii, strict=True))
+    stays_inside = [distance <= radius for distance, radius in zip(distances, given_radii, strict=True)]
+    all_stay_inside = np.all(stays_inside, axis=0)
+    largest_distance = np.max(distances, axis=0)
+    simultaneous_radius = float(np.quantile(largest_distance, coverage))
     return JointCoverage(
         coverage=coverage,
         draws=draws,
         gamma=wanted,
         level=_level(high),
         given_level=max(loop.plant.level for loop in loops),
-        gamma_given=at_given,
-        coverage_given=float(np.mean(gamma <= at_given)),
-        simultaneous_given=float(
-            np.mean(np.all([one <= r for one, r in zip(distances, given, strict=True)], axis=0))
-        ),
-        simultaneous_level=_level(float(np.quantile(outside, coverage))),
-        stable_share=float(np.mean(np.all(stable, axis=0))),
+        gamma_given=gamma_given,
+        coverage_given=float(np.mean(gamma <= gamma_given)),
+        simultaneous_given=float(np.mean(all_stay_inside)),
+        simultaneous_level=_level(simultaneous_radius),
+        stable_share=float(np.mean(np.all(stables, axis=0))),
     )
 
 
 def at_level(plant: UncertainPlant, level: float) -> UncertainPlant:
-    """The plant with ellipses of another level, its performance channel with it."""
-    performance = plant.performance and replace(plant.performance, level=level)
+    """The plant with ellipses of another level, in (0, 1), its performance channel with it."""
+    performance = plant.performance
+    if performance is not None:
+        performance = replace(performance, level=level)
     return replace(plant, level=level, performance=performance)
 
 
 class SampledLoop:
-    """One plant and controller on one grid, to draw posterior samples for.
+    """One plant and controller on one grid of F frequencies, to draw posterior samples for.
 
-    Raises ValueError if an uncertainty cannot be drawn from.
+    Attributes
+    ----------
+    plant, controller, specification
+        As given.
+    draw : Draw
+        Draws responses of the measured channel.
+    omega_rad_s : (F,) array
+        The grid, rad/s.
+    data : PlantData
+        Plant and weights there.
+    unit : Ellipses
+        With a radius of one standard deviation.
+    loop : (F,) complex array
+        The controller without delay.
+
+    Raises
+    ------
+    ValueError
+        The uncertainty cannot be drawn from.
     """
 
     def __init__(self, controller: Controller, plant: UncertainPlant, specification: Specification) -> None:
-        self.plant, self.controller, self.specification = plant, controller, specification
+        self.plant = plant
+        self.controller = controller
+        self.specification = specification
         self.draw = drawn(plant.channel)
         poles = closed_loop_poles(controller, plant)
-        modes = (*plant.modes, *modes_of(poles, plant.dt_s), *modes_of(controller.poles, plant.dt_s))
-        light = [
-            Mode(m.omega_rad_s, max(abs(m.zeta), 1e-3)) for m in modes if m.omega_rad_s < plant.nyquist_rad_s
-        ]
-        grid = checked_grid(plant, light, 500, 80)
-        self.omega_rad_s, self.data = grid, PlantData.build(plant, specification, grid)
+        loop_modes = modes_of(poles, plant.dt_s)
+        controller_modes = modes_of(controller.poles, plant.dt_s)
+        light: list[Mode] = []
+        for mode in (*plant.modes, *loop_modes, *controller_modes):
+            if mode.omega_rad_s < plant.nyquist_rad_s:
+                light.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), _LEAST_DAMPING)))
+        grid = checked_grid(plant, light, _LOG_POINTS, _POINTS_PER_MODE)
+        self.omega_rad_s = grid
+        self.data = PlantData.build(plant, specification, grid)
         self.unit = self.data.ellipses.scaled(1 / radius_of(plant.level))
         self.loop = controller.response(grid, with_delay=False)
         integrators, unstable = loop_integrators(controller, plant)
-        self._required = {"integrators": integrators, "unstable_poles": unstable}
+        self._winding_of_stable = {"integrators": integrators, "unstable_poles": unstable}
 
     def worst(self, radius: float) -> float:
         """Largest weighted worst case over ellipses of a radius in standard deviations."""
-        data = PlantData.build(at_level(self.plant, _level(radius)), self.specification, self.omega_rad_s)
+        plant = at_level(self.plant, _level(radius))
+        data = PlantData.build(plant, self.specification, self.omega_rad_s)
         return float(np.max(worst_of(data.weighted(self.loop))))
 
     def gamma_of(self, members: Complex, performance: Responses | None) -> Real:
-        """Largest weighted value (D,) of responses (D, F) of the measured channel, and of the performance
-        channel's draws."""
-        data, size = self.data, np.abs(self.loop)
-        inverse = 1.0 / np.maximum(np.abs(1.0 + members * (self.loop * data.delay)), 1e-300)
+        """Largest weighted value gamma(G) (D,) of responses (D, F) of the measured channel.
+
+        performance: draws of an independent performance channel, which its requirement is about; None: there
+        is none, or nothing is asked of it.
+        """
+        data = self.data
+        size = np.abs(self.loop)
+        return_difference = np.abs(1.0 + members * (self.loop * data.delay))
+        sensitivity = 1.0 / np.maximum(return_difference, _TINY)
         largest = np.zeros(members.shape[0])
         for each in data.weightings:
-            use = each.own > 0
+            use = each.magnitude > 0
             if not np.any(use):
                 continue
-            weight = (each.own * size if each.requirement.function.of_controller else each.own)[use]
+            weight = each.magnitude[use]
+            if each.requirement.function.of_controller:
+                weight = (each.magnitude * size)[use]
             if each.channel is not None and performance is not None:
                 weight = weight * np.abs(performance(self.omega_rad_s[use]))
             elif each.function.of_plant:
                 weight = weight * np.abs(members[:, use])
-            largest = np.maximum(largest, np.max(weight * inverse[:, use], axis=1))
+            largest = np.maximum(largest, np.max(weight * sensitivity[:, use], axis=1))
         return np.asarray(largest, dtype=np.float64)
 
     def distance_of(self, members: Complex) -> Real:
-        """Largest normalised distance (D,) from the centre."""
+        """Largest distance (D,) of responses (D, F) from the centre, in standard deviations."""
         turned = (members - self.unit.centre) * np.conj(self.unit.direction)
-        major, minor = np.maximum(self.unit.semi_major, 1e-300), np.maximum(self.unit.semi_minor, 1e-300)
+        major = np.maximum(self.unit.semi_major, _TINY)
+        minor = np.maximum(self.unit.semi_minor, _TINY)
+        along_major = turned.real / major
         # An axis of zero length (a frequency where the response is real) says nothing by itself.
-        thin = self.unit.semi_minor <= 1e-6 * self.unit.semi_major
-        second = np.where(thin, 0.0, turned.imag / minor)
-        return np.asarray(np.max(np.hypot(turned.real / major, second), axis=1), dtype=np.float64)
+        thin = self.unit.semi_minor <= _THIN * self.unit.semi_major
+        along_minor = np.where(thin, 0.0, turned.imag / minor)
+        return np.asarray(np.max(np.hypot(along_major, along_minor), axis=1), dtype=np.float64)
 
     def stable_of(self, responses: Responses, members: Complex) -> Boolean:
-        """Whether 1 + K G winds as it must, (D,); on a ten times finer grid where a step is wide."""
+        """Whether 1 + K G winds as a stable loop's, (D,); members (D, F): the responses on the grid.
+
+        Draws with a wide step are counted again on a ten times finer grid.
+        """
         omega = self.omega_rad_s
-        stable, wide = winds(members * (self.loop * self.data.delay), **self._required)
-        if np.any(wide):
-            share = np.linspace(0, 1, 11)[:-1]
-            fine = np.append((omega[:-1, None] + np.diff(omega)[:, None] * share).ravel(), omega[-1])
+        stable, has_wide_step = winds(members * (self.loop * self.data.delay), **self._winding_of_stable)
+        if np.any(has_wide_step):
+            share = np.linspace(0, 1, _PARTS_OF_A_STEP + 1)[:-1]
+            fine = (omega[:-1, None] + np.diff(omega)[:, None] * share).ravel()
+            fine = np.append(fine, omega[-1])
             loop = self.controller.response(fine)
-            stable[wide], _ = winds(responses(fine)[wide] * loop, **self._required)
+            wide_members = responses(fine)[has_wide_step]
+            stable[has_wide_step], _ = winds(wide_members * loop, **self._winding_of_stable)
         return stable
 
     def gamma(self, rng: np.random.Generator, draws: int) -> tuple[Real, Boolean, Real]:
-        """Of posterior samples (a Monte Carlo check), (D,) each: gamma(G) (inf where 1 + K G does not wind as
-        a stable loop's), stable, and the largest normalised distance of the measured response from the
-        centre, in standard deviations."""
-        other = None if self.plant.performance is None else drawn(self.plant.performance)
-        asked = any(each.channel is not None and np.any(each.own > 0) for each in self.data.weightings)
-        gamma, stable, distance = np.zeros(draws), np.zeros(draws, dtype=bool), np.zeros(draws)
+        """Values of D posterior samples (a Monte Carlo check), (D,) each.
+
+        Returns
+        -------
+        gamma : (D,) array
+            gamma(G); inf where 1 + K G does not wind as a stable loop's.
+        stable : (D,) array of bool
+            Whether it does.
+        distance : (D,) array
+            Largest distance of the measured response from the centre, in standard deviations.
+        """
+        has_asked_channel = False
+        for each in self.data.weightings:
+            if each.channel is not None and np.any(each.magnitude > 0):
+                has_asked_channel = True
+        draw_performance = None
+        if self.plant.performance is not None:
+            draw_performance = drawn(self.plant.performance)
+
+        gamma = np.zeros(draws)
+        stable = np.zeros(draws, dtype=bool)
+        distance = np.zeros(draws)
         for here, count in _chunks(draws):
             responses = self.draw(rng, count)
             members = responses(self.omega_rad_s)
-            performance = other(rng, count) if other is not None and asked else None
+            performance = None
+            if draw_performance is not None and has_asked_channel:
+                performance = draw_performance(rng, count)
             stable[here] = self.stable_of(responses, members)
             gamma[here] = np.where(stable[here], self.gamma_of(members, performance), np.inf)
             distance[here] = self.distance_of(members)
@@ -219,45 +354,71 @@ def unstable_draws(
     draws: int,
     most: int,
 ) -> tuple[int, list[Guard]]:
-    """How many of `draws` sampled responses (of every plant) are unstable, and up to `most` different ones
-    of each plant, as guards for another synthesis.
+    """How many sampled responses are unstable, and some of them as guards for another synthesis.
 
-    Raises ValueError if an uncertainty cannot be drawn from.
+    Parameters
+    ----------
+    controller : Controller
+    plants : sequence of UncertainPlant
+        A draw counts as unstable where the response of any of them is.
+    specification : Specification
+        For the computational delay and the grid.
+    rng : numpy.random.Generator
+    draws : int
+        Number of samples of every plant.
+    most : int
+        Guards of each plant at most, different from one another.
+
+    Returns
+    -------
+    number : int
+        Of unstable draws.
+    guards : list of Guard
+
+    Raises
+    ------
+    ValueError
+        An uncertainty cannot be drawn from.
     """
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []
     for number, plant in enumerate(plants):
         loop = SampledLoop(controller, plant, specification)
-        # Fine enough to count the winding of a response whose modes have moved.
-        grid, found = checked_grid(plant, plant.modes, 1200, 400), list[Complex]()
+        grid = checked_grid(plant, plant.modes, _GUARD_LOG_POINTS, _GUARD_POINTS_PER_MODE)
+        unstable_responses: list[Complex] = []
         for here, count in _chunks(draws):
             responses = loop.draw(rng, count)
-            bad = ~loop.stable_of(responses, responses(loop.omega_rad_s))
-            unstable[here] |= bad
-            if np.any(bad):
-                found.append(responses(grid)[bad])
-        if found:
-            together = np.concatenate(found)
-            guards += [Guard(number, grid, together[at]) for at in different_responses(together, most)]
+            stable = loop.stable_of(responses, responses(loop.omega_rad_s))
+            unstable[here] |= ~stable
+            if not np.all(stable):
+                unstable_responses.append(responses(grid)[~stable])
+        if unstable_responses:
+            together = np.concatenate(unstable_responses)
+            for at in different_responses(together, most):
+                guards.append(Guard(number, grid, together[at]))
     return int(np.count_nonzero(unstable)), guards
 
 
 def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
-    """Positions and number of the draws made together."""
+    """Positions, and number, of the draws that are made together, until there are `draws`."""
     for start in range(0, draws, _CHUNK):
         count = min(_CHUNK, draws - start)
         yield slice(start, start + count), count
 
 
 def drawn(channel: PlantChannel) -> Draw:
-    """How posterior samples of a channel are drawn; ValueError where they cannot be."""
+    """Function that draws posterior samples of a channel; without uncertainty all are the nominal response.
+
+    Raises
+    ------
+    ValueError
+        The uncertainty is neither a posterior nor offers `draw` or `first_order`.
+    """
     uncertainty: Any = channel.uncertainty
     if uncertainty is None:
-        return lambda rng, draws: (
-            lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
-        )
+        return partial(_nominal_responses, channel)
     if isinstance(uncertainty, ResponsePosterior):
-        return lambda rng, draws: partial(uncertainty.response_of, uncertainty.sample(rng, draws))
+        return partial(_posterior_responses, uncertainty)
     if isinstance(uncertainty, ResponseDraws):
         return uncertainty.draw
     if isinstance(uncertainty, FirstOrderUncertainty):
@@ -268,20 +429,37 @@ def drawn(channel: PlantChannel) -> Draw:
     )
 
 
+def _nominal_responses(channel: PlantChannel, rng: np.random.Generator, draws: int) -> Responses:
+    """Function of omega (F,) that gives the nominal response `draws` times, (draws, F); draws no number."""
+    return lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
+
+
+def _posterior_responses(posterior: ResponsePosterior, rng: np.random.Generator, draws: int) -> Responses:
+    """Function of omega (F,) that gives responses (draws, F) of coefficients drawn from the posterior."""
+    return partial(posterior.response_of, posterior.sample(rng, draws))
+
+
 def _linear_responses(
     uncertainty: FirstOrderUncertainty, dt_s: float, rng: np.random.Generator, draws: int
 ) -> Responses:
-    """Gaussian draws on the generators of an uncertainty: the linear model whose ellipses they are."""
-    kept: list[Real] = []
+    """Function of omega (F,) that gives responses (draws, F): Gaussian draws on the uncertainty's generators.
+
+    They are those of the linear model whose ellipses the uncertainty has. The weights (draws, Q) of the Q
+    generators are drawn at the first call, which shows Q, and serve all later ones.
+    """
+    weights: list[Real] = []
 
     def at(omega: Real) -> Complex:
-        centre, generators = uncertainty.first_order(FrequencyIntervals(omega, np.zeros(omega.size), dt_s), 0)
-        if not kept:
-            kept.append(rng.standard_normal((draws, generators.value.shape[1])))
-        return np.asarray(centre.value + kept[0] @ generators.value.T, dtype=np.complex128)
+        """Responses (draws, F) at omega (F,), rad/s."""
+        points = FrequencyIntervals(omega, np.zeros(omega.size), dt_s)
+        centre, generators = uncertainty.first_order(points, 0)
+        if not weights:
+            weights.append(rng.standard_normal((draws, generators.value.shape[1])))
+        return np.asarray(centre.value + weights[0] @ generators.value.T, dtype=np.complex128)
 
     return at
 
 
 def _level(radius: float) -> float:
-    return float(min(-np.expm1(-0.5 * radius**2), 1 - 1e-15))
+    """Level, the probability of a plane Gaussian inside an ellipse of a radius in standard deviations."""
+    return float(min(-np.expm1(-0.5 * radius**2), _LARGEST_LEVEL))

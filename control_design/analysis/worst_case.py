@@ -1,6 +1,10 @@
-"""Worst case over the ellipses on a dense grid, refined around its maxima. Exact at every grid frequency.
+"""Worst case over the ellipses on a dense grid, refined around its maxima: exact at every grid frequency.
 
-Plants and specification stand on two grids: a lean one for the optimisers, a dense one for their checks.
+`PlantData` holds one plant and its weights on one grid, and gives the worst case of every requirement for
+controller values there (`PlantData.weighted`). `worst_case` evaluates a controller on a grid and adds points
+around the largest maxima. `Grids` keeps every plant on two grids for the optimisers: a lean one that grows,
+and a dense one for their checks. Assumed: the ellipses hold every plant at each frequency by itself.
+Neglected: what lies between grid points (`between_grid_points` bounds that).
 """
 
 from __future__ import annotations
@@ -20,37 +24,67 @@ from control_design.plants.ellipses import (
     quotient,
 )
 from control_design.plants.frequency_grid import GridOptions, around_maxima, joined, programme_grid
-from control_design.plants.plant_set import UncertainPlant
+from control_design.plants.plant_set import Mode, UncertainPlant
 from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction, WeightedRequirement
 
-_PEAKS = 8  # local maxima that a round refines
+# Local maxima of each requirement that a round refines, the largest ones. Chosen; from 2 to 16 no test of the
+# certificate moves.
+_PEAKS = 8
+# Relative distance in frequency below which a mode of the performance channel is one of the plant's.
+_SAME_MODE = 1e-6
+# Frequency around which a controller acts, in bandwidths. Chosen: its roll-off and its notches lie above the
+# bandwidth. It scales parameters and starts of the optimisers, and decides nothing.
+_BANDWIDTHS = 3.0
+# That frequency where neither bandwidth nor mode says it, as a share of Nyquist.
+_SHARE_OF_NYQUIST = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Weighting:
-    """A weighted requirement on a grid: own (F,) its |W|, 0 = not asked; channel (F,) the largest |Gp| of an
-    independent channel where asked, or None."""
+    """A weighted requirement on a grid of F frequencies.
+
+    Attributes
+    ----------
+    requirement : WeightedRequirement
+        Its `function` is one of S, K S, G S, T; its `of_member` that without an independent channel.
+    magnitude : (F,) array
+        |W|, 0 where nothing is asked.
+    channel : (F,) array or None
+        Largest |Gp| of an independent channel where asked; None without such a channel.
+    """
 
     requirement: WeightedRequirement
-    own: Real
+    magnitude: Real
     channel: Real | None
 
     @cached_property
     def size(self) -> Real:
         """Everything that multiplies the closed-loop function of the member, (F,)."""
-        return self.own if self.channel is None else self.own * self.channel
+        if self.channel is None:
+            return self.magnitude
+        return self.magnitude * self.channel
 
     @property
     def function(self) -> LoopFunction:
-        """The closed-loop function of the member."""
+        """The closed-loop function of the member: without the factor of an independent channel."""
         return self.requirement.of_member
 
 
 @dataclass(frozen=True, eq=False)
 class PlantData:
-    """One plant on one grid with everything that does not depend on the controller; delay (F,) = e^{-j omega
-    (dt samples)}."""
+    """One plant on one grid of F frequencies, with everything that does not depend on the controller.
+
+    Attributes
+    ----------
+    plant : UncertainPlant
+    ellipses : Ellipses
+        Of its response, F of them.
+    delay : (F,) complex array
+        e^{-j omega dt samples} of the computational delay.
+    weightings : tuple of Weighting
+        One per weighted requirement.
+    """
 
     plant: UncertainPlant
     ellipses: Ellipses
@@ -59,89 +93,133 @@ class PlantData:
 
     @classmethod
     def build(cls, plant: UncertainPlant, specification: Specification, omega_rad_s: Real) -> PlantData:
-        """Evaluate plant and weights at omega (F,)."""
+        """Plant and weights of its requirements, evaluated at omega (F,), rad/s.
+
+        Raises
+        ------
+        ValueError
+            The plant is known on its own frequencies only, and omega has another one.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         weightings = []
         for requirement in specification.weighted(plant):
-            own, channel = requirement.magnitude(omega, plant.dt_s), None
+            magnitude = requirement.magnitude(omega, plant.dt_s)
+            channel = None
             if requirement.channel is not None:
-                channel, use = np.zeros(omega.size), own > 0
+                channel = np.zeros(omega.size)
+                use = magnitude > 0
                 if np.any(use):
                     channel[use] = requirement.channel.at(omega[use]).farthest()
-            weightings.append(Weighting(requirement, own, channel))
+            weightings.append(Weighting(requirement, magnitude, channel))
         delay = np.exp(-1j * omega * plant.dt_s * specification.computational_delay_samples)
         return cls(plant, plant.at(omega), delay, tuple(weightings))
 
-    def _most(self, sizes: Iterable[Real]) -> Real:
-        return np.asarray(np.max([np.zeros(self.delay.size), *sizes], axis=0), dtype=np.float64)
+    def _largest_of(self, sizes: Iterable[Real]) -> Real:
+        """Largest of several weights (F,) at every frequency, (F,); zeros where there are none."""
+        nothing = np.zeros(self.delay.size)
+        return np.asarray(np.max([nothing, *sizes], axis=0), dtype=np.float64)
 
     def largest(self, function: LoopFunction) -> Real:
         """Largest weight (F,) on a closed-loop function of the members; zeros where none is asked."""
-        return self._most(each.size for each in self.weightings if each.function is function)
+        return self._largest_of(each.size for each in self.weightings if each.function is function)
 
     @property
     def sensitivity(self) -> Real:
         """Largest weight (F,) on S itself: tracking and modulus margin."""
-        itself = LoopFunction.SENSITIVITY
-        return self._most(each.own for each in self.weightings if each.requirement.function is itself)
+        on_sensitivity = [
+            each for each in self.weightings if each.requirement.function is LoopFunction.SENSITIVITY
+        ]
+        return self._largest_of(each.magnitude for each in on_sensitivity)
 
     def of(self, kind: type[WeightedRequirement]) -> Real:
         """Weight (F,) of one kind of requirement; zeros where it is not asked."""
-        return self._most(each.size for each in self.weightings if isinstance(each.requirement, kind))
+        return self._largest_of(each.size for each in self.weightings if isinstance(each.requirement, kind))
 
     @property
     def open_loop_disturbance(self) -> Real:
         """Largest |W Gp| (F,) of the requirements on disturbances without a controller, at the centre."""
-        asked = [w for w in self.weightings if w.requirement.function is LoopFunction.DISTURBANCE]
         centre = np.abs(self.ellipses.centre)
-        return self._most(w.own * (centre if w.channel is None else w.channel) for w in asked)
+        sizes: list[Real] = []
+        for each in self.weightings:
+            if each.requirement.function is LoopFunction.DISTURBANCE:
+                response = centre if each.channel is None else each.channel
+                sizes.append(each.magnitude * response)
+        return self._largest_of(sizes)
 
     def row_weights(self) -> tuple[tuple[LoopFunction, Real], ...]:
-        """Weights (F,) by function of the members, as rows of the optimisers: all that are asked at every
-        frequency together, those of a band by themselves."""
+        """Weights (F,) by function of the members, as rows of the optimisers.
+
+        Those that are asked at every frequency are one row per function, the largest of them; those of a band
+        come after, each by itself.
+        """
         rows: list[tuple[LoopFunction, Real]] = []
-        whole = [w for w in self.weightings if w.requirement.band is None]
+        everywhere = [each for each in self.weightings if each.requirement.band is None]
+        in_a_band = [each for each in self.weightings if each.requirement.band is not None]
         for function in LoopFunction:
-            everywhere = [w.size for w in whole if w.function is function]
-            if everywhere:
-                rows.append((function, np.asarray(np.max(everywhere, axis=0), dtype=np.float64)))
-        return (*rows, *((w.function, w.size) for w in self.weightings if w not in whole))
+            sizes = [each.size for each in everywhere if each.function is function]
+            if sizes:
+                rows.append((function, np.asarray(np.max(sizes, axis=0), dtype=np.float64)))
+        rows += [(each.function, each.size) for each in in_a_band]
+        return tuple(rows)
 
     def weighted(self, k: Complex) -> dict[str, Real]:
-        """Worst case over the ellipses of each weighted closed-loop function for controller values k (F,)
-        without delay.
+        """Worst case over the ellipses of each weighted closed-loop function.
 
-        By name of the requirement, and "distance" = dist(-1, K E); inf where a member of the ellipse puts the
-        loop on -1.
+        Parameters
+        ----------
+        k : (F,) complex array
+            Controller values without delay.
+
+        Returns
+        -------
+        dict of str to (F,) array
+            By name of the requirement, and "distance" = dist(-1, K E). Inf where a member of the ellipse puts
+            the loop on -1.
         """
         loop = k * self.delay
         distance = distance_to_minus_one(loop, self.ellipses)
-        inverse = quotient(1.0, distance, np.inf)
+        largest_sensitivity = quotient(1.0, distance, np.inf)
         values: dict[str, Real] = {}
         for each in self.weightings:
             # An infinite weight (integrator asked of the loop) at an infinite loop gain never occurs: the
             # grid starts above 0.
-            weight = each.size * np.abs(k) if each.function.of_controller else each.size
-            value, use = np.zeros(loop.size), each.own > 0
-            if each.function.of_plant and np.any(use):
-                value[use] = weight[use] * largest_disturbance_gain(loop[use], self.ellipses.subset(use))
-            elif not each.function.of_plant:
-                with np.errstate(invalid="ignore"):  # 0 * inf: no requirement there
-                    value = np.where(weight > 0, weight * inverse, 0.0)
+            weight = each.size
+            if each.function.of_controller:
+                weight = each.size * np.abs(k)
+            use = each.magnitude > 0
+            value = np.zeros(loop.size)
+            if not each.function.of_plant:
+                # 0 * inf, where nothing is asked and the loop may be on -1, is 0.
+                with np.errstate(invalid="ignore"):
+                    value = np.where(weight > 0, weight * largest_sensitivity, 0.0)
+            elif np.any(use):
+                largest_gain = largest_disturbance_gain(loop[use], self.ellipses.subset(use))
+                value[use] = weight[use] * largest_gain
             values[each.requirement.name] = value
         return values | {"distance": distance}
 
 
 def worst_of(values: dict[str, Real]) -> Real:
-    """Largest weighted value per frequency, (F,)."""
+    """Largest weighted value per frequency, (F,), of what `PlantData.weighted` gives."""
     weighted = [value for name, value in values.items() if name != "distance"]
     return np.asarray(np.max(weighted, axis=0), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class WorstCase:
-    """Weighted worst cases on an adaptively refined grid: omega (F,), values as `PlantData.weighted`, k
-    (F,)."""
+    """Weighted worst cases of one plant and controller on an adaptively refined grid.
+
+    Attributes
+    ----------
+    omega_rad_s : (F,) array
+        Ascending, rad/s.
+    ellipses : Ellipses
+        Of the plant there.
+    loop_factor : (F,) complex array
+        The controller with its delay: what multiplies a member of the ellipse.
+    values : dict of str to (F,) array
+        As of `PlantData.weighted`.
+    """
 
     omega_rad_s: Real
     ellipses: Ellipses
@@ -150,18 +228,19 @@ class WorstCase:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the weighted requirements."""
+        """Names of the weighted requirements."""
         return tuple(name for name in self.values if name != "distance")
 
     def joined(self, other: WorstCase) -> WorstCase:
-        """This and another, at other frequencies."""
-        own, new = ([one.loop_factor, *(one.values[name] for name in self.values)] for one in (self, other))
-        omega, (factor, *values) = joined(self.omega_rad_s, own, other.omega_rad_s, new)
+        """Both on one ascending grid; `other` has other frequencies and the requirements of this one."""
+        arrays = [self.loop_factor, *self.values.values()]
+        other_arrays = [other.loop_factor, *(other.values[name] for name in self.values)]
+        omega, (factor, *values) = joined(self.omega_rad_s, arrays, other.omega_rad_s, other_arrays)
         ellipses = self.ellipses.joined(other.ellipses)
         return WorstCase(omega, ellipses, factor, dict(zip(self.values, values, strict=True)))
 
     def peak(self, kind: str) -> tuple[float, float]:
-        """(largest value, its frequency) of one kind."""
+        """Largest value of one requirement, and its frequency, rad/s."""
         index = int(np.argmax(self.values[kind]))
         return float(self.values[kind][index]), float(self.omega_rad_s[index])
 
@@ -174,64 +253,106 @@ def worst_case(
     *,
     rounds: int = 3,
 ) -> WorstCase:
-    """Evaluate on `start` (F,) and refine around the largest local maxima of every kind.
+    """Worst cases on a grid that is refined around their largest local maxima.
 
-    response: controller without delay. Each round makes the grid ten times finer between the neighbours of
-    the eight largest local maxima; plants known on their own grid only are not refined.
+    Parameters
+    ----------
+    response : callable
+        Controller without delay (N,) at frequencies (N,), rad/s.
+    plant : UncertainPlant
+        One that is known on its own frequencies only is not refined.
+    specification : Specification
+    start : (F,) array
+        First grid, rad/s.
+    rounds : int
+        Each puts nine points between the neighbours of the eight largest local maxima of every requirement:
+        two neighbours are then a fifth as far apart.
+
+    Returns
+    -------
+    WorstCase
     """
 
-    def found_at(omega: Real) -> WorstCase:
-        data, k = PlantData.build(plant, specification, omega), response(omega)
+    def evaluated(omega: Real) -> WorstCase:
+        """Worst cases at frequencies (N,), rad/s."""
+        data = PlantData.build(plant, specification, omega)
+        k = response(omega)
         return WorstCase(omega, data.ellipses, k * data.delay, data.weighted(k))
 
-    found = found_at(np.asarray(start, dtype=np.float64))
-    for _ in range(rounds if plant.own_grid is None else 0):
-        sizes = [value for name, value in found.values.items() if name != "distance" and np.any(value > 0)]
-        new = around_maxima(found.omega_rad_s, sizes, _PEAKS)
+    worst = evaluated(np.asarray(start, dtype=np.float64))
+    if plant.own_grid is not None:
+        return worst
+    for _ in range(rounds):
+        asked_values = [worst.values[name] for name in worst.names if np.any(worst.values[name] > 0)]
+        new = around_maxima(worst.omega_rad_s, asked_values, _PEAKS)
         if not new.size:
             break
-        found = found.joined(found_at(new))
-    return found
+        worst = worst.joined(evaluated(new))
+    return worst
 
 
 class Grids:
-    """Every plant on its lean grid (F,), which grows by exchange, and on its dense one, which is fixed."""
+    """Every plant on its lean grid (F,), which grows by exchange, and on its dense one, which is fixed.
+
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+    specification : Specification
+    options : GridOptions
+        Numbers of points.
+
+    Attributes
+    ----------
+    grids : list of (F,) arrays
+        The lean grids, rad/s; optimisers put others in their place.
+    dense : list of PlantData
+        The dense grids, with the points of the first lean ones.
+    """
 
     def __init__(
         self, plants: Sequence[UncertainPlant], specification: Specification, options: GridOptions
     ) -> None:
-        self.plants, self.spec = tuple(plants), specification
+        self.plants = tuple(plants)
+        self.spec = specification
         self.grids: list[Real] = []
         self.dense: list[PlantData] = []
         for plant in plants:
-            # The plant's, and the performance channel's where damping is asked for.
+            # The plant's modes, and the performance channel's where damping is asked for.
             modes = list(plant.modes)
             if specification.mode_peak_ratio is not None:
-                modes += [
-                    mode
-                    for mode in plant.damped.modes
-                    if all(abs(mode.omega_rad_s - o.omega_rad_s) > 1e-6 * o.omega_rad_s for o in modes)
-                ]
-            edges = [edge for asked in specification.weighted(plant) for edge in asked.band or ()]
+                modes += [mode for mode in plant.damped.modes if not _is_among(mode, plant.modes)]
+            edges: list[float] = []
+            for asked in specification.weighted(plant):
+                edges += asked.band or ()
             lean = programme_grid(plant, modes, options, edges)
             self.grids.append(lean)
             dense = programme_grid(plant, modes, options, lean, dense=True)
             self.dense.append(PlantData.build(plant, specification, dense))
 
     def lean(self, grids: Sequence[Real] | None = None) -> list[PlantData]:
-        """Every plant on its lean grid, as it is now or as given."""
-        return [
-            PlantData.build(plant, self.spec, grid)
-            for plant, grid in zip(self.plants, self.grids if grids is None else grids, strict=True)
-        ]
+        """Every plant on its lean grid, as it is now or as given, rad/s."""
+        used = self.grids if grids is None else grids
+        pairs = zip(self.plants, used, strict=True)
+        return [PlantData.build(plant, self.spec, grid) for plant, grid in pairs]
 
     @property
     def scale_rad_s(self) -> float:
-        """Frequency around which the controller has to act: bandwidth and lowest mode, or a tenth of
-        Nyquist."""
+        """Frequency around which the controller has to act, rad/s.
+
+        Geometric mean of three bandwidths and the lowest mode of every plant; a tenth of Nyquist without any.
+        """
         candidates = [mode.omega_rad_s for plant in self.plants for mode in plant.modes[:1]]
         if self.spec.bandwidth_rad_s is not None:
-            candidates.append(3.0 * self.spec.bandwidth_rad_s)
+            candidates.append(_BANDWIDTHS * self.spec.bandwidth_rad_s)
         if not candidates:
-            return 0.1 * self.plants[0].nyquist_rad_s
+            return _SHARE_OF_NYQUIST * self.plants[0].nyquist_rad_s
         return float(np.exp(np.mean(np.log(candidates))))
+
+
+def _is_among(mode: Mode, modes: Sequence[Mode]) -> bool:
+    """Whether one of the modes has the mode's frequency, but for `_SAME_MODE`."""
+    for other in modes:
+        difference = abs(mode.omega_rad_s - other.omega_rad_s)
+        if not difference > _SAME_MODE * other.omega_rad_s:
+            return True
+    return False
