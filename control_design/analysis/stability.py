@@ -1,5 +1,12 @@
-"""Nominal stability two ways: closed-loop poles of the full state space, and the Nyquist count of the
-uncertainty centre."""
+"""Nominal stability two ways: closed-loop poles of the full state space, and a Nyquist count.
+
+`NominalLoop` closes one plant with any controller and gives the poles; `closed_loop_poles` does it once, with
+checks. `mode_changes` follows the plant's lightly damped modes along the root locus into the closed loop.
+`nyquist_count` counts the half turns of 1 + L from zero frequency to Nyquist, of a response alone: it decides
+about centres of ellipses and posterior samples, whose poles nobody computes. `loop_integrators` says how many
+half turns a stable loop makes. Assumed of a count: the grid shows every turn; it is refined where that can be
+done.
+"""
 
 from __future__ import annotations
 
@@ -15,30 +22,85 @@ from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, delayed, modes_of
 
-_GAINS = 16  # steps of the root locus; halved up to _HALVINGS times where poles come near one another
-_HALVINGS = 6  # the smallest step is then a thousandth of the way: 16 * 2^6 = 1024
-_NEAR = 1.2  # ratio of frequencies within which a lighter pole of the loop is heard as the mode
-_LOST = 0.02  # share of its damping; two digits show no less
+# Determinant of 1 + D_K D_G below which a loop is algebraic, and one that is closed has no defined command.
+_SMALLEST_DETERMINANT = 1e-12
+# Relative difference of two sampling times that counts as none: rounding of decimal numbers.
+_SAME_PERIOD = 1e-9
+
+# Steps of the root locus, gain 0 to 1. From 4 to 32 no test moves.
+_GAINS = 16
+# Times that a step is halved at most where poles come near one another: the smallest one is a thousandth of
+# the way, 16 * 2^6 = 1024. From 0 to 10 no test moves.
+_HALVINGS = 6
+# A pole may be followed if it moved by less than this share of its distance to the next candidate. Chosen.
+_CLEARLY_NEAREST = 0.3
+# Ratio of frequencies within which a lighter pole of the loop is heard as the mode. Chosen; with 1.05 or 1.5
+# no test moves.
+_NEAR = 1.2
+# Share of its damping ratio that a mode loses before that is told: two digits show no less.
+_LOST = 0.02
+
+# Tolerance of a count of half turns, which comes in steps of 1/2.
+_HALF_OF_A_STEP = 0.25
+# Widest phase step, rad, between neighbours of a draw that is not counted again on a finer grid.
+_WIDE_STEP_RAD = np.pi / 3
+# Widest phase step of a count that is believed: below it no turn by pi hides between two points that turn one
+# way and back.
+_WIDEST_STEP_RAD = np.pi / 2
+# A refined count adds points until every phase step is below this: a quarter of what is believed.
+_FINE_STEP_RAD = np.pi / 8
+# Sine of the angle between 1 + L at the lowest frequency and its limit direction at which the grid begins low
+# enough, and the decades by which it is lowered at most, with points per decade.
+_NEAR_LIMIT_DIRECTION = 0.1
+_MOST_DECADES = 8
+_POINTS_PER_DECADE = 20
+# Rounds in which wide steps are halved, and the most points: a limit of work for a loop that passes through
+# -1. Steps narrower than this share of their frequency are rounding.
+_MOST_ROUNDS = 30
+_MOST_POINTS = 200_000
+_NARROWEST_STEP = 1e-12
 
 
 class NominalLoop:
-    """One nominal plant with the computational delay at its input, ready to be closed many times."""
+    """One nominal plant with the computational delay at its input, ready to be closed many times.
+
+    Parameters
+    ----------
+    plant : UncertainPlant or MultivariablePlant
+        Its `nominal` discrete state space counts.
+    delay_samples : int
+        Computational delay.
+    """
 
     def __init__(self, plant: UncertainPlant | MultivariablePlant, delay_samples: int) -> None:
         system = delayed(plant.nominal, delay_samples)
-        self._a, self._b, self._c, self._d = (np.asarray(getattr(system, m), dtype=float) for m in "ABCD")
+        self._a = np.asarray(system.A, dtype=float)
+        self._b = np.asarray(system.B, dtype=float)
+        self._c = np.asarray(system.C, dtype=float)
+        self._d = np.asarray(system.D, dtype=float)
 
     def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
-        """Poles (n,) with the controller a, b, c, d (without delay); one infinite pole for an algebraic
-        loop, det(1 + D_K D_G) = 0."""
+        """Closed-loop poles (n,) in z with a controller u = K e, e = -y.
+
+        Parameters
+        ----------
+        a, b, c, d : arrays
+            State space of the controller without delay: (m, m), (m, Y), (U, m), (U, Y).
+
+        Returns
+        -------
+        (n,) complex array
+            Of plant, delay and controller; one infinite pole for an algebraic loop, det(1 + D_K D_G) = 0, and
+            where a matrix is not finite.
+        """
         n = self._a.shape[0]
         if not (np.all(np.isfinite(a)) and np.all(np.isfinite(c))):
             return np.array([np.inf + 0j])
-        # u = (1 + D_K D_G)^-1 (c x_k - d C x), e = -(C x + D u)
+        # u = (1 + D_K D_G)^-1 (c x_k - d C x), e = -(C x + D u), as rows over the states (x, x_k).
         u = np.hstack([-d @ self._c, c])
         if np.any(self._d):
             loop = np.eye(d.shape[0]) + d @ self._d
-            if not abs(np.linalg.det(loop)) > 1e-12:
+            if not abs(np.linalg.det(loop)) > _SMALLEST_DETERMINANT:
                 return np.array([np.inf + 0j])
             u = np.linalg.solve(loop, u)
         e = -self._d @ u
@@ -52,11 +114,14 @@ class NominalLoop:
 
 
 def closed_loop_poles(controller: Controller, plant: UncertainPlant) -> Complex:
-    """Poles (n,) of the feedback of plant and controller, delay states included.
+    """Poles (n,) in z of the feedback of plant and controller, delay states included.
 
-    Raises ValueError if the loop is algebraic (1 + D_K D_G = 0) or the sampling times differ.
+    Raises
+    ------
+    ValueError
+        The loop is algebraic (1 + D_K D_G = 0), or the sampling times differ.
     """
-    if not np.isclose(controller.dt_s, plant.dt_s, rtol=1e-9, atol=0):
+    if not np.isclose(controller.dt_s, plant.dt_s, rtol=_SAME_PERIOD, atol=0):
         raise ValueError(
             f"controller and plant {plant.name!r} differ in dt_s: {controller.dt_s} and {plant.dt_s}; "
             "sample both with the period of the loop"
@@ -77,50 +142,81 @@ class ModeChange:
 
     @property
     def loses_damping(self) -> bool:
-        """By a share that two digits can show."""
+        """Whether the damping ratio falls by a share that two digits can show."""
         return self.closed_loop.zeta < (1 - _LOST) * self.open_loop.zeta
 
 
 def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeChange, ...]:
-    """Every stable mode of the plant in closed loop, ascending in frequency.
+    """What becomes of every stable mode of the plant in the nominal closed loop.
 
+    Parameters
+    ----------
+    controller : Controller
+    plant : UncertainPlant
+        Its nominal modes count: oscillatory pole pairs, each with its frequency and damping ratio.
+
+    Returns
+    -------
+    tuple of ModeChange
+        Ascending in frequency.
+
+    Notes
+    -----
     A mode is followed along the root locus, gain of the controller from 0 to 1. Of closed-loop modes that no
     mode of the plant has become and that are within a fifth of its frequency, a lighter one takes its place:
-    where poles of plant and controller meet, the lighter branch is what rings. Only the nominal plant.
+    where poles of plant and controller meet, the lighter branch is what rings.
     """
     modes = [mode for mode in plant.modes if mode.zeta > 0]
     loop = NominalLoop(plant, controller.computational_delay_samples)
 
     def poles_at(gain: float) -> Complex:
-        found = loop.poles(controller.A, controller.B, gain * controller.C, gain * controller.D)
-        return found[(found.imag >= 0) & np.isfinite(found)]
+        """Finite poles in z of the upper half plane, with the controller times a gain."""
+        poles = loop.poles(controller.A, controller.B, gain * controller.C, gain * controller.D)
+        is_upper = poles.imag >= 0
+        return poles[is_upper & np.isfinite(poles)]
 
-    def follow(from_: Complex, low: float, high: float, halvings: int) -> Complex:
-        near = poles_at(high)
-        away = np.abs(from_[:, None] - near[None])
-        own = linear_sum_assignment(away)[1]
-        others = away.copy()
-        others[np.arange(from_.size), own] = np.inf
-        if halvings and np.any(away.min(axis=1) > 0.3 * others.min(axis=1, initial=np.inf)):
+    def follow(before: Complex, low: float, high: float, halvings: int) -> Complex:
+        """Poles (M,) at gain `high` that continue those at gain `low`: the nearest ones, each used once.
+
+        Where a pole has not moved clearly less than the way to the next candidate, the step is halved, up to
+        `halvings` times.
+        """
+        candidates = poles_at(high)
+        distance = np.abs(before[:, None] - candidates[None])
+        chosen = linear_sum_assignment(distance)[1]
+        distance_to_next = distance.copy()
+        distance_to_next[np.arange(before.size), chosen] = np.inf
+        nearest = distance.min(axis=1)
+        next_nearest = distance_to_next.min(axis=1, initial=np.inf)
+        if halvings and np.any(nearest > _CLEARLY_NEAREST * next_nearest):
             middle = 0.5 * (low + high)
-            return follow(follow(from_, low, middle, halvings - 1), middle, high, halvings - 1)
-        return near[own]
+            half_way = follow(before, low, middle, halvings - 1)
+            return follow(half_way, middle, high, halvings - 1)
+        return candidates[chosen]
 
-    s = [mode.omega_rad_s * (-mode.zeta + 1j * np.sqrt(1 - mode.zeta**2)) for mode in modes]
-    followed = np.exp(np.array(s, dtype=np.complex128) * plant.dt_s)
+    # Poles of the modes in s, then in z, followed from the open to the closed loop.
+    poles_s = [mode.omega_rad_s * (-mode.zeta + 1j * np.sqrt(1 - mode.zeta**2)) for mode in modes]
+    followed = np.exp(np.array(poles_s, dtype=np.complex128) * plant.dt_s)
     gains = np.linspace(0.0, 1.0, _GAINS + 1)
     if modes:
         for low, high in pairwise(gains.tolist()):
             followed = follow(followed, low, high, _HALVINGS)
-    every = poles_at(1.0)
-    rest = modes_of(every[~np.isin(every, followed)], plant.dt_s, zeta_below=1.0)
+
+    # Modes of the loop that none of the plant's has become.
+    closed_loop = poles_at(1.0)
+    is_new = ~np.isin(closed_loop, followed)
+    new_modes = modes_of(closed_loop[is_new], plant.dt_s, zeta_below=1.0)
     changes = []
     for mode, pole in zip(modes, followed, strict=True):
-        became = modes_of(np.array([pole]), plant.dt_s, zeta_below=1.0) or (
-            Mode(float(abs(np.log(pole)) / plant.dt_s) if pole else np.inf, 1.0),
-        )
-        near = [m for m in rest if 1 / _NEAR < m.omega_rad_s / mode.omega_rad_s < _NEAR]
-        changes.append(ModeChange(mode, min((*became, *near), key=lambda found: found.zeta)))
+        candidates = list(modes_of(np.array([pole]), plant.dt_s, zeta_below=1.0))
+        if not candidates:
+            # A real pole swings no more; one at z = 0 is gone after a sample.
+            omega = float(abs(np.log(pole)) / plant.dt_s) if pole else np.inf
+            candidates = [Mode(omega, 1.0)]
+        for new_mode in new_modes:
+            if 1 / _NEAR < new_mode.omega_rad_s / mode.omega_rad_s < _NEAR:
+                candidates.append(new_mode)
+        changes.append(ModeChange(mode, min(candidates, key=lambda candidate: candidate.zeta)))
     return tuple(changes)
 
 
@@ -128,9 +224,18 @@ def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeCha
 class NyquistCount:
     """Half turns of 1 + L from zero frequency to Nyquist.
 
-    half_turns: phase change / pi, counted anticlockwise. required: unstable poles + integrators/2 for a
-    stable loop. largest_step_rad: largest phase step between neighbouring points (below pi/2 the count is
-    trustworthy). matches: they agree.
+    Attributes
+    ----------
+    half_turns : float
+        Phase change / pi, counted anticlockwise.
+    required : float
+        Half turns of a stable loop: unstable poles + integrators / 2.
+    largest_step_rad : float
+        Largest phase step between neighbouring points; below pi/2 the count is trustworthy.
+    points : int
+        Of the grid.
+    matches : bool
+        The count is trustworthy and the required one.
     """
 
     half_turns: float
@@ -141,28 +246,50 @@ class NyquistCount:
 
 
 def _steps(value: Complex) -> Real:
-    """Phase steps between neighbours on the last axis."""
+    """Phase steps (..., F - 1), rad, between neighbours on the last axis of values (..., F)."""
     return np.asarray(np.angle(value[..., 1:] * np.conj(value[..., :-1])), dtype=np.float64)
 
 
 def half_turns(value: Complex, integrators: int) -> Real:
-    """Phase change / pi (...) of 1 + L (..., F) from near zero frequency to Nyquist.
+    """Phase change / pi (...) of 1 + L (..., F) from near zero frequency to Nyquist, a multiple of 1/2.
 
-    The remainders to the limit directions at both ends, known up to half turns, close the count to a multiple
-    of 1/2.
+    Parameters
+    ----------
+    value : (..., F) complex array
+        1 + L on an ascending grid that ends at Nyquist.
+    integrators : int
+        Poles of L at z = 1.
+
+    Notes
+    -----
+    The limit directions at both ends are known up to half turns: real at Nyquist, that of j^-integrators at
+    zero frequency. The remainders to them close the count to a multiple of 1/2.
     """
-    first, last = np.angle(value[..., 0] * 1j**integrators), np.angle(value[..., -1])
-    total = np.sum(_steps(value), axis=-1) + (first - np.pi * np.round(first / np.pi))
-    total -= last - np.pi * np.round(last / np.pi)
-    closed = np.round(total / np.pi, 9) + 0.0  # no minus sign on zero
+    first = np.angle(value[..., 0] * 1j**integrators)
+    last = np.angle(value[..., -1])
+    first_remainder = first - np.pi * np.round(first / np.pi)
+    last_remainder = last - np.pi * np.round(last / np.pi)
+    total = np.sum(_steps(value), axis=-1) + first_remainder
+    total -= last_remainder
+    # Adding 0.0 leaves no minus sign on zero.
+    closed = np.round(total / np.pi, 9) + 0.0
     return np.asarray(closed, dtype=np.float64)
 
 
 def winds(loop_gain: Complex, *, integrators: int, unstable_poles: int) -> tuple[Boolean, Boolean]:
-    """(1 + L turns as a stable loop's, some phase step is wider than pi/3), each (D,), for L (D, F) from
-    near zero frequency to Nyquist; see `nyquist_count`."""
-    right = np.abs(half_turns(1.0 + loop_gain, integrators) - (unstable_poles + integrators / 2.0)) < 0.25
-    return right, np.max(np.abs(_steps(1.0 + loop_gain)), axis=1) > np.pi / 3
+    """Whether 1 + L turns as a stable loop's, and whether some phase step is wider than pi/3, (D,) each.
+
+    Parameters
+    ----------
+    loop_gain : (D, F) complex array
+        L of D loops on an ascending grid from near zero frequency to Nyquist.
+    integrators, unstable_poles : int
+        Of L: poles at z = 1 and outside the circle; see `nyquist_count`.
+    """
+    required = unstable_poles + integrators / 2.0
+    off_count = np.abs(half_turns(1.0 + loop_gain, integrators) - required)
+    largest_step = np.max(np.abs(_steps(1.0 + loop_gain)), axis=1)
+    return off_count < _HALF_OF_A_STEP, largest_step > _WIDE_STEP_RAD
 
 
 def nyquist_count(
@@ -175,44 +302,70 @@ def nyquist_count(
 ) -> NyquistCount:
     """Count the half turns of F = 1 + L on the upper half of the circle.
 
+    Parameters
+    ----------
+    loop_gain : callable
+        L (N,) at frequencies (N,), rad/s.
+    start : (F,) array
+        First grid, ascending, ending at Nyquist, rad/s.
+    integrators, unstable_poles : int
+        Poles of L at z = 1 and outside the circle.
+    refinable : bool
+        L is known between the points: they are added until every phase step is below pi/8, and the lowest
+        frequency is lowered until F is within 0.1 rad of its limit direction there.
+
+    Returns
+    -------
+    NyquistCount
+
+    Notes
+    -----
     F has as many zeros as poles (L is proper and F(infinity) is not 0). With the contour indented outside z =
     1 the i integrators lie inside, so a stable loop turns by 2 pi P over the whole contour, P the unstable
     poles of L; by symmetry pi P over the upper half, of which the quarter of the indentation takes -i pi/2.
     Hence arg F(pi/dt) - arg F(0+) = pi P + i pi/2, where arg F(0+) = -i pi/2 (mod pi). With i = 0, 1, 2 and P
     = 0 the phase therefore starts at 0, -pi/2, -pi and ends at 0.
-
-    start (F,): first grid, ascending, ending at Nyquist. If refinable, points are added until every phase
-    step is below pi/8 and the lowest frequency is lowered until F is within 0.1 rad of its limit direction
-    there.
     """
     omega = np.asarray(start, dtype=np.float64)
     value = 1.0 + loop_gain(omega)
     if refinable:
-        for _ in range(8):
-            off_axis = np.angle(value[0] * 1j**integrators)
-            if abs(np.sin(off_axis)) < 0.1:
+        for _ in range(_MOST_DECADES):
+            off_limit_direction = np.angle(value[0] * 1j**integrators)
+            if abs(np.sin(off_limit_direction)) < _NEAR_LIMIT_DIRECTION:
                 break
-            lower = np.geomspace(omega[0] / 10.0, omega[0], 21)[:-1]
+            lower = np.geomspace(omega[0] / 10.0, omega[0], _POINTS_PER_DECADE + 1)[:-1]
             omega = np.concatenate([lower, omega])
             value = np.concatenate([1.0 + loop_gain(lower), value])
-        for _ in range(30):
-            wide = np.flatnonzero(np.abs(_steps(value)) > np.pi / 8)
-            wide = wide[(omega[wide + 1] - omega[wide]) > 1e-12 * omega[wide + 1]]
-            if wide.size == 0 or omega.size > 200_000:
+        for _ in range(_MOST_ROUNDS):
+            is_wide = np.abs(_steps(value)) > _FINE_STEP_RAD
+            can_be_halved = np.diff(omega) > _NARROWEST_STEP * omega[1:]
+            wide = np.flatnonzero(is_wide & can_be_halved)
+            if wide.size == 0 or omega.size > _MOST_POINTS:
                 break
             middle = 0.5 * (omega[wide] + omega[wide + 1])
             omega = np.insert(omega, wide + 1, middle)
             value = np.insert(value, wide + 1, 1.0 + loop_gain(middle))
+
     turns = float(half_turns(value, integrators))
     required = unstable_poles + integrators / 2.0
-    largest = float(np.max(np.abs(_steps(value)))) if omega.size > 1 else np.pi
-    matches = bool(abs(turns - required) < 0.25 and largest < np.pi / 2 and np.all(np.isfinite(value)))
-    return NyquistCount(turns, required, largest, int(omega.size), matches)
+    largest_step = np.pi
+    if omega.size > 1:
+        largest_step = float(np.max(np.abs(_steps(value))))
+    is_required = abs(turns - required) < _HALF_OF_A_STEP
+    is_trustworthy = largest_step < _WIDEST_STEP_RAD and np.all(np.isfinite(value))
+    matches = bool(is_required and is_trustworthy)
+    return NyquistCount(turns, required, largest_step, int(omega.size), matches)
 
 
 def loop_integrators(controller: Controller, plant: UncertainPlant) -> tuple[int, int]:
-    """(integrators, unstable poles) of the loop gain L = G K."""
+    """Numbers of integrators and of unstable poles of the loop gain L = G K, nominal plant and controller.
+
+    A pole of the controller on the circle away from z = 1 counts as unstable.
+    """
     poles = controller.poles
-    own = count_integrators(poles)
-    others = poles[np.argsort(np.abs(poles - 1.0), kind="stable")][own:]
-    return plant.n_integrators + own, plant.unstable_poles + int(np.sum(np.abs(others) >= 1.0))
+    n_controller = count_integrators(poles)
+    nearest_one_first = np.argsort(np.abs(poles - 1.0), kind="stable")
+    other_poles = poles[nearest_one_first][n_controller:]
+    unstable = np.abs(other_poles) >= 1.0
+    integrators = plant.n_integrators + n_controller
+    return integrators, plant.unstable_poles + int(np.sum(unstable))
