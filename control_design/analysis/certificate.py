@@ -1,11 +1,19 @@
-"""The certificate: what was checked about a controller, independently of the optimiser that made it."""
+"""The certificate: what was checked about a controller, independently of the optimiser that made it.
+
+`certify` checks one controller against plants and specification. For every plant (`_check_plant`) it builds a
+dense grid of its own, computes closed-loop poles, worst cases over the ellipses, the Nyquist count and
+margins (`loop_margins`), bounds everything between the grid points, and lets each requirement decide. What
+holds for whole responses (joint coverage) and what happens at the controller's limits come on top. A
+`Certificate` holds the numbers, so that they can be shown and stored. Assumed: every plant lies in the
+ellipses, with as many unstable poles as its nominal model.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -23,7 +31,7 @@ from control_design.analysis.stability import (
 )
 from control_design.analysis.worst_case import WorstCase, worst_case
 from control_design.controllers.controller import Controller
-from control_design.plants.ellipses import Complex, Real
+from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import checked_grid, near_the_circle, with_own_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.plants.set_expansion import with_straight_between
@@ -32,20 +40,65 @@ from control_design.specification.requirement import Findings, SpecificationItem
 from ident.data.finding import Finding, distinct
 from ident.data.shown import NOT_STORED, Shown
 
+# Damping ratio of a controller's pole pair below which it is told: it is narrower than what anybody measures
+# a machine on.
+LIGHT_CONTROLLER_POLES = 1e-3
+
+# Damping ratio below which modes of plant, controller and loop get grid points of their own: above it a
+# logarithmic grid shows the resonance, which is at most 1 / (2 zeta) high.
+_LIGHT_MODE = 0.4
+# Damping ratio that the grid takes at least for a mode, so that its points do not fall onto one another.
+_LEAST_DAMPING = 1e-5
+# Grid points around each of these modes.
+_POINTS_PER_MODE = 120
+# Distance of the loop from -1 at which |S| is -3 dB, its value at the bandwidth.
+_DISTANCE_AT_BANDWIDTH = np.sqrt(2.0)
+
+_LIMITED_COMMAND = "limited command under a constant error: distance from its end, share of the limit"
+_LIMITED_LOOP = "limited loop after a step beyond the limit: distance from its end, share of the step"
+
 
 @dataclass(frozen=True)
 class PlantVerdict:
     """Everything checked on one plant.
 
-    closed_loop_modes: oscillatory pairs of the nominal closed loop. mode_changes: what becomes of the lightly
-    damped modes of the nominal plant. worst_tracking etc.: largest weighted
-    value over the ellipses (<= 1 met, 0 = not asked). bandwidth_rad_s: up to here
-    every member has |S| below -3 dB. own_grid_rad_s: range of a user's own frequency grid, None if the
-    uncertainty is known everywhere; assumed_linear: between its points the response was assumed on a straight
-    line between members. Margins and bandwidth are nan where the loop is not stable. stated: an uncertainty
-    was given at all. own_performance: the damping requirement
-    looks at a channel of its own, any pair of members allowed. all_frequencies: what was proved between the
-    grid points.
+    Attributes
+    ----------
+    plant : str
+        Its name.
+    stable : bool
+        All nominal closed-loop poles lie inside the unit circle.
+    pole_radius : float
+        Largest modulus of these poles.
+    closed_loop_modes : tuple of Mode
+        Oscillatory pole pairs of the nominal closed loop.
+    mode_changes : tuple of ModeChange
+        What becomes of the lightly damped modes of the nominal plant.
+    nyquist : NyquistCount
+        Half turns of 1 + K c, c the centre of the ellipses.
+    nominal_margins, worst_margins : Margins
+        Of the centre, and the smallest over all members of the ellipses; nan where the loop is not stable.
+    worst_margin_omega_rad_s : float
+        Where the loop comes nearest to -1.
+    worst_weighted : float
+        Largest weighted value over the ellipses (at most 1: met); inf where the loop is not stable or an
+        ellipse reaches -1.
+    worst_peak_sensitivity : float
+        Largest |S| over the ellipses.
+    bandwidth_rad_s : float
+        Up to here every member has |S| below -3 dB; nan where the loop is not stable.
+    frequencies : int
+        Points of the dense grid.
+    own_grid_rad_s : tuple of float or None
+        Range of a user's own frequency grid; None if the uncertainty is known everywhere.
+    assumed_linear : bool
+        Between the points of that grid the response was assumed on a straight line between members.
+    stated : bool
+        An uncertainty was given at all.
+    own_performance : bool
+        The damping requirement looks at a channel of its own, any pair of members allowed.
+    all_frequencies : AllFrequencies
+        What was proved between the grid points.
     """
 
     plant: str
@@ -111,25 +164,18 @@ class Certificate(Shown):
 
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
-        """What the certificate stands or falls with: doubts about the ellipses of its plants."""
-        found: list[Finding] = []
+        """Doubts about the ellipses of its plants, each once: what the certificate stands or falls with."""
+        findings: list[Finding] = []
         for plant in self.uncertain_plants:
-            if (conditions := getattr(plant.uncertainty, "conditions", None)) is not None:
-                found += conditions(partial(frequency_response, plant.nominal), plant.level)
-        return distinct(found)
+            conditions = getattr(plant.uncertainty, "conditions", None)
+            if conditions is not None:
+                findings += conditions(partial(frequency_response, plant.nominal), plant.level)
+        return distinct(findings)
 
     @property
     def nominal_only(self) -> bool:
-        """No plant had an uncertainty: the worst case is the nominal plant."""
+        """Whether no plant had an uncertainty: the worst case is the nominal plant."""
         return not any(plant.stated for plant in self.plants)
-
-
-LIGHT_CONTROLLER_POLES = 1e-3
-"""Damping ratio; less is narrower than what anybody measures a machine on, and is told."""
-
-
-_LIMITED_COMMAND = "limited command under a constant error: distance from its end, share of the limit"
-_LIMITED_LOOP = "limited loop after a step beyond the limit: distance from its end, share of the step"
 
 
 def certify(
@@ -146,27 +192,49 @@ def certify(
 ) -> Certificate:
     """Check a controller from any source against plants and specification.
 
+    Parameters
+    ----------
+    controller : Controller
+        One error, one command. With limits it is also simulated at them, on the nominal plants
+        (`limited_loop`): constant errors and reference steps beyond the limit have to end where they must.
+    plants : sequence of UncertainPlant
+        Each a nominal model with ellipses of its response.
+    specification : Specification
+        What the loop has to do for every member.
+    n_dense : int
+        Logarithmic points of the dense grid; those around modes and roots come on top.
+    between_own_points : {"linear", "nothing"}
+        What may be assumed of a response known on its own frequencies only. "linear": at fraction x between
+        two neighbours it lies in (1 - x) E_k + x E_{k+1}; the verdict says that this was assumed. "nothing":
+        no statement between them, whatever the controller does there.
+    joint_coverage : float, optional
+        Probability with which the weighted worst case shall hold for a whole response
+        (`joint_coverage.joint_coverage`). None: each frequency by itself.
+    rng : numpy.random.Generator, optional
+        Draws the responses that a joint coverage needs.
+    joint_draws : int
+        Number of these responses.
+    joint_stable_share : float
+        With a joint coverage, share of those responses that must be stable. It is a requirement of its own:
+        ellipses propagate parameters to first order, and no level of theirs speaks for draws far outside
+        (`joint_synthesis` designs for it).
+
+    Returns
+    -------
+    Certificate
+
+    Raises
+    ------
+    ValueError
+        The plants are none, sampling times or computational delays do not match, the loop is algebraic, or a
+        joint coverage comes without rng.
+
+    Notes
+    -----
     The grid is built here from the poles of plants, controller and closed loop and refined where the checks
     are worst; the optimiser's grid plays no part. Between its points the worst cases are bounded
     (`between_grid_points`), for plants whose uncertainty can be evaluated with its derivatives: posteriors of
     coefficients, plants without uncertainty, and uncertainties that offer `first_order`.
-
-    between_own_points: what may be assumed of a response known on its own frequencies only. "linear": at
-    fraction x between two neighbours it lies in (1 - x) E_k + x E_{k+1}; the verdict says that this was
-    assumed. "nothing": no statement between them, whatever the controller does there.
-
-    joint_coverage: probability with which the weighted worst case shall hold for a whole response; needs rng
-    and draws `joint_draws` responses (`joint_coverage.joint_coverage`). None: each frequency by itself.
-
-    A controller with limits is also simulated at them, on the nominal plants (`limited_loop`): constant
-    errors and reference steps beyond the limit have to end where they must.
-
-    joint_stable_share: with a joint coverage, share of those responses that must be stable. It is a
-    requirement of its own: ellipses propagate parameters to first order, and no level of theirs speaks for
-    draws far outside (`joint_synthesis` designs for it).
-
-    Raises ValueError if the plants are none, sampling times or computational delays do not match, or the loop
-    is algebraic.
     """
     if not plants:
         raise ValueError("certify needs at least one plant")
@@ -176,7 +244,10 @@ def certify(
             f"the controller has {controller.computational_delay_samples} samples of computational delay, "
             f"the specification {specification.computational_delay_samples}"
         )
-    joint, asked = None, tuple(plants)
+
+    # Ellipses of the calibrated level, where that is above the given one.
+    asked_plants = tuple(plants)
+    joint = None
     if joint_coverage is not None:
         if rng is None:
             raise ValueError("joint_coverage needs rng, a numpy.random.Generator to draw responses with")
@@ -184,77 +255,148 @@ def certify(
             controller, plants, specification, rng=rng, coverage=joint_coverage, draws=joint_draws
         )
         plants = [at_level(plant, max(plant.level, joint.level)) for plant in plants]
+
+    # Requirements on the loops, then on the controller alone, of which nothing about a loop is known.
     verdicts: list[PlantVerdict] = []
     items: list[SpecificationItem] = []
     for plant in plants:
-        verdict, found = _check_plant(controller, plant, specification, n_dense, between_own_points)
+        verdict, plant_items = _check_plant(controller, plant, specification, n_dense, between_own_points)
         verdicts.append(verdict)
-        items += found
-    nothing = Findings("controller", {}, None, (np.inf, 0.0), np.inf, (), controller)
-    items += [requirement.check(nothing) for requirement in specification.on_controller()]
-    if joint is not None:
-        name = plants[0].name if len(plants) == 1 else "all plants together"
-        caption = f"share of {joint.draws} sampled responses that are stable"
-        found_share, enough = joint.stable_share, bool(joint.stable_share >= joint_stable_share)
-        share = SpecificationItem(caption, name, joint_stable_share, found_share, "", enough)
-        items.append(replace(share, at_least=True, about="sampled responses"))
-    # The nominal loops at the controller's limits.
-    limited = limited_loops(controller, plants)
-    for loop in limited:
-        if loop.steps:
-            alone = loop is limited[0]
-            caption = _LIMITED_COMMAND if alone else _LIMITED_LOOP
-            about: Literal["controller", "nominal loop"] = "controller" if alone else "nominal loop"
-            found_loop = SpecificationItem(caption, loop.plant, ERROR_LEFT, loop.worst, "", loop.ends)
-            items.append(replace(found_loop, about=about))
+        items += plant_items
+    no_loop = Findings(
+        plant="controller",
+        peaks={},
+        bounds=None,
+        modulus=(np.inf, 0.0),
+        delay_s=np.inf,
+        modes=(),
+        controller=controller,
+    )
+    items += [requirement.check(no_loop) for requirement in specification.on_controller()]
 
-    robust = all(v.stable and v.nyquist.matches and v.worst_margins.modulus > 0 for v in verdicts)
-    proofs = [v.all_frequencies for v in verdicts]
-    robust = robust and all(proof.proved or not proof.possible for proof in proofs)
+    # Stability of the sampled responses.
+    if joint is not None:
+        items.append(
+            SpecificationItem(
+                requirement=f"share of {joint.draws} sampled responses that are stable",
+                plant=plants[0].name if len(plants) == 1 else "all plants together",
+                required=joint_stable_share,
+                achieved=joint.stable_share,
+                unit="",
+                met=bool(joint.stable_share >= joint_stable_share),
+                at_least=True,
+                about="sampled responses",
+            )
+        )
+
+    # The controller alone and the nominal loops at the limits.
+    limited = limited_loops(controller, plants)
+    for number, loop in enumerate(limited):
+        if not loop.steps:
+            continue
+        is_controller = number == 0
+        items.append(
+            SpecificationItem(
+                requirement=_LIMITED_COMMAND if is_controller else _LIMITED_LOOP,
+                plant=loop.plant,
+                required=ERROR_LEFT,
+                achieved=loop.worst,
+                unit="",
+                met=loop.ends,
+                about="controller" if is_controller else "nominal loop",
+            )
+        )
+
+    # The verdict: robust stability of every plant, proved where a proof is possible, and every item.
+    is_robust = True
+    for verdict in verdicts:
+        is_stable = verdict.stable and verdict.nyquist.matches and verdict.worst_margins.modulus > 0
+        proof = verdict.all_frequencies
+        is_unproved = proof.possible and not proof.proved
+        is_robust = is_robust and is_stable and not is_unproved
+    gamma_bound = None
+    if all(verdict.all_frequencies.possible for verdict in verdicts):
+        gamma_bound = max(verdict.all_frequencies.gamma for verdict in verdicts)
+
+    resonances: list[Resonance] = []
+    light_modes = modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
+    for mode in light_modes:
+        if mode.omega_rad_s < np.pi / controller.dt_s:
+            response = controller.response(np.array([mode.omega_rad_s]))
+            resonances.append(Resonance(mode, float(np.abs(response[0]))))
     return Certificate(
-        certified=bool(robust and all(item.met for item in items)),
-        gamma=max(v.worst_weighted for v in verdicts),
+        certified=bool(is_robust and all(item.met for item in items)),
+        gamma=max(verdict.worst_weighted for verdict in verdicts),
         plants=tuple(verdicts),
         items=tuple(items),
-        gamma_bound=max(proof.gamma for proof in proofs) if all(p.possible for p in proofs) else None,
+        gamma_bound=gamma_bound,
         joint=joint,
-        resonances=tuple(
-            Resonance(mode, float(np.abs(controller.response(np.array([mode.omega_rad_s]))[0])))
-            for mode in modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
-            if mode.omega_rad_s < np.pi / controller.dt_s
-        ),
+        resonances=tuple(resonances),
         limited=limited,
         controller=controller,
-        uncertain_plants=asked,
+        uncertain_plants=asked_plants,
         specification=specification,
     )
 
 
-def loop_margins(
-    controller: Controller, plant: UncertainPlant, worst: WorstCase
-) -> tuple[Margins, Margins, float]:
-    """Margins of the centres, the smallest over all members of the ellipses, and the bandwidth [rad/s] up to
-    which every member has |S| below -3 dB: on the grid of `worst` and, of a plant that is known there,
-    between its points. They say nothing of a loop that is not stable."""
-    known = plant.own_grid is None
-    integrates, _ = loop_integrators(controller, plant)
+class LoopMargins(NamedTuple):
+    """Margins of one uncertain loop.
+
+    nominal: of the centres. worst: smallest over all members of the ellipses. bandwidth_rad_s: up to here
+    every member has |S| below -3 dB.
+    """
+
+    nominal: Margins
+    worst: Margins
+    bandwidth_rad_s: float
+
+
+def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase) -> LoopMargins:
+    """Margins of the centres and over the ellipses, and the bandwidth.
+
+    Parameters
+    ----------
+    controller : Controller
+    plant : UncertainPlant
+    worst : WorstCase
+        Its grid, ellipses and distance from -1. Of a plant that is known between the points of the grid the
+        margins hold there, too.
+
+    Returns
+    -------
+    LoopMargins
+        They say nothing of a loop that is not stable.
+    """
+    is_known_between = plant.own_grid is None
+    integrators, _ = loop_integrators(controller, plant)
 
     def loop_gain(omega: Real) -> Complex:
+        """Loop gain K c (N,) of the centres at frequencies (N,), rad/s."""
         return controller.response(omega) * plant.at(omega).centre
 
-    at_zero = None if integrates else float(loop_gain(np.zeros(1))[0].real)
-    nominal = nominal_margins(loop_gain, worst.omega_rad_s, refinable=known, at_zero=at_zero)
+    def factor_and_ellipses(omega: Real) -> tuple[Complex, Ellipses]:
+        """Controller with its delay (N,), and the ellipses, at frequencies (N,), rad/s."""
+        return controller.response(omega), plant.at(omega)
+
+    at_zero = None
+    if not integrators:
+        at_zero = float(loop_gain(np.zeros(1))[0].real)
+    nominal = nominal_margins(loop_gain, worst.omega_rad_s, refinable=is_known_between, at_zero=at_zero)
     distance = worst.values["distance"]
-    found = ellipse_margins(
+    over_ellipses = ellipse_margins(
         worst.loop_factor,
         worst.ellipses,
         distance,
-        between=(lambda omega: (controller.response(omega), plant.at(omega))) if known else None,
-        at_zero=not integrates,
+        between=factor_and_ellipses if is_known_between else None,
+        at_zero=not integrators,
     )
-    below = np.flatnonzero(distance < np.sqrt(2.0))
-    bandwidth = float(worst.omega_rad_s[below[0] - 1]) if below.size and below[0] > 0 else 0.0
-    return nominal, found.worse(nominal), bandwidth
+
+    # The last grid point before a member's |S| exceeds -3 dB; 0 where it does from the first one on.
+    exceeds = np.flatnonzero(distance < _DISTANCE_AT_BANDWIDTH)
+    bandwidth_rad_s = 0.0
+    if exceeds.size and exceeds[0] > 0:
+        bandwidth_rad_s = float(worst.omega_rad_s[exceeds[0] - 1])
+    return LoopMargins(nominal, over_ellipses.worse(nominal), bandwidth_rad_s)
 
 
 def _check_plant(
@@ -264,43 +406,65 @@ def _check_plant(
     n_dense: int,
     between_own_points: str,
 ) -> tuple[PlantVerdict, list[SpecificationItem]]:
+    """Verdict on one plant, and its requirements with what was found; arguments as of `certify`."""
     poles = closed_loop_poles(controller, plant)
-    radius = float(np.max(np.abs(poles))) if poles.size else 0.0
+    radius = float(np.max(np.abs(poles), initial=0.0))
+    is_stable = bool(radius < 1.0)
+
+    # Modes that get grid points of their own: those of plant, loop and controller.
     loop_modes = modes_of(poles, plant.dt_s, zeta_below=1.0)
-    own_modes = modes_of(controller.poles, plant.dt_s)
-    near = [m for m in (*plant.modes, *loop_modes, *own_modes) if m.omega_rad_s < plant.nyquist_rad_s]
-    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-5)) for m in near if abs(m.zeta) < 0.4]
-    # Whatever is narrow: poles and zeros of the loop next to the circle, before and after it is closed.
-    zeros = np.asarray(controller.to_control().zeros() if controller.order else [], dtype=np.complex128)
+    controller_modes = modes_of(controller.poles, plant.dt_s)
+    light: list[Mode] = []
+    for mode in (*plant.modes, *loop_modes, *controller_modes):
+        if mode.omega_rad_s < plant.nyquist_rad_s and abs(mode.zeta) < _LIGHT_MODE:
+            light.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), _LEAST_DAMPING)))
+
+    # Whatever else is narrow: poles and zeros of the loop next to the circle, before and after it is closed.
+    zeros = np.zeros(0, dtype=np.complex128)
+    if controller.order:
+        zeros = np.asarray(controller.to_control().zeros(), dtype=np.complex128)
     zeros = zeros[np.isfinite(zeros)]
     roots = np.concatenate([plant.poles, plant.zeros, controller.poles, zeros, poles])
-    grid = checked_grid(plant, light, n_dense, 120, roots=roots, extra=near_the_circle(roots, plant.dt_s))
+    narrow = near_the_circle(roots, plant.dt_s)
+    grid = checked_grid(plant, light, n_dense, _POINTS_PER_MODE, roots=roots, extra=narrow)
+
+    # A plant known on its own frequencies only is checked there, and between them where that is assumed.
     assumed_linear = plant.own_grid is not None and between_own_points == "linear"
     own_points = with_own_grid(plant, grid)
-    seen = with_straight_between(plant) if assumed_linear else plant
-    grid = np.union1d(grid, own_points) if assumed_linear else own_points
+    seen_plant = plant
+    checked = own_points
+    if assumed_linear:
+        seen_plant = with_straight_between(plant)
+        checked = np.union1d(grid, own_points)
+    own_grid_rad_s = None
+    if plant.own_grid is not None:
+        own_grid_rad_s = (float(plant.own_grid[0]), float(plant.own_grid[-1]))
 
-    worst = worst_case(partial(controller.response, with_delay=False), seen, specification, grid)
+    # Worst cases, winding and margins.
+    law = partial(controller.response, with_delay=False)
+    worst = worst_case(law, seen_plant, specification, checked)
     integrators, unstable = loop_integrators(controller, plant)
-    # On a plant's own frequencies the count is that of its data; what lies between them is the proof's.
-    counted = own_points if assumed_linear else worst.omega_rad_s
     count = nyquist_count(
-        lambda omega: controller.response(omega) * seen.at(omega).centre,
-        counted,
+        lambda omega: controller.response(omega) * seen_plant.at(omega).centre,
+        # On a plant's own frequencies the count is that of its data; what lies between them is the proof's.
+        own_points if assumed_linear else worst.omega_rad_s,
         integrators=integrators,
         unstable_poles=unstable,
         refinable=plant.own_grid is None,
     )
-    nominal, margins, bandwidth = loop_margins(controller, seen, worst)
-    at = int(np.argmin(worst.values["distance"]))
+    margins = loop_margins(controller, seen_plant, worst)
+    reaches_minus_one = not margins.worst.modulus > 0
+    nearest_rad_s = float(worst.omega_rad_s[np.argmin(worst.values["distance"])])
     peaks: dict[str, tuple[float, float | None]] = {name: worst.peak(name) for name in worst.names}
-    weighted = max(peak for peak, _ in peaks.values())
-    stable = bool(radius < 1.0)
-    peak_sensitivity = 1.0 / margins.modulus if margins.modulus > 0 else float("inf")
-    if not stable:  # |1 + K G| says nothing of a loop that is not stable
-        nominal = margins = Margins(*[np.nan] * len(fields(Margins)))
-        peaks, bandwidth = dict.fromkeys(peaks, (np.nan, None)), np.nan
-    if stable and count.matches and margins.modulus > 0:
+    worst_weighted = float("inf")
+    worst_peak_sensitivity = float("inf")
+    if not reaches_minus_one:
+        worst_peak_sensitivity = 1.0 / margins.worst.modulus
+        if is_stable:
+            worst_weighted = max(value for value, _ in peaks.values())
+
+    # Between the grid points, for a loop that is robustly stable on them.
+    if is_stable and count.matches and not reaches_minus_one:
         proof = bound_all_frequencies(
             controller,
             plant,
@@ -311,38 +475,44 @@ def _check_plant(
         )
     else:
         proof = AllFrequencies.ended_by(Obstacle.NOT_STABLE)
+
+    # |1 + K G| says nothing of a loop that is not stable.
+    if not is_stable:
+        no_margins = Margins(*[np.nan] * len(fields(Margins)))
+        margins = LoopMargins(no_margins, no_margins, np.nan)
+        peaks = dict.fromkeys(peaks, (np.nan, None))
     verdict = PlantVerdict(
         plant=plant.name,
-        stable=stable,
+        stable=is_stable,
         pole_radius=radius,
-        closed_loop_modes=tuple(m for m in loop_modes if m.zeta < 1.0),
+        closed_loop_modes=tuple(mode for mode in loop_modes if mode.zeta < 1.0),
         mode_changes=mode_changes(controller, plant),
         nyquist=count,
-        nominal_margins=nominal,
-        worst_margins=margins,
-        worst_margin_omega_rad_s=float(worst.omega_rad_s[at]),
-        worst_weighted=weighted if margins.modulus > 0 else float("inf"),
-        worst_peak_sensitivity=peak_sensitivity,
-        bandwidth_rad_s=bandwidth,
+        nominal_margins=margins.nominal,
+        worst_margins=margins.worst,
+        worst_margin_omega_rad_s=nearest_rad_s,
+        worst_weighted=worst_weighted,
+        worst_peak_sensitivity=worst_peak_sensitivity,
+        bandwidth_rad_s=margins.bandwidth_rad_s,
         frequencies=int(worst.omega_rad_s.size),
-        own_grid_rad_s=None
-        if plant.own_grid is None
-        else (float(plant.own_grid[0]), float(plant.own_grid[-1])),
+        own_grid_rad_s=own_grid_rad_s,
         assumed_linear=assumed_linear,
         stated=plant.uncertainty is not None,
         own_performance=plant.performance is not None,
         all_frequencies=proof,
     )
-    found = Findings(
-        plant.name,
-        peaks,
-        proof.bounds if proof.possible and stable else None,
-        (margins.modulus, float(worst.omega_rad_s[at]) if stable else None),
-        margins.delay_s,
-        loop_modes,
-        controller,
+
+    # Let every requirement decide.
+    findings = Findings(
+        plant=plant.name,
+        peaks=peaks,
+        bounds=proof.bounds if proof.possible and is_stable else None,
+        modulus=(margins.worst.modulus, nearest_rad_s if is_stable else None),
+        delay_s=margins.worst.delay_s,
+        modes=loop_modes,
+        controller=controller,
     )
-    items = [requirement.check(found) for requirement in specification.requirements(plant)]
+    items = [requirement.check(findings) for requirement in specification.requirements(plant)]
     if plant.uncertainty is None and plant.damped.uncertainty is None:
         items = [replace(item, about="nominal loop") for item in items]
     return verdict, items
