@@ -25,7 +25,10 @@ from control_design.plants.ellipses import Real
 from control_design.plants.plant_set import Mode, PlantChannel
 from control_design.plants.weights import RationalWeight
 
-_PROOF_SLACK = 2e-5  # relative: what the bounds may exceed a limit the dense maximum meets
+# Share by which a bound for all frequencies may exceed a limit that the dense maximum meets: twice the excess
+# `LEAST_EXCESS` to which such bounds are cut (`between_grid_points`). Without it a design on its limit would
+# not be proved.
+_PROOF_SLACK = 2e-5
 
 
 class LoopFunction(Enum):
@@ -51,8 +54,23 @@ class LoopFunction(Enum):
 class SpecificationItem:
     """One requirement on one plant: met or not, with the number that decides it and where.
 
-    bound: what was proved of `achieved` for all frequencies, where that was possible. at_least: `required` is
-    the smallest value allowed, else the largest. about: what `achieved` is a number of.
+    Attributes
+    ----------
+    requirement, plant : str
+        What is asked, in words, and of whom.
+    required, achieved : float
+        The limit, and the number that decides.
+    unit : str
+        Of both; "" for ratios.
+    met : bool
+    omega_rad_s : float or None
+        Where `achieved` is reached; None: it has no frequency.
+    bound : float or None
+        What was proved of `achieved` for all frequencies, where that was possible.
+    at_least : bool
+        `required` is the smallest value allowed, else the largest.
+    about : str
+        What `achieved` is a number of.
     """
 
     requirement: str
@@ -76,17 +94,32 @@ class SpecificationItem:
         """Whether `achieved` is enough and what was proved of it for all frequencies is not."""
         if self.met or self.bound is None:
             return False
-        return (self.achieved - self.required) * (self.bound - self.required) <= 0.0
+        # The limit lies between the two.
+        excess = self.achieved - self.required
+        excess_of_bound = self.bound - self.required
+        return excess * excess_of_bound <= 0.0
 
 
 @dataclass(frozen=True)
 class Findings:
     """What was found out about one loop, for requirements to decide on.
 
-    peaks: by name of the weighted requirement, its largest value over ellipses and grid, and where; nan and
-    None where the loop is not stable, as `modulus`. bounds:
-    the same proved for all frequencies, None where that is not possible. modulus: smallest distance from -1,
-    and where. delay_s: worst delay margin. modes: of the nominal closed loop.
+    Attributes
+    ----------
+    plant : str
+        Its name.
+    peaks : mapping of str to (float, float or None)
+        By name of the weighted requirement: its largest value over ellipses and grid, and where, rad/s; nan
+        and None where the loop is not stable.
+    bounds : mapping of str to float, or None
+        Upper bounds of these for all frequencies; None where nothing can be proved.
+    modulus : (float, float or None)
+        Smallest distance from -1, and where, rad/s; nan and None where the loop is not stable.
+    delay_s : float
+        Worst delay margin, s.
+    modes : sequence of Mode
+        Oscillatory pole pairs of the nominal closed loop.
+    controller : Controller
     """
 
     plant: str
@@ -116,9 +149,20 @@ class Requirement(ABC):
 class WeightedRequirement(Requirement):
     """max |W f| <= 1 over the ellipses of one plant, f a closed-loop function.
 
-    weight : W(s), seen through the Tustin frequency. band : frequencies where it is asked, None = all.
-    above : asked only where |W| is larger (below, another requirement asks more). channel : an independent
-    response Gp in place of the factor G of f; every pair of members is then allowed.
+    Attributes
+    ----------
+    name : str
+        Key of its peak and its bound in `Findings`.
+    function : LoopFunction
+        The closed-loop function f.
+    weight : RationalWeight
+        W(s), seen through the Tustin frequency.
+    band : (float, float) or None
+        Frequencies, rad/s, where it is asked; None: all.
+    above : float
+        It is asked only where |W| is larger: below, another requirement asks more.
+    channel : PlantChannel or None
+        An independent response Gp in place of the factor G of f; every pair of members is then allowed.
     """
 
     name: ClassVar[str]
@@ -131,25 +175,41 @@ class WeightedRequirement(Requirement):
 
     @property
     def of_member(self) -> LoopFunction:
-        """f without the factor that the independent channel replaces."""
+        """Closed-loop function of the member: f without the factor that an independent channel replaces."""
         if self.channel is None:
             return self.function
-        return LoopFunction.EFFORT if self.function.of_controller else LoopFunction.SENSITIVITY
+        if self.function.of_controller:
+            return LoopFunction.EFFORT
+        return LoopFunction.SENSITIVITY
 
     def magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
-        """|W| (F,), 0 where nothing is asked; without the independent channel."""
+        """|W| (F,) at omega (F,), 0 where nothing is asked; without the independent channel."""
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         size = np.abs(self.weight.at(imaginary_axis(omega, dt_s)))
         size = np.where(size > self.above, size, 0.0)
         if self.band is not None:
-            size = np.where((omega >= self.band[0]) & (omega <= self.band[1]), size, 0.0)
+            low, high = self.band
+            is_in_band = np.logical_and(omega >= low, omega <= high)
+            size = np.where(is_in_band, size, 0.0)
         return np.asarray(size, dtype=np.float64)
 
     def check(self, found: Findings) -> SpecificationItem:
-        value, omega = found.peaks[self.name]
-        bound = None if found.bounds is None else found.bounds.get(self.name, np.inf)
-        met = bool(value <= 1.0) and found.proved(self.name)
-        return SpecificationItem(self.caption, found.plant, 1.0, value, "", met, omega, bound)
+        """Item with the largest |W f|, met where it and its bound, if one can be had, are at most 1."""
+        value, omega_rad_s = found.peaks[self.name]
+        bound = None
+        if found.bounds is not None:
+            # Without a bound of its own it is not proved.
+            bound = found.bounds.get(self.name, np.inf)
+        return SpecificationItem(
+            requirement=self.caption,
+            plant=found.plant,
+            required=1.0,
+            achieved=value,
+            unit="",
+            met=bool(value <= 1.0) and found.proved(self.name),
+            omega_rad_s=omega_rad_s,
+            bound=bound,
+        )
 
 
 def constant_weight(value: float) -> RationalWeight:

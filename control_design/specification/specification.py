@@ -8,6 +8,11 @@ For the worst member of the uncertainty ellipses, at the Tustin frequency s = j 
 
 with m the modulus margin, r the low-frequency rejection (0 with an integrator) and wb = bandwidth sqrt(2 -
 m^2), so that |W1| is at least sqrt 2 (-3 dB of S) up to the bandwidth.
+
+`Specification` holds the words and makes the weights. Each requirement is a class of its own below it, with
+`of(specification, plant)`, which makes it where it is asked, and `check(findings)`, which decides;
+`REQUIREMENTS` lists those of a plant's loop. `Specification.check_against` refuses, before anything is
+optimised, what no controller can meet (the functions `_refuse_...`).
 """
 
 from __future__ import annotations
@@ -41,6 +46,31 @@ from control_design.specification.requirement import (
 from ident.data.settings import Settings
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+# Relative difference of two sampling times that counts as none: they come as decimal numbers of logs.
+_SAME_PERIOD = 1e-6
+# Factor either side of the lowest mode that makes the band of the damping requirement where none is given;
+# the field's description promises it.
+_BAND_OF_MODE = 1.5
+# Frequency, rad per sample, below which an integrating plant is its integrator and no more: a band that
+# starts there has no finite open-loop peak. Ten times the lowest frequency of the grids.
+_INTEGRATES_BELOW_RAD = 5e-6
+# Distance of a zero from z = 1 that an integrator would cancel.
+_ZERO_AT_ONE = 1e-6
+# Modulus beyond which a zero lies outside the circle, but for rounding.
+_OUTSIDE_CIRCLE = 1.0 + 1e-9
+# Halvings with which the largest possible bandwidth is told: more than a double has digits.
+_HALVINGS = 60
+# Frequencies at which tracking and effort are compared, and those at which an open-loop peak is sought.
+_POINTS_OF_CONFLICT = 4000
+_POINTS_OF_PEAK = 2000
+# Points around each mode where that peak is sought, in 10 half widths of the mode (sinh 3) either side, and
+# the damping ratio that they take at least.
+_POINTS_OF_MODE = 121
+_REACH_OF_MODE = 3
+_LEAST_DAMPING = 1e-9
+# Keeps a quotient and a bandwidth above zero.
+_TINY = 1e-300
 
 
 class SpecificationError(ValueError):
@@ -139,12 +169,15 @@ class Specification(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> Specification:
+        """Return self; ValueError, with the keys, for settings that contradict each other."""
         if self.sensitivity_weight is not None and self.bandwidth_rad_s is not None:
             raise ValueError("give bandwidth_rad_s or sensitivity_weight, not both")
-        if self.lowest_bandwidth_rad_s is not None and not (
-            self.bandwidth_rad_s is not None and self.lowest_bandwidth_rad_s < self.bandwidth_rad_s
-        ):
-            raise ValueError("lowest_bandwidth_rad_s needs a larger bandwidth_rad_s, which is tried first")
+        if self.lowest_bandwidth_rad_s is not None:
+            bandwidth = self.bandwidth_rad_s
+            if bandwidth is None or not self.lowest_bandwidth_rad_s < bandwidth:
+                raise ValueError(
+                    "lowest_bandwidth_rad_s needs a larger bandwidth_rad_s, which is tried first"
+                )
         if self.effort_weight is not None and (self.effort_limit or self.effort_rolloff_rad_s):
             raise ValueError("give effort_limit (with effort_rolloff_rad_s) or effort_weight, not both")
         if self.effort_rolloff_rad_s is not None and self.effort_limit is None:
@@ -161,7 +194,10 @@ class Specification(Settings):
             if self.structure != "biquads":
                 raise ValueError("controller_order = 'auto' needs structure 'biquads'; give a number")
             return self
-        smallest = 1 if self.structure == "biquads" else 1 + int(self.integrator)
+        # A cascade needs one state; lead/lag and notches one beside the integrator.
+        smallest = 1
+        if self.structure == "pi_d_notch" and self.integrator:
+            smallest = 2
         if self.controller_order < smallest:
             raise ValueError(
                 f"structure {self.structure!r} needs controller_order of at least {smallest}; got "
@@ -175,16 +211,30 @@ class Specification(Settings):
         return self
 
     def sections(self) -> tuple[SectionKind, ...]:
-        """Section kinds of the cascade, integrator first."""
+        """Section kinds of the cascade: integrator, sections of first order, sections of second order.
+
+        Raises
+        ------
+        SpecificationError
+            controller_order is "auto".
+        """
         if self.controller_order == "auto":
             raise SpecificationError(
                 "controller_order = 'auto': the synthesis chooses it; give a number here"
             )
-        head: list[SectionKind] = ["integrator"] if self.integrator else []
-        rest = self.controller_order - len(head)
-        real: list[SectionKind] = ["first_order"] * (1 if self.structure == "pi_d_notch" else rest % 2)
-        pair: SectionKind = "notch" if self.structure == "pi_d_notch" else "second_order"
-        return (*head, *real, *([pair] * ((rest - len(real)) // 2)))
+        kinds: list[SectionKind] = []
+        if self.integrator:
+            kinds.append("integrator")
+        n_left = self.controller_order - len(kinds)
+        if self.structure == "pi_d_notch":
+            n_pairs = (n_left - 1) // 2
+            kinds.append("first_order")
+            kinds += ["notch"] * n_pairs
+        else:
+            n_pairs = n_left // 2
+            kinds += ["first_order"] * (n_left % 2)
+            kinds += ["second_order"] * n_pairs
+        return tuple(kinds)
 
     def tracking_weight(self, plant: UncertainPlant | None = None) -> RationalWeight | None:
         """W1 without the modulus margin; None without a tracking requirement.
@@ -194,11 +244,15 @@ class Specification(Settings):
         """
         if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
             return self.sensitivity_weight
-        slow: tuple[float, ...] = ()
-        if self.integrator and plant is not None:
-            slow = plant.slow_poles_rad_s(integral_corner(self.bandwidth_rad_s, self.modulus_margin))
-        floor = 0.0 if self.integrator else self.low_frequency_rejection
-        return bandwidth_weight(self.bandwidth_rad_s, self.modulus_margin, floor, slow_poles_rad_s=slow)
+        # Where the controller integrates |S| has to fall to zero, with a plant's slow poles the faster.
+        floor = self.low_frequency_rejection
+        slow_poles: tuple[float, ...] = ()
+        if self.integrator:
+            floor = 0.0
+            if plant is not None:
+                corner = integral_corner(self.bandwidth_rad_s, self.modulus_margin)
+                slow_poles = plant.slow_poles_rad_s(corner)
+        return bandwidth_weight(self.bandwidth_rad_s, self.modulus_margin, floor, slow_poles_rad_s=slow_poles)
 
     def limit_weight(self) -> RationalWeight | None:
         """W3, or None where effort is not limited."""
@@ -207,19 +261,33 @@ class Specification(Settings):
         return effort_limit_weight(self.effort_limit, self.effort_rolloff_rad_s)
 
     def requirements(self, plant: UncertainPlant) -> tuple[Requirement, ...]:
-        """All requirements on the loop of one plant."""
-        found = (kind.of(self, plant) for kind in REQUIREMENTS)
-        return tuple(each for each in found if each is not None)
+        """Requirements on the loop of one plant that are asked, in the order of `REQUIREMENTS`.
+
+        Raises
+        ------
+        SpecificationError
+            Damping of a mode is asked for, and the plant has none.
+        """
+        requirements: list[Requirement] = []
+        for kind in REQUIREMENTS:
+            requirement = kind.of(self, plant)
+            if requirement is not None:
+                requirements.append(requirement)
+        return tuple(requirements)
 
     def weighted(self, plant: UncertainPlant) -> tuple[WeightedRequirement, ...]:
-        """The requirements that bound a closed-loop function."""
-        return tuple(each for each in self.requirements(plant) if isinstance(each, WeightedRequirement))
+        """The requirements on the loop of one plant that bound a closed-loop function."""
+        requirements = self.requirements(plant)
+        return tuple(each for each in requirements if isinstance(each, WeightedRequirement))
 
     def on_controller(self) -> tuple[Requirement, ...]:
         """Requirements on the controller alone."""
-        damping = self.controller_damping
-        rings = () if damping is None else (ControllerDamping(damping),)
-        return (*rings, *([ControllerIntegrator()] if self.integrator else []))
+        requirements: list[Requirement] = []
+        if self.controller_damping is not None:
+            requirements.append(ControllerDamping(self.controller_damping))
+        if self.integrator:
+            requirements.append(ControllerIntegrator())
+        return tuple(requirements)
 
     def magnitude(self, plant: UncertainPlant, omega_rad_s: Real, function: LoopFunction) -> Real:
         """|W| (F,) on one closed-loop function, all requirements on it together; zeros where none is."""
@@ -228,13 +296,23 @@ class Specification(Settings):
             for each in self.weighted(plant)
             if each.function is function
         ]
-        return np.max(sizes, axis=0) if sizes else np.zeros(np.shape(omega_rad_s))
+        if not sizes:
+            return np.zeros(np.shape(omega_rad_s))
+        return np.asarray(np.max(sizes, axis=0), dtype=np.float64)
 
     def refuse_other_rate(self, plants: Sequence[UncertainPlant]) -> None:
-        """Raise SpecificationError, one line, where a plant has another step than the controller."""
+        """Refuse plants with another sampling time than `controller_dt_s`.
+
+        Raises
+        ------
+        SpecificationError
+            One line, with both steps.
+        """
         wanted_s = self.controller_dt_s
+        if wanted_s is None:
+            return
         for plant in plants:
-            if wanted_s is not None and abs(plant.dt_s - wanted_s) > 1e-6 * wanted_s:
+            if abs(plant.dt_s - wanted_s) > _SAME_PERIOD * wanted_s:
                 raise SpecificationError(
                     f"controller_dt_s = {wanted_s:.6g} s, but plant {plant.name!r} is sampled every "
                     f"{plant.dt_s:.6g} s: leave controller_dt_s out, or give it to flexlink run, which "
@@ -244,15 +322,26 @@ class Specification(Settings):
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:
         """Refuse a specification that no controller can meet, before optimising.
 
-        Raises SpecificationError: one line: which requirement, what limits it, by how much.
+        Parameters
+        ----------
+        plants : sequence of UncertainPlant
+            Their nominal models count.
 
+        Raises
+        ------
+        SpecificationError
+            One line: which requirement, what limits it, by how much.
+
+        Notes
+        -----
         At a zero w of G outside the circle (also the one at z = infinity that a sample of delay makes) S(w) =
         1, hence max|W1 S| >= |W1(w)| for a stable loop. On the circle 1 = S + G K S gives gamma >= 1/(1/|W1|
         + |G|/|W3|). Both use the nominal plant, so they are necessary conditions only.
         """
         if not plants:
             raise SpecificationError("no plant given: the design needs at least one uncertain plant")
-        if len({plant.dt_s for plant in plants}) > 1:
+        periods_s = {plant.dt_s for plant in plants}
+        if len(periods_s) > 1:
             raise SpecificationError(
                 f"the plants differ in sampling time: {[p.dt_s for p in plants]} s; sample all "
                 "with one period"
@@ -262,100 +351,145 @@ class Specification(Settings):
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)
             _refuse_effort(self, plant)
+            # Called for its error: damping of a mode that the plant has not.
             self.requirements(plant)
 
 
 class Tracking(WeightedRequirement):
     """|W1 S| <= 1 where W1 asks for more than the modulus margin."""
 
-    name, caption, function = "tracking", "tracking, largest |W1 S|", LoopFunction.SENSITIVITY
+    name = "tracking"
+    caption = "tracking, largest |W1 S|"
+    function = LoopFunction.SENSITIVITY
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> Tracking | None:
+        """Requirement with the specification's weight for this plant; None where tracking is not asked."""
         weight = spec.tracking_weight(plant)
-        return None if weight is None else cls(weight, above=spec.modulus_margin)
+        if weight is None:
+            return None
+        return cls(weight, above=spec.modulus_margin)
 
 
 class ModulusMargin(WeightedRequirement):
     """|m S| <= 1: the loop keeps the distance m from -1."""
 
-    name, caption, function = "modulus", "modulus margin, worst case", LoopFunction.SENSITIVITY
+    name = "modulus"
+    caption = "modulus margin, worst case"
+    function = LoopFunction.SENSITIVITY
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> ModulusMargin:
+        """Requirement with the specification's margin; always asked."""
         return cls(constant_weight(spec.modulus_margin))
 
     def check(self, found: Findings) -> SpecificationItem:
-        """In terms of the distance itself."""
+        """Item in terms of the distance from -1 itself, of which a bound of |m S| makes a lower bound."""
         wanted = self.weight.numerator[0]
-        achieved, omega = found.modulus
-        bound = None if found.bounds is None else wanted / found.bounds.get(self.name, np.inf)
-        met = bool(achieved >= wanted) and found.proved(self.name)
-        return SpecificationItem(self.caption, found.plant, wanted, achieved, "", met, omega, bound, True)
+        achieved, omega_rad_s = found.modulus
+        bound = None
+        if found.bounds is not None:
+            bound = wanted / found.bounds.get(self.name, np.inf)
+        return SpecificationItem(
+            requirement=self.caption,
+            plant=found.plant,
+            required=wanted,
+            achieved=achieved,
+            unit="",
+            met=bool(achieved >= wanted) and found.proved(self.name),
+            omega_rad_s=omega_rad_s,
+            bound=bound,
+            at_least=True,
+        )
 
 
 class Effort(WeightedRequirement):
     """|W3 K S| <= 1."""
 
-    name, caption, function = "effort", "effort, largest |W3 K S|", LoopFunction.EFFORT
+    name = "effort"
+    caption = "effort, largest |W3 K S|"
+    function = LoopFunction.EFFORT
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> Effort | None:
+        """Requirement with the specification's weight; None where effort is not limited."""
         weight = spec.limit_weight()
-        return None if weight is None else cls(weight)
+        if weight is None:
+            return None
+        return cls(weight)
 
 
 class ModePeak(WeightedRequirement):
     """|W4 Gp S| <= 1 in the band of the flexible mode, W4 = 1/(ratio x open-loop peak of the nominal Gp)."""
 
-    name, caption, function = (
-        "mode damping",
-        "damping of the mode, largest |W4 Gp S|",
-        LoopFunction.DISTURBANCE,
-    )
+    name = "mode damping"
+    caption = "damping of the mode, largest |W4 Gp S|"
+    function = LoopFunction.DISTURBANCE
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> ModePeak | None:
-        """SpecificationError if the plant has no flexible mode and no band is given."""
+        """Requirement on this plant's damped channel; None where mode_peak_ratio is not given.
+
+        Raises
+        ------
+        SpecificationError
+            The plant has no flexible mode and no band is given.
+        """
         if spec.mode_peak_ratio is None:
             return None
-        band, modes = spec.mode_band_rad_s, plant.damped.modes
+        band = spec.mode_band_rad_s
         if band is None:
+            modes = plant.damped.modes
             if not modes:
                 raise SpecificationError(
                     f"mode_peak_ratio: plant {plant.name!r} has no lightly damped mode; give mode_band_rad_s"
                 )
-            band = modes[0].omega_rad_s / 1.5, modes[0].omega_rad_s * 1.5
-        peak = _nominal_peak(plant.damped, band[0], min(band[1], plant.nyquist_rad_s))
-        return cls(constant_weight(1.0 / (spec.mode_peak_ratio * peak)), band, channel=plant.performance)
+            lowest_rad_s = modes[0].omega_rad_s
+            band = (lowest_rad_s / _BAND_OF_MODE, lowest_rad_s * _BAND_OF_MODE)
+        band_end = min(band[1], plant.nyquist_rad_s)
+        open_loop_peak = _nominal_peak(plant.damped, band[0], band_end)
+        weight = constant_weight(1.0 / (spec.mode_peak_ratio * open_loop_peak))
+        return cls(weight, band, channel=plant.performance)
 
 
-@lru_cache(maxsize=32)  # every grid of a synthesis asks for the requirements of its plant
+# Kept for the last 32 channels and bands: every grid of a synthesis asks for the requirements of its plant.
+@lru_cache(maxsize=32)
 def _nominal_peak(channel: PlantChannel, low_rad_s: float, high_rad_s: float) -> float:
-    """Largest nominal gain in a band, refined around the modes."""
-    omega = np.geomspace(low_rad_s, high_rad_s, 2000)
+    """Largest nominal gain |Gp| of a channel in a band, on a grid that is finer around its modes."""
+    omega = np.geomspace(low_rad_s, high_rad_s, _POINTS_OF_PEAK)
     for mode in channel.modes:
-        width = max(mode.zeta, 1e-9) * mode.omega_rad_s
-        omega = np.append(omega, mode.omega_rad_s + width * np.sinh(np.linspace(-3, 3, 121)))
-    omega = np.unique(omega[(omega >= low_rad_s) & (omega <= high_rad_s)])
-    return float(np.max(np.abs(channel.nominal_response(omega))))
+        half_width = max(mode.zeta, _LEAST_DAMPING) * mode.omega_rad_s
+        offsets = np.sinh(np.linspace(-_REACH_OF_MODE, _REACH_OF_MODE, _POINTS_OF_MODE))
+        omega = np.append(omega, mode.omega_rad_s + half_width * offsets)
+    is_in_band = np.logical_and(omega >= low_rad_s, omega <= high_rad_s)
+    response = channel.nominal_response(np.unique(omega[is_in_band]))
+    return float(np.max(np.abs(response)))
 
 
 @dataclass(frozen=True)
 class DelayMargin(Requirement):
-    """The loop stands this much more delay; the synthesis carries a delayed copy of every plant."""
+    """The loop stands this much more delay, s; the synthesis carries a delayed copy of every plant."""
 
     delay_s: float
     caption = "delay margin, worst case"
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> DelayMargin | None:
-        return None if spec.delay_margin_s is None else cls(spec.delay_margin_s)
+        """Requirement with the specification's delay; None where it is not asked."""
+        if spec.delay_margin_s is None:
+            return None
+        return cls(spec.delay_margin_s)
 
     def check(self, found: Findings) -> SpecificationItem:
-        met = bool(found.delay_s >= self.delay_s)
+        """Item with the worst delay margin, s."""
         return SpecificationItem(
-            self.caption, found.plant, self.delay_s, found.delay_s, "s", met, at_least=True
+            requirement=self.caption,
+            plant=found.plant,
+            required=self.delay_s,
+            achieved=found.delay_s,
+            unit="s",
+            met=bool(found.delay_s >= self.delay_s),
+            at_least=True,
         )
 
 
@@ -369,39 +503,70 @@ class ModeDamping(Requirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> ModeDamping | None:
+        """Requirement with the specification's ratio and band; None where it is not asked."""
         if spec.mode_damping is None or spec.mode_band_rad_s is None:
             return None
         return cls(spec.mode_damping, spec.mode_band_rad_s)
 
     def check(self, found: Findings) -> SpecificationItem:
-        inside = [mode for mode in found.modes if self.band[0] <= mode.omega_rad_s <= self.band[1]]
-        least = min(inside, key=lambda mode: mode.zeta, default=None)
-        achieved, omega = (1.0, None) if least is None else (least.zeta, least.omega_rad_s)
-        met = least is None or achieved >= self.zeta
+        """Item with the smallest damping ratio in the band; 1, and no frequency, without a mode there."""
+        low_rad_s, high_rad_s = self.band
+        inside = [mode for mode in found.modes if low_rad_s <= mode.omega_rad_s <= high_rad_s]
+        achieved = 1.0
+        omega_rad_s = None
+        met = True
+        if inside:
+            least_damped = min(inside, key=lambda mode: mode.zeta)
+            achieved = least_damped.zeta
+            omega_rad_s = least_damped.omega_rad_s
+            met = achieved >= self.zeta
         return SpecificationItem(
-            self.caption, found.plant, self.zeta, achieved, "", met, omega, None, True, "nominal loop"
+            requirement=self.caption,
+            plant=found.plant,
+            required=self.zeta,
+            achieved=achieved,
+            unit="",
+            met=met,
+            omega_rad_s=omega_rad_s,
+            at_least=True,
+            about="nominal loop",
         )
 
 
 @dataclass(frozen=True)
 class ControllerDamping(Requirement):
-    """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis, met within
-    `SOLVER_SLACK`."""
+    """Damping ratio of the controller's own pole pairs, a bound on parameters in the synthesis.
+
+    Met within `SOLVER_SLACK`, the share by which the solver may miss a bound.
+    """
 
     zeta: float
     caption = "damping ratio of the controller's own poles"
 
     def check(self, found: Findings) -> SpecificationItem:
+        """Item with the smallest damping ratio of the controller's pole pairs; 1 without a pair."""
         # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
         poles = found.controller.poles
         w = 2 / found.controller.dt_s * (poles - 1) / (poles + 1)
-        pairs = w[np.imag(w) > 0]
-        zeta = -np.real(pairs) / np.abs(pairs)
-        least = int(np.argmin(zeta)) if pairs.size else None
-        achieved, omega = (1.0, None) if least is None else (float(zeta[least]), float(np.abs(pairs[least])))
-        met = achieved >= self.zeta * (1 - SOLVER_SLACK)
+        is_upper = np.imag(w) > 0
+        pairs = w[is_upper]
+        damping = -np.real(pairs) / np.abs(pairs)
+        achieved = 1.0
+        omega_rad_s = None
+        if pairs.size:
+            least = int(np.argmin(damping))
+            achieved = float(damping[least])
+            omega_rad_s = float(np.abs(pairs[least]))
         return SpecificationItem(
-            self.caption, "controller", self.zeta, achieved, "", met, omega, None, True, "controller"
+            requirement=self.caption,
+            plant="controller",
+            required=self.zeta,
+            achieved=achieved,
+            unit="",
+            met=achieved >= self.zeta * (1 - SOLVER_SLACK),
+            omega_rad_s=omega_rad_s,
+            at_least=True,
+            about="controller",
         )
 
 
@@ -412,10 +577,17 @@ class ControllerIntegrator(Requirement):
     caption = "integrators in the controller"
 
     def check(self, found: Findings) -> SpecificationItem:
-        own = count_integrators(found.controller.poles)
-        met = bool(own >= 1)
+        """Item with the number of such poles."""
+        n_integrators = count_integrators(found.controller.poles)
         return SpecificationItem(
-            self.caption, "controller", 1.0, float(own), "", met, None, None, True, "controller"
+            requirement=self.caption,
+            plant="controller",
+            required=1.0,
+            achieved=float(n_integrators),
+            unit="",
+            met=bool(n_integrators >= 1),
+            at_least=True,
+            about="controller",
         )
 
 
@@ -424,6 +596,7 @@ REQUIREMENTS = (ModulusMargin, Tracking, Effort, ModePeak, DelayMargin, ModeDamp
 
 
 def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
+    """Raise SpecificationError for a frequency that the plant's sampling, integrator or zeros rule out."""
     nyquist = plant.nyquist_rad_s
     for name in ("bandwidth_rad_s", "effort_rolloff_rad_s"):
         value = getattr(spec, name)
@@ -431,46 +604,64 @@ def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
             raise SpecificationError(
                 f"{name} = {value:.4g} rad/s lies beyond the Nyquist frequency {nyquist:.4g} rad/s"
             )
-    low = np.inf if spec.mode_band_rad_s is None else spec.mode_band_rad_s[0]
-    if spec.mode_band_rad_s is not None and not low < nyquist:
-        raise SpecificationError(
-            f"mode_band_rad_s starts at {low:.4g} rad/s, beyond the Nyquist frequency {nyquist:.4g} rad/s"
-        )
-    if plant.n_integrators and low * plant.dt_s < 5e-6:  # where the open loop is its integrator and no more
-        raise SpecificationError(
-            f"mode_band_rad_s starts at {low:.4g} rad/s, where plant {plant.name!r} integrates and has no "
-            "finite peak"
-        )
-    if spec.integrator and np.any(np.abs(plant.zeros - 1.0) < 1e-6):
+    if spec.mode_band_rad_s is not None:
+        low = spec.mode_band_rad_s[0]
+        if not low < nyquist:
+            raise SpecificationError(
+                f"mode_band_rad_s starts at {low:.4g} rad/s, beyond the Nyquist frequency {nyquist:.4g} rad/s"
+            )
+        if plant.n_integrators and low * plant.dt_s < _INTEGRATES_BELOW_RAD:
+            raise SpecificationError(
+                f"mode_band_rad_s starts at {low:.4g} rad/s, where plant {plant.name!r} integrates and has "
+                "no finite peak"
+            )
+    if spec.integrator and np.any(np.abs(plant.zeros - 1.0) < _ZERO_AT_ONE):
         raise SpecificationError(
             f"integrator = true, but plant {plant.name!r} has a zero at z = 1: the two would cancel"
         )
 
 
 def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
+    """Raise SpecificationError where a zero outside the circle makes tracking impossible.
+
+    There S = 1 for every stable loop, so |W1| must not exceed 1. The message names the zero and, of a
+    bandwidth, the largest that is possible there.
+    """
     # In the Tustin plane; the sample of delay's zero at z = infinity is w = 2/dt, the last.
-    outside = plant.zeros[np.abs(plant.zeros) > 1.0 + 1e-9]
+    is_outside = np.abs(plant.zeros) > _OUTSIDE_CIRCLE
+    outside = plant.zeros[is_outside]
     w = 2.0 / plant.dt_s * (outside - 1.0) / (outside + 1.0)
-    if float(np.asarray(plant.nominal.D)[0, 0]) == 0.0 or spec.computational_delay_samples > 0:
-        w = np.append(w, 2.0 / plant.dt_s)
+    zero_of_delay = 2.0 / plant.dt_s
+    feedthrough = float(np.asarray(plant.nominal.D)[0, 0])
+    if feedthrough == 0.0 or spec.computational_delay_samples > 0:
+        w = np.append(w, zero_of_delay)
     weight = spec.tracking_weight(plant)
-    bound = np.zeros(0) if weight is None else np.abs(weight.at(w))
+    if weight is None:
+        return
+    bound = np.abs(weight.at(w))
     if not np.any(bound > 1.0):
         return
+
     worst = int(np.argmax(bound))
-    last = worst == w.size - 1 and w[worst] == 2.0 / plant.dt_s
-    where = "the sampling delay" if last else f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
+    where = f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
+    if worst == w.size - 1 and w[worst] == zero_of_delay:
+        where = "the sampling delay"
     message = (
         f"plant {plant.name!r}: {where} makes the tracking requirement impossible by a factor "
         f"{bound[worst]:.3g}"
     )
     if spec.bandwidth_rad_s is not None:
-        low, high = 0.0, spec.bandwidth_rad_s
-        for _ in range(60):
+        # The weight grows with the bandwidth everywhere, so the largest possible one is found by bisection.
+        low = 0.0
+        high = spec.bandwidth_rad_s
+        for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
-            weight = spec.model_copy(update={"bandwidth_rad_s": max(middle, 1e-300)}).tracking_weight(plant)
-            possible = weight is not None and bool(np.all(np.abs(weight.at(w)) <= 1.0))
-            low, high = (middle, high) if possible else (low, middle)
+            slower = spec.model_copy(update={"bandwidth_rad_s": max(middle, _TINY)})
+            slower_weight = slower.tracking_weight(plant)
+            if slower_weight is not None and np.all(np.abs(slower_weight.at(w)) <= 1.0):
+                low = middle
+            else:
+                high = middle
         message += (
             f": bandwidth_rad_s = {spec.bandwidth_rad_s:.4g}, at most {low:.4g} with modulus_margin "
             f"{spec.modulus_margin:.3g}"
@@ -479,14 +670,20 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
 
 
 def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
-    omega = np.geomspace(lowest_rad_s(plant.dt_s, plant.poles), plant.nyquist_rad_s, 4000)
+    """Raise SpecificationError where tracking needs more effort than its limit allows, at some frequency.
+
+    1 = S + G K S gives gamma >= 1 / (1/|W1| + |G|/|W3|) there.
+    """
+    lowest = lowest_rad_s(plant.dt_s, plant.poles)
+    omega = np.geomspace(lowest, plant.nyquist_rad_s, _POINTS_OF_CONFLICT)
     effort = spec.magnitude(plant, omega, LoopFunction.EFFORT)
     if not np.any(effort > 0):
         return
     gain = np.abs(plant.channel.nominal_response(omega))
     tracking = spec.magnitude(plant, omega, LoopFunction.SENSITIVITY)
     with np.errstate(divide="ignore", over="ignore"):
-        bound = 1.0 / (1.0 / tracking + gain / np.maximum(effort, 1e-300))
+        largest_sensitivity = 1.0 / tracking
+        bound = 1.0 / (largest_sensitivity + gain / np.maximum(effort, _TINY))
     worst = int(np.argmax(bound))
     if bound[worst] > 1.0:
         needed = (1.0 - 1.0 / tracking[worst]) / gain[worst]
