@@ -1,8 +1,10 @@
 """What a controller does at its limits: simulated, from rest, without noise and without friction.
 
 Two questions. A constant error that asks for more than the limit: does the command reach the limit and stay
-there? A reference step that meets the limit: does the loop end where it has to? On a stable plant that is at
-the reference, or, where the reference cannot be reached, with the command at its limit.
+there (`limited_controller`)? A reference step that meets the limit: does the loop end where it has to
+(`limited_loop`, `limited_joints`)? On a stable plant that is at the reference, or, where the reference cannot
+be reached, with the command at its limit. `with_safe_limits` looks for an anti-windup gain with which both
+do. Nothing is said of unstable plants, of other plants in the set and of disturbances.
 """
 
 from __future__ import annotations
@@ -21,8 +23,8 @@ from control_design.plants.ellipses import Real
 from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.plant_set import UncertainPlant, delayed
 
+# Share of the step and of the limit in which the limited loop has to end: the usual band of a settling time.
 ERROR_LEFT = 0.02
-"""Of the step and of the limit: the band of a settling time, in which the limited loop has to end."""
 
 # Samples of the longest simulation: 200 s at 1 kHz, and 0.1 s of computation for ten states.
 _LONGEST = 200_000
@@ -47,6 +49,9 @@ _REACHABLE = 0.9
 _CLOSE = 0.5
 # Command that a step asks for which cannot be followed, as a share of the limit.
 _UNREACHABLE = 1.5
+# Modulus of a pole beyond which it is unstable, and not an integrator that rounding moved
+# (`count_integrators` takes poles as close for one).
+_UNSTABLE = 1.0 + 1e-6
 # Factors on the reference gain of `anti_windup_gain`, tried in this order: from half a decade to almost two.
 _SLOWER = (4.0, 16.0, 64.0)
 
@@ -65,10 +70,17 @@ class LimitedObstacle(Enum):
 class LimitedLoop:
     """A loop with limits, simulated on the nominal plant.
 
-    plant: its name, or "controller" for the controller alone under constant errors. steps: sizes of the
-    reference steps (constant errors), in the unit of the error. error_left: per step, the largest distance
-    from where the loop has to end in the last tenth of the simulation: of the output as a share of the step,
-    of the command as a share of its limit; the larger one. obstacle: why nothing is said, else None.
+    Attributes
+    ----------
+    plant : str
+        Its name, or "controller" for the controller alone under constant errors.
+    steps : tuple of float
+        Sizes of the reference steps (constant errors), in the unit of the error.
+    error_left : tuple of float
+        Per step, the largest distance from where the loop has to end in the last tenth of the simulation: of
+        the output as a share of the step, of the command as a share of its limit; the larger one.
+    obstacle : LimitedObstacle or None
+        Why nothing is said.
     """
 
     plant: str
@@ -102,47 +114,59 @@ def limited_controller(controller: Controller) -> LimitedLoop:
         an integrator at the limit. Where only its rate is limited and it integrates, at the largest rate.
     """
     name = "controller"
+    ends_unknown = LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
     law = _alone(controller)
+    if np.any(np.abs(law.poles) > _UNSTABLE):
+        return ends_unknown
+
+    # How long to simulate: until the slowest decay of the controller, limited or not, is seen to end. A pole
+    # too slow to be seen decay acts as an integrator for as long as is simulated.
+    poles_at_limit = np.linalg.eigvals(law.A - _gain(law) @ law.C)
+    moduli = np.abs(np.concatenate([law.poles, poles_at_limit]))
+    slowest_seen = np.exp(np.log(_DECAY) * _LONGER[0] / _LONGEST)
+    slowest = float(np.max(moduli, initial=0.0, where=moduli < slowest_seen))
+    samples = _LONGER[0] * (_samples_to_settle(slowest) or _SHORTEST)
+
+    # What the linear controller asks for under an error of one: a machine that never moves leaves it there.
     linear = replace(law, input_limit=None, rate_limit=None)
     silent = LinearMachine(control.ss([[0.0]], [[0.0]], [[1.0]], [[0.0]], law.dt_s))
-    speeds = np.concatenate([law.poles, np.linalg.eigvals(law.A - _gain(law) @ law.C)])
-    if np.any(np.abs(law.poles) > 1.0 + 1e-6):
-        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
-    # A pole too slow to be seen decay acts as an integrator for as long as is simulated.
-    slowest = np.exp(np.log(_DECAY) * _LONGER[0] / _LONGEST)
-    decaying = np.abs(speeds[np.abs(speeds) < slowest])
-    samples = _LONGER[0] * (_samples_to_settle(float(np.max(decaying, initial=0.0))) or _SHORTEST)
-
-    # What the linear controller asks for under an error of one.
     asked = simulate(linear, silent, np.ones(samples)).command
-    tail = slice(-max(1, int(_TAIL * samples)), None)
-    limit = float(law.limits("input_limit")[0])
-    change = float(law.limits("rate_limit")[0]) * law.dt_s
-    largest = float(np.max(np.abs(asked)))
-    integrates = bool(abs(asked[-1] - asked[tail][0]) > ERROR_LEFT * abs(asked[-1]))
-    one_sign = bool(np.all(np.sign(asked[tail]) == np.sign(asked[-1])))
-    if not one_sign or not abs(asked[-1]) > _DECAY * largest:  # a differentiator ends at zero
-        return LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
+    at_end = float(asked[-1])
+    tail = _tail_of(samples)
+    change_in_tail = abs(asked[-1] - asked[tail][0])
+    integrates = bool(change_in_tail > ERROR_LEFT * abs(at_end))
+    has_one_sign = bool(np.all(np.sign(asked[tail]) == np.sign(at_end)))
+    # A differentiator ends at zero.
+    ends_at_zero = not abs(at_end) > _DECAY * float(np.max(np.abs(asked)))
+    if not has_one_sign or ends_at_zero:
+        return ends_unknown
 
     # Errors that ask for more than the limit at the end, and where the command has to end then.
+    limit = float(law.limits("input_limit")[0])
+    largest_change = float(law.limits("rate_limit")[0]) * law.dt_s
     sizes: list[float] = []
     left: list[float] = []
     if np.isfinite(limit):
-        ramp = int(np.ceil(limit / change)) if np.isfinite(change) else 0
+        ramp = 0
+        if np.isfinite(largest_change):
+            ramp = int(np.ceil(limit / largest_change))
         if samples + ramp > _LONGEST:
             return LimitedLoop(name, obstacle=LimitedObstacle.TOO_SLOW)
         for factor in _ERRORS:
-            size = factor * limit / abs(float(asked[-1]))
+            size = factor * limit / abs(at_end)
             command = simulate(law, silent, np.full(samples + ramp, size)).command
+            off = command[tail] / limit - np.sign(at_end)
             sizes.append(size)
-            left.append(float(np.max(np.abs(command[tail] / limit - np.sign(asked[-1])))))
-    else:
-        increments = np.diff(asked)
-        for factor in _ERRORS if integrates else ():
-            size = factor * change / abs(float(increments[-1]))
+            left.append(float(np.max(np.abs(off))))
+    elif integrates:
+        # Only the rate is limited: the command has to grow at the largest rate.
+        last_change = float(np.diff(asked)[-1])
+        for factor in _ERRORS:
+            size = factor * largest_change / abs(last_change)
             command = simulate(law, silent, np.full(samples, size)).command
+            off = np.diff(command)[tail] / largest_change - np.sign(last_change)
             sizes.append(size)
-            left.append(float(np.max(np.abs(np.diff(command)[tail] / change - np.sign(increments[-1])))))
+            left.append(float(np.max(np.abs(off))))
     return LimitedLoop(name, tuple(sizes), tuple(left))
 
 
@@ -178,17 +202,23 @@ def limited_loop(controller: Controller, plant: UncertainPlant) -> LimitedLoop:
     machine = LinearMachine(system)
 
     # The linear loop after a step of one: what it asks for, and where it ends.
-    linear = simulate(replace(law, input_limit=None, rate_limit=None), machine, np.ones(samples))
+    linear_law = replace(law, input_limit=None, rate_limit=None)
+    linear = simulate(linear_law, machine, np.ones(samples))
     peak = float(np.max(np.abs(linear.command)))
     largest_output = float(np.max(np.abs(linear.measured)))
     if not peak or not largest_output:
         return LimitedLoop(plant.name)
     limit = float(law.limits("input_limit")[0])
     rate = float(law.limits("rate_limit")[0])
-    command_at_end = 0.0 if plant.n_integrators else float(linear.command[-1])
+    command_at_end = 0.0
+    if not plant.n_integrators:
+        command_at_end = float(linear.command[-1])
+    # Largest step that the plant can follow with its limit.
+    largest = np.inf
+    if command_at_end:
+        largest = limit / abs(command_at_end)
 
-    # Steps that the plant can follow with its limits.
-    largest = limit / abs(command_at_end) if command_at_end else np.inf
+    # Steps at which the limit counts, up to those that cannot be followed.
     sizes: list[float] = []
     if np.isfinite(limit):
         sizes += [min(factor * limit / peak, _REACHABLE * largest) for factor in _STEPS]
@@ -197,28 +227,36 @@ def limited_loop(controller: Controller, plant: UncertainPlant) -> LimitedLoop:
             sizes.append(_UNREACHABLE * largest)
     if np.isfinite(rate):
         # The way to the peak at the largest rate takes as long as the linear loop's rise.
-        risen = int(np.argmax(np.abs(linear.measured) >= _REACHABLE * abs(linear.measured[-1]))) or 1
-        sizes.append(min(rate * law.dt_s * risen / peak, _REACHABLE * largest))
+        has_risen = np.abs(linear.measured) >= _REACHABLE * abs(linear.measured[-1])
+        rise_samples = int(np.argmax(has_risen)) or 1
+        to_rate = rate * law.dt_s * rise_samples / peak
+        sizes.append(min(to_rate, _REACHABLE * largest))
 
     # Next to its limit the command moves the plant no faster than the plant moves by itself.
-    by_itself = _samples_to_settle(float(np.max(np.abs(plant.poles), initial=0.0)))
+    slowest_pole = float(np.max(np.abs(plant.poles), initial=0.0))
+    by_itself = _samples_to_settle(slowest_pole)
     if by_itself is None:
         sizes = [size for size in sizes if size < _CLOSE * largest]
 
+    # Simulate each, longer where it has not ended, and see how far it is from its end.
     left: list[float] = []
     for size in sizes:
-        share = min(size, largest)
-        output_at_end = share * float(linear.measured[-1])
-        unit = limit if np.isfinite(limit) else size * peak
+        followed = min(size, largest)
+        output_at_end = followed * float(linear.measured[-1])
+        command_unit = limit if np.isfinite(limit) else size * peak
+        needed = samples
+        if not size < _CLOSE * largest:
+            needed = max(samples, by_itself or 0)
         worst = np.inf
-        needed = samples if size < _CLOSE * largest else max(samples, by_itself or 0)
         for longer in _LONGER:
-            run = simulate(law, machine, np.full(min(longer * needed, _LONGEST), size))
-            tail = slice(-max(1, int(_TAIL * run.command.size)), None)
+            steps = min(longer * needed, _LONGEST)
+            run = simulate(law, machine, np.full(steps, size))
+            tail = _tail_of(steps)
             off_output = np.max(np.abs(run.measured[tail] - output_at_end)) / (size * largest_output)
-            off_command = np.max(np.abs(run.command[tail] - share * command_at_end)) / unit
+            off_command = np.max(np.abs(run.command[tail] - followed * command_at_end)) / command_unit
+            # A run that is not finite has not ended.
             worst = float(np.nan_to_num(max(off_output, off_command), nan=np.inf))
-            if worst <= ERROR_LEFT or run.command.size == _LONGEST:
+            if worst <= ERROR_LEFT or steps == _LONGEST:
                 break
         left.append(worst)
     return LimitedLoop(plant.name, tuple(sizes), tuple(left))
@@ -250,7 +288,7 @@ def limited_joints(controller: Controller, plant: MultivariablePlant) -> Limited
     radius = float(np.max(np.abs(poles), initial=0.0))
     if not radius < 1.0:
         return LimitedLoop(plant.name, obstacle=LimitedObstacle.LOOP_UNSTABLE)
-    if np.any(np.abs(plant.poles) > 1.0 + 1e-6):
+    if np.any(np.abs(plant.poles) > _UNSTABLE):
         return LimitedLoop(plant.name, obstacle=LimitedObstacle.PLANT_UNSTABLE)
     samples = _samples_to_settle(radius)
     if samples is None:
@@ -263,28 +301,39 @@ def limited_joints(controller: Controller, plant: MultivariablePlant) -> Limited
     sizes: list[float] = []
     left: list[float] = []
     for channel in range(plant.outputs):
-        one = np.zeros(plant.outputs)
-        one[channel] = 1.0
-        linear_output, linear_command = simulate_joints(linear_law, machine, np.tile(one, (samples, 1)))
+        # The linear loop after a step of one of this reference: peaks (U,) of its commands, and its rise.
+        direction = np.zeros(plant.outputs)
+        direction[channel] = 1.0
+        linear_reference = np.tile(direction, (samples, 1))
+        linear_output, linear_command = simulate_joints(linear_law, machine, linear_reference)
         peak = np.max(np.abs(linear_command), axis=0)
-        rises = np.abs(linear_output[:, channel]) >= _REACHABLE * abs(linear_output[-1, channel])
-        risen = int(np.argmax(rises)) or 1
+        largest_output = float(np.max(np.abs(linear_output)))
+        followed = linear_output[:, channel]
+        has_risen = np.abs(followed) >= _REACHABLE * abs(followed[-1])
+        rise_samples = int(np.argmax(has_risen)) or 1
+
+        # Steps at which the first command meets its limit, or its largest rate during the rise.
         with np.errstate(divide="ignore"):
             to_limit = float(np.min(limits / peak))
-            to_rate = float(np.min(changes * risen / peak))
+            to_rate = float(np.min(changes * rise_samples / peak))
             largest = float(np.min(limits / np.abs(linear_command[-1])))
-        reached = [factor * to_limit for factor in _STEPS] if np.isfinite(to_limit) else []
-        reached += [to_rate] if np.isfinite(to_rate) else []
-        for size in dict.fromkeys(min(step, _REACHABLE * largest) for step in reached):
+        reached: list[float] = []
+        if np.isfinite(to_limit):
+            reached += [factor * to_limit for factor in _STEPS]
+        if np.isfinite(to_rate):
+            reached.append(to_rate)
+        # Each size once, none beyond what can be followed.
+        followed_steps = dict.fromkeys(min(step, _REACHABLE * largest) for step in reached)
+        for size in followed_steps:
+            command_unit = np.where(np.isfinite(limits), limits, size * np.max(peak))
+            output_unit = size * largest_output
             worst = np.inf
             for longer in _LONGER:
                 steps = min(longer * samples, _LONGEST)
-                output, command = simulate_joints(law, machine, np.tile(size * one, (steps, 1)))
-                tail = slice(-max(1, int(_TAIL * steps)), None)
-                scale = size * float(np.max(np.abs(linear_output)))
-                off_output = np.max(np.abs(output[tail] - size * linear_output[-1])) / scale
-                off = np.abs(command[tail] - size * linear_command[-1])
-                off_command = np.max(off / np.where(np.isfinite(limits), limits, size * np.max(peak)))
+                output, command = simulate_joints(law, machine, np.tile(size * direction, (steps, 1)))
+                tail = _tail_of(steps)
+                off_output = np.max(np.abs(output[tail] - size * linear_output[-1])) / output_unit
+                off_command = np.max(np.abs(command[tail] - size * linear_command[-1]) / command_unit)
                 worst = float(np.nan_to_num(max(off_output, off_command), nan=np.inf))
                 if worst <= ERROR_LEFT or steps == _LONGEST:
                     break
@@ -297,7 +346,10 @@ def limited_loops(controller: Controller, plants: Sequence[UncertainPlant]) -> t
     """The controller alone under constant errors, then the loop with every plant; none without limits."""
     if not controller.limited_commands.any():
         return ()
-    return (limited_controller(controller), *(limited_loop(controller, plant) for plant in plants))
+    loops = [limited_controller(controller)]
+    for plant in plants:
+        loops.append(limited_loop(controller, plant))
+    return tuple(loops)
 
 
 def with_safe_limits(
@@ -324,9 +376,9 @@ def with_safe_limits(
     if np.all(np.abs(controller.poles) < 1.0):
         gains.append(np.zeros_like(gains[0]))
     for gain in gains:
-        tried = replace(controller, anti_windup_gain=gain)
-        if all(loop.ends for loop in check(tried)):
-            return tried
+        slower = replace(controller, anti_windup_gain=gain)
+        if all(loop.ends for loop in check(slower)):
+            return slower
     return controller
 
 
@@ -336,9 +388,14 @@ def _alone(controller: Controller) -> Controller:
 
 
 def _gain(controller: Controller) -> Real:
-    """Its anti-windup gain, (n, U)."""
+    """Anti-windup gain (n, U) of a controller: what the limited part of its commands does to its states."""
     assert controller.anti_windup_gain is not None
     return controller.anti_windup_gain
+
+
+def _tail_of(samples: int) -> slice:
+    """Last tenth of a simulation of so many samples, at least one: where the loop has to be at rest."""
+    return slice(-max(1, int(_TAIL * samples)), None)
 
 
 def _samples_to_settle(radius: float) -> int | None:
@@ -348,4 +405,6 @@ def _samples_to_settle(radius: float) -> int | None:
     samples = _SHORTEST
     if radius > 0.0:
         samples = max(_SHORTEST, int(np.ceil(np.log(_DECAY) / np.log(radius))))
-    return samples if _LONGER[0] * samples <= _LONGEST else None
+    if _LONGER[0] * samples > _LONGEST:
+        return None
+    return samples
