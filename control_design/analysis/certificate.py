@@ -49,11 +49,12 @@ LIGHT_CONTROLLER_POLES = 1e-3
 _LIGHT_MODE = 0.4
 # Damping ratio that the grid takes at least for a mode, so that its points do not fall onto one another.
 _LEAST_DAMPING = 1e-5
-# Grid points around each of these modes.
+# Grid points around each of these modes, before the maxima are refined. Chosen.
 _POINTS_PER_MODE = 120
 # Distance of the loop from -1 at which |S| is -3 dB, its value at the bandwidth.
 _DISTANCE_AT_BANDWIDTH = np.sqrt(2.0)
 
+# Captions of the two items about a controller's limits.
 _LIMITED_COMMAND = "limited command under a constant error: distance from its end, share of the limit"
 _LIMITED_LOOP = "limited loop after a step beyond the limit: distance from its end, share of the step"
 
@@ -254,6 +255,7 @@ def certify(
         joint = calibrate(
             controller, plants, specification, rng=rng, coverage=joint_coverage, draws=joint_draws
         )
+        # A lower level would check smaller ellipses than the user asked for.
         plants = [at_level(plant, max(plant.level, joint.level)) for plant in plants]
 
     # Requirements on the loops, then on the controller alone, of which nothing about a loop is known.
@@ -318,6 +320,7 @@ def certify(
     if all(verdict.all_frequencies.possible for verdict in verdicts):
         gamma_bound = max(verdict.all_frequencies.gamma for verdict in verdicts)
 
+    # Resonances of the controller that are narrower than anybody's measurement of the machine.
     resonances: list[Resonance] = []
     light_modes = modes_of(controller.poles, controller.dt_s, zeta_below=LIGHT_CONTROLLER_POLES)
     for mode in light_modes:
@@ -378,6 +381,7 @@ def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase
         """Controller with its delay (N,), and the ellipses, at frequencies (N,), rad/s."""
         return controller.response(omega), plant.at(omega)
 
+    # A loop that integrates is infinite at zero frequency, and no gain moves a pole through z = 1.
     at_zero = None
     if not integrators:
         at_zero = float(loop_gain(np.zeros(1))[0].real)
@@ -455,6 +459,7 @@ def _check_plant(
     margins = loop_margins(controller, seen_plant, worst)
     reaches_minus_one = not margins.worst.modulus > 0
     nearest_rad_s = float(worst.omega_rad_s[np.argmin(worst.values["distance"])])
+    # Largest value of each requirement, and where.
     peaks: dict[str, tuple[float, float | None]] = {name: worst.peak(name) for name in worst.names}
     worst_weighted = float("inf")
     worst_peak_sensitivity = float("inf")
@@ -513,6 +518,7 @@ def _check_plant(
         controller=controller,
     )
     items = [requirement.check(findings) for requirement in specification.requirements(plant)]
+    # Without any uncertainty nothing is a worst case.
     if plant.uncertainty is None and plant.damped.uncertainty is None:
         items = [replace(item, about="nominal loop") for item in items]
     return verdict, items

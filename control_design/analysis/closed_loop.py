@@ -122,6 +122,7 @@ class LinearMachine:
         ValueError
             A disturbance torque is given and the system has no input for it.
         """
+        # Without an input for the torque it is cut off, and must be zero.
         drive = np.append(u, hub_torque_Nm)[: self._b.shape[1]]
         self._refuse_torque(hub_torque_Nm)
         self._x = self._a @ self._x + self._b @ drive
@@ -155,6 +156,7 @@ class LinearMachine:
             The machine clips its input there.
         """
         self._refuse_torque(signals[:, 4])
+        # What joins the applied command, and the torque where the system has an input for it.
         added = signals[:, 3 : 3 + self._b.shape[1]]
         outputs, commands, limited = self.joints_in_loop(
             signals[:, :3], added, law, limits, steps, delay, np.array([measured]), clip
@@ -205,6 +207,7 @@ class LinearMachine:
         output = np.empty((n_samples, n_outputs))
         command = np.empty((n_samples, n_commands))
         limited = np.zeros(n_samples, dtype=np.bool_)
+        # Inputs to which nothing is added.
         not_added = np.zeros((n_samples, n_inputs - added.shape[1]))
         drive = np.hstack([added, not_added])
         # A sparse A, because a model of many taps is a shift register.
@@ -276,7 +279,8 @@ def _run(
             output[k, measured[i]] = y
             signals[n + i] = given[k, i] - y
 
-        # Commands, limited in rate and size, quantised and queued for the delay.
+        # Commands, limited in rate and then in size, quantised and queued for the delay: a ring of delay + 1
+        # samples, of which the oldest is applied.
         for i in range(n_u):
             wanted = _along(law, n + i, signals) + given[k, n_y + i]
             lowest = last_command[i] - limits[n_u + i]
@@ -286,6 +290,7 @@ def _run(
             last_command[i] = u
             if u != wanted:
                 limited[k] = True
+            # What the limits took off, which the anti-windup gain hands to the states.
             signals[n + n_y + i] = u - wanted
             if steps[1] != 0:
                 u = steps[1] * np.rint(u / steps[1])
@@ -297,6 +302,7 @@ def _run(
         for i in range(n):
             next_states[i] = _along(law, i, signals)
         signals[:n] = next_states
+        # Inputs beyond the commands (a torque) get what is added alone.
         for i in range(n_u, drive.size):
             drive[i] = added[k, i]
         for i in range(x.size):
@@ -423,6 +429,7 @@ def simulate(
     # The whole loop compiled, where the machine has it.
     in_loop = getattr(machine, "in_loop", None)
     if in_loop is not None:
+        # The stepper makes the feed-forward sample by sample; here it is a signal that joins the command.
         from_feedforward = np.zeros(n_samples)
         if controller.feedforward is not None:
             from_feedforward = controller.feedforward.signal(wanted, controller.dt_s)
@@ -434,7 +441,7 @@ def simulate(
             time_s, wanted, outputs, commands, at_limit, controller.dt_s, measured_index
         )
 
-    # Sample by sample.
+    # Sample by sample; the queue holds the commands that wait for the delay to pass.
     machine.reset()
     stepper = controller.stepper()
     queue = [0.0] * delay
@@ -446,6 +453,7 @@ def simulate(
         y[measured_index] += shift[k]
         if measurement_step > 0:
             y[measured_index] = np.round(y[measured_index] / measurement_step) * measurement_step
+        # The stepper takes the reference, too: it makes the feed-forward of it.
         error = float(wanted[k] - y[measured_index])
         u = stepper.step(error, float(wanted[k]))
         limited[k] = stepper.limited[0]
@@ -730,10 +738,12 @@ def sensitivity_of(
     peak_command = 0.0
     limited_fraction = 0.0
     for _ in range(draws):
+        # Equal amplitudes at the lines, random phases, scaled to the root mean square that is asked for.
         spectrum = np.zeros(period_samples // 2 + 1, dtype=np.complex128)
         spectrum[lines] = np.exp(2j * np.pi * rng.random(lines.size))
         period = np.fft.irfft(spectrum, period_samples)
         period *= rms / np.sqrt(np.mean(period**2))
+        # Whole periods after the lead-in, so that their Fourier transform has no leakage.
         run = loop(np.tile(period, lead_in_periods + periods))
         error = (run.reference - run.measured)[lead_in_periods * period_samples :]
         error_lines = np.fft.rfft(error.reshape(periods, period_samples), axis=1)[:, lines]

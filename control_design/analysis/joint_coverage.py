@@ -164,6 +164,7 @@ def joint_coverage(
     samples = [loop.gamma(rng, draws) for loop in loops]
     gammas, stables, distances = zip(*samples, strict=True)
     gamma = np.max(gammas, axis=0)
+    # A value that was drawn, at or above the quantile, so that the share within it is at least `coverage`.
     wanted = float(np.quantile(gamma, coverage, method="higher"))
 
     # Radius of the ellipses, in standard deviations and common to all plants, whose worst case is the
@@ -266,6 +267,7 @@ class SampledLoop:
         """
         data = self.data
         size = np.abs(self.loop)
+        # |S| of every draw; a draw on -1 gets a huge finite value.
         return_difference = np.abs(1.0 + members * (self.loop * data.delay))
         sensitivity = 1.0 / np.maximum(return_difference, _TINY)
         largest = np.zeros(members.shape[0])
@@ -273,6 +275,7 @@ class SampledLoop:
             use = each.magnitude > 0
             if not np.any(use):
                 continue
+            # Weight times K, and times the independent channel or the member itself, where f has them.
             weight = each.magnitude[use]
             if each.requirement.function.of_controller:
                 weight = (each.magnitude * size)[use]

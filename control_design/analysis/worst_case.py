@@ -105,12 +105,14 @@ class PlantData:
         for requirement in specification.weighted(plant):
             magnitude = requirement.magnitude(omega, plant.dt_s)
             channel = None
+            # Of an independent channel any member may meet any member of the plant: its largest gain counts.
             if requirement.channel is not None:
                 channel = np.zeros(omega.size)
                 use = magnitude > 0
                 if np.any(use):
                     channel[use] = requirement.channel.at(omega[use]).farthest()
             weightings.append(Weighting(requirement, magnitude, channel))
+        # The computational delay is kept apart from the controller, so that optimisers see no delay in K.
         delay = np.exp(-1j * omega * plant.dt_s * specification.computational_delay_samples)
         return cls(plant, plant.at(omega), delay, tuple(weightings))
 
@@ -176,6 +178,8 @@ class PlantData:
             By name of the requirement, and "distance" = dist(-1, K E). Inf where a member of the ellipse puts
             the loop on -1.
         """
+        # Without the member as a factor the worst case is that of |S|, 1 over the distance from -1. With it,
+        # numerator and denominator move together, and the exact maximum of the quotient is taken.
         loop = k * self.delay
         distance = distance_to_minus_one(loop, self.ellipses)
         largest_sensitivity = quotient(1.0, distance, np.inf)
@@ -283,6 +287,7 @@ def worst_case(
     if plant.own_grid is not None:
         return worst
     for _ in range(rounds):
+        # Requirements that ask for nothing anywhere have no maximum.
         asked_values = [worst.values[name] for name in worst.names if np.any(worst.values[name] > 0)]
         new = around_maxima(worst.omega_rad_s, asked_values, _PEAKS)
         if not new.size:
@@ -324,6 +329,7 @@ class Grids:
             edges: list[float] = []
             for asked in specification.weighted(plant):
                 edges += asked.band or ()
+            # Edges of bands are grid points, because a weight jumps there.
             lean = programme_grid(plant, modes, options, edges)
             self.grids.append(lean)
             dense = programme_grid(plant, modes, options, lean, dense=True)

@@ -116,6 +116,7 @@ class MultivariableSpecification(Settings):
 
         inputs, outputs: numbers U and Y of the plant; joints beyond them are left out.
         """
+        # Tracking and modulus margin are about outputs, effort about actuators.
         at_outputs = self.joints[:outputs]
         at_inputs = self.joints[:inputs]
         tracking = tuple(joint.tracking_weight() for joint in at_outputs)
@@ -126,6 +127,7 @@ class MultivariableSpecification(Settings):
             "effort": ChannelWeights("u", effort),
             "modulus": ChannelWeights("y", modulus),
         }
+        # A requirement that no channel asks for is left out; the modulus margin is always asked.
         asked = {}
         for name, channels in by_requirement.items():
             if any(weight is not None for weight in channels.weights):

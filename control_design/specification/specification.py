@@ -170,6 +170,7 @@ class Specification(Settings):
     @model_validator(mode="after")
     def _consistent(self) -> Specification:
         """Return self; ValueError, with the keys, for settings that contradict each other."""
+        # Tracking and effort: in words or as a weight.
         if self.sensitivity_weight is not None and self.bandwidth_rad_s is not None:
             raise ValueError("give bandwidth_rad_s or sensitivity_weight, not both")
         if self.lowest_bandwidth_rad_s is not None:
@@ -182,6 +183,7 @@ class Specification(Settings):
             raise ValueError("give effort_limit (with effort_rolloff_rad_s) or effort_weight, not both")
         if self.effort_rolloff_rad_s is not None and self.effort_limit is None:
             raise ValueError("effort_rolloff_rad_s needs effort_limit")
+        # Damping of modes: the nominal damping ratio needs a band, the peak may take that of the lowest mode.
         if self.mode_band_rad_s is not None:
             low, high = self.mode_band_rad_s
             if not (0 < low < high and np.isfinite(high)):
@@ -190,6 +192,7 @@ class Specification(Settings):
                 raise ValueError("mode_band_rad_s needs mode_peak_ratio or mode_damping")
         if self.mode_damping is not None and self.mode_band_rad_s is None:
             raise ValueError("mode_damping needs mode_band_rad_s: the band whose modes are meant")
+        # Orders that the structure can have.
         if self.controller_order == "auto":
             if self.structure != "biquads":
                 raise ValueError("controller_order = 'auto' needs structure 'biquads'; give a number")
@@ -226,6 +229,7 @@ class Specification(Settings):
         if self.integrator:
             kinds.append("integrator")
         n_left = self.controller_order - len(kinds)
+        # What order is left goes to sections of second order, which have real or complex poles.
         if self.structure == "pi_d_notch":
             n_pairs = (n_left - 1) // 2
             kinds.append("first_order")
@@ -368,6 +372,7 @@ class Tracking(WeightedRequirement):
         weight = spec.tracking_weight(plant)
         if weight is None:
             return None
+        # Where the weight asks for no more than the modulus margin, that requirement asks it already.
         return cls(weight, above=spec.modulus_margin)
 
 
@@ -644,6 +649,7 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
 
     worst = int(np.argmax(bound))
     where = f"the non-minimum-phase zero at {np.abs(w[worst]):.4g} rad/s"
+    # A zero of the plant may lie at 2/dt, too; the last one is that of the delay.
     if worst == w.size - 1 and w[worst] == zero_of_delay:
         where = "the sampling delay"
     message = (
@@ -674,6 +680,7 @@ def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
 
     1 = S + G K S gives gamma >= 1 / (1/|W1| + |G|/|W3|) there.
     """
+    # The nominal plant on a grid: a necessary condition, so points between may be missed.
     lowest = lowest_rad_s(plant.dt_s, plant.poles)
     omega = np.geomspace(lowest, plant.nyquist_rad_s, _POINTS_OF_CONFLICT)
     effort = spec.magnitude(plant, omega, LoopFunction.EFFORT)
