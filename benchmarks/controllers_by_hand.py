@@ -29,7 +29,7 @@ def run(out: Print, *, controllers: int = 1000, seed: int = 47) -> None:
     false: list[str] = []
     stable = certified = numbers = loose = 0
     for number in range(controllers):
-        case = _case(rng)
+        case = drawn_case(rng)
         found, told, checked, cautious = checked_case(case, rng)
         stable, certified = stable + told[0], certified + told[1]
         numbers, loose = numbers + checked, loose + cautious
@@ -40,7 +40,7 @@ def run(out: Print, *, controllers: int = 1000, seed: int = 47) -> None:
     out(f"false: {len(false)}; nominal gain margins more than .1 % too careful: {loose}")
 
 
-def _case(rng: np.random.Generator) -> dict[str, Any]:
+def drawn_case(rng: np.random.Generator) -> dict[str, Any]:
     """A plant, a controller, a delay and a relative uncertainty, drawn."""
     plants = _plants(rng)
     name = str(rng.choice(list(plants)))
