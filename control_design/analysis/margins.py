@@ -29,7 +29,7 @@ _TOUCHES = 1e-9
 # margins depend on the unit of time (`test_margins`); with eight no test moves.
 _ROUNDS = 4
 # Minima that are searched, the smallest: more of them than a loop of any order here has near -1. With a
-# quarter of them no test moves; twice as many take twice the time.
+# quarter of them, or twice as many, no test moves.
 _MINIMA = 16
 # What the search may miss of a smallest value, relative: it is taken off the margins over ellipses, so that
 # they err to the safe side. A minimum seen at a 625th of the grid's distance is missed by far less: with
