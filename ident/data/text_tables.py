@@ -1,6 +1,14 @@
-"""Tables in text files: which line holds the names, what separates the cells, how a number is written. The
-layout that fits best is taken, and shown; what cannot be told, such as decimal commas between commas, is
-refused."""
+"""Tables in text files: which line holds the names, what separates the cells, how a number is written.
+
+Loggers, instruments and spreadsheets write tables in many ways, and no file says which. `read_text` tries
+every usual separator with decimal points and with decimal commas on the first lines (`_Fit.of`), takes what
+makes most cells numbers under as many names (`_Fit.score`), and looks for names and units around the first
+row (`_Fit.layout`). Then it cuts all lines into cells and leaves out what is no row: comments, words under
+the table, a row in which the file ends. The `Layout` says what was found, so that it can be shown.
+
+What cannot be told, such as decimal commas between commas, is refused. Every step takes a time that is linear
+in the length of the text: no regular expression here can match one text in two ways.
+"""
 
 from __future__ import annotations
 
@@ -24,32 +32,70 @@ from ident.data.text_numbers import (
 from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
 
-# Lines that are looked at to find the layout.
-_SAMPLE = 400
-# Separators with decimal points and commas, plain ones first: of several that fit alike the first is taken.
-_KINDS = (
-    *((",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), (" ", "."), (" ", ","), ("|", ".")),
-    *(("|", ","), (",", ",")),
+# Lines from the beginning of the file that are looked at to find the layout: preambles of recorders have up
+# to some hundred. Doubled or halved, no test of
+# text logs moves.
+_SAMPLE_LINES = 400
+# Lines from the end of these that say how wide a row is and which columns hold numbers: there the preamble is
+# over. Doubled, no test of text logs moves.
+_USUAL_LINES = 100
+# Separators and decimal signs that are tried. Of several that fit alike the first is taken, so plain ones
+# come first; comma and comma are last, as such a table cannot be told from one of integers.
+_DIALECTS = (
+    (",", "."),
+    (";", "."),
+    (";", ","),
+    ("\t", "."),
+    ("\t", ","),
+    (" ", "."),
+    (" ", ","),
+    ("|", "."),
+    ("|", ","),
+    (",", ","),
 )
+# Words for the separators in complaints.
+_SEPARATOR_WORDS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars"}
+# Signs with which a line of comment begins, and the characters with which such signs begin (a faster test).
 _COMMENT = re.compile(r"^\s*(?:#+|%+|//+|!+|--+(?=\D)|\*+|rem\s)\s*", re.IGNORECASE)
-# A statement of the sampling above the rows: Rigol's tInc = 1e-06 and t0 = -0.005 between the names.
+_COMMENT_BEGINNINGS = frozenset("#%/!-*rR")
+# Statements of the sampling above the rows: Rigol's tInc = 1e-06 and t0 = -0.005 between the names.
 _START = re.compile(r"(?:t0|x0|start|x ?org|x ?origin)\b", re.IGNORECASE)
 _INCREMENT = re.compile(
     r"(?:tinc|xinc|x ?increment|increment|delta[_ ]?[xt]|hresolution|sampl(?:e|ing) (?:interval|period))\b",
     re.IGNORECASE,
 )
-# What names hold beyond those of the columns: LabVIEW's comments, Rigol's start and step and their values.
-_BEYOND = re.compile(r"comment|start|increment|[+-]?\d+\.?\d*(e[+-]?\d+)?|", re.IGNORECASE)
+# What a line of names may hold behind those of the columns: LabVIEW's comments, Rigol's start and step and
+# their values.
+_BEHIND_NAMES = re.compile(r"comment|start|increment|[+-]?\d+\.?\d*(e[+-]?\d+)?|", re.IGNORECASE)
+# Lines above the names that state the units of the first column, and of the others.
 _UNITS_OF_X = re.compile(r"(?:horizontal|x)[_ ]units?\b|x_dimension\b", re.IGNORECASE)
 _UNITS_OF_Y = re.compile(r"(?:vertical|y)[_ ]unit", re.IGNORECASE)
+# The step of the rows as the scope of a PLC states it for each channel: 'Sample time [ms]'.
+_STEP_OF_CHANNEL = re.compile(r"sampl.*[\[(](\w+)[\])]")
+# Difference of the first two stamps from a stated step, as a share of it, up to which they agree: stamps are
+# written with few digits, and another unit would be a factor of 1000.
+_SAME_STEP = 0.01
+# A cell that is a unit by its form: in brackets, '-' and '1' for none, Rigol's word for counted rows.
+_UNIT_BY_FORM = re.compile(r"[\[(].*[\])]|-|1|sequence", re.IGNORECASE)
+# Signs around a unit that are no part of it.
+_AROUND_UNITS = "[](){} "
 # What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
 _ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
-_LONGEST_ARRIVAL = 120  # characters of a line in which that is looked for
+# Characters of a line in which that is looked for: a date and a time with their signs have 40. Chosen above that.
+_LONGEST_ARRIVAL = 120
 # A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'. No part matches
 # what the next one begins with, so that time is linear in the length of a line.
 _LABELLED = re.compile(r"([^\W\d_][^:=,;\t|]*)[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
-_SIGNS = frozenset("#%/!-*rR")
-_MOST_FOOTER_LINES = 3  # words under a table: units, a count of rows, the name of the recorder
+# Lines of words under a table that are left out: units, a count of rows, the name of the recorder. More are
+# no footer, and are complained of.
+_MOST_FOOTER_LINES = 3
+# Rows that stand above a footer, or besides one in which the file ends, before either is told from a row:
+# fewer do not say what a row looks like. Chosen.
+_FEWEST_ROWS = 4
+# Lines above the first row in which the names are looked for: names, units, and a faulty row or an empty
+# statement between.
+_LINES_ABOVE = 3
+# Control characters that no text has.
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 
 
@@ -57,13 +103,34 @@ _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
 class Layout:
     """How a text table is written.
 
-    separator: , ; tab | or a blank for any run of blanks. decimal: point or comma. names: of the columns,
-    numbered where there is no header line. units: by name, of a line of units. header, first: line (from 1)
-    of the names, 0 for none, and of the first row. skipped: lines from there on that are no rows; commented:
-    how many of them are commented out. increment: (start, step) of the rows [s], where lines above say so.
-    plain: a cell leaves no doubt of the decimal sign; stated: by the user. cut: the last line that was left
-    out because the file ends inside of it, footer: the first of those under the table that hold words alone,
-    0 for none.
+    Attributes
+    ----------
+    separator : str
+        Comma, semicolon, tab or bar; a blank for any run of blanks.
+    decimal : str
+        Point or comma.
+    names : tuple of str
+        Of the columns, numbered where there is no line of names.
+    units : dict
+        Units by name, as a line of units or lines above the names state them.
+    header : int
+        Line (from 1) of the names, 0 for none.
+    first : int
+        Line (from 1) of the first row.
+    skipped : tuple of int
+        Lines from there on that are no rows, in order.
+    commented : int
+        How many of them are commented out.
+    increment : tuple of float, or None
+        Start and step of the rows in seconds, where lines above state them.
+    plain : bool
+        A cell leaves no doubt of the decimal sign.
+    stated : bool
+        The user stated the decimal sign.
+    cut : int
+        The last line, where it was left out because the file ends inside of it; else 0.
+    footer : int
+        First of the lines under the table that hold words alone; 0 for none.
     """
 
     separator: str
@@ -81,17 +148,31 @@ class Layout:
     footer: int = 0
 
     def line(self, row: int) -> int:
-        """The line of a row, which is counted from 0."""
+        """The line of the file (from 1) of a row, which is counted from 0."""
         line = self.first + row
         for skipped in self.skipped:
-            line += skipped <= line
+            if skipped <= line:
+                line += 1
         return line
 
 
 def text_of(content: bytes) -> str:
-    """The text of a file in UTF-8 or UTF-16 (with its mark), else as Windows writes it (code page 1252).
+    """The text of a file, its lines ended by line feeds alone.
 
-    Raises ValueError where it is no text.
+    Parameters
+    ----------
+    content : bytes
+        UTF-8 or UTF-16 (with its mark), else as Windows writes it (code page 1252).
+
+    Returns
+    -------
+    str
+        Without the mark.
+
+    Raises
+    ------
+    ValueError
+        It is no text, or larger than `LARGEST_TEXT_BYTES`.
     """
     if len(content) > LARGEST_TEXT_BYTES:
         raise ValueError(
@@ -114,44 +195,75 @@ def text_of(content: bytes) -> str:
 
 
 def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
-    """The layout of a table, and its columns as text, equally long. Raises ValueError, with the line first
-    where there is one."""
+    """The layout of a table, and its columns as text.
+
+    Parameters
+    ----------
+    text : str
+        All of a file, lines ended by line feeds (`text_of`).
+
+    Returns
+    -------
+    layout : Layout
+        How the table is written, and what was left out of it.
+    columns : dict
+        The cells of each column by name, a tuple of one string per row, all equally long; a missing cell is
+        an empty string. Units that stand in every cell are taken off.
+
+    Raises
+    ------
+    ValueError
+        No table of numbers, more cells than names, a quotation mark that is not closed, or too many columns.
+        The message begins with ':' or with the line, as ', line 3:'.
+    """
     lines = with_plain_minus(text).split("\n")
+    # Blank lines at the very end are no samples.
     while lines and not lines[-1].strip(" \t,;|"):
-        lines.pop()  # blank lines at the very end are no samples
+        lines.pop()
     if not lines:
         raise ValueError(": the file is empty; expected a header line and rows of numbers")
-    lines, named = _bare(lines)
-    layout = _layout(lines[:_SAMPLE], len(lines))
-    if named:
-        names = distinct([*named, *layout.names[len(named) if layout.header else 0 :]])[: len(layout.names)]
-        header = layout.header or (layout.first if len(named) > 1 else 0)
-        layout = replace(layout, names=tuple(names), header=header)
+    lines, serial_names = _without_labels(lines)
+    layout = _layout(lines[:_SAMPLE_LINES], len(lines))
+
+    # Names that stand before the numbers of each line count more than those of a line above, if there is one.
+    if serial_names:
+        first_other = len(serial_names) if layout.header else 0
+        names = distinct([*serial_names, *layout.names[first_other:]])
+        header = layout.header
+        if not header and len(serial_names) > 1:
+            header = layout.first
+        layout = replace(layout, names=tuple(names[: len(layout.names)]), header=header)
 
     # Lines that are no rows: comments, and blank ones behind every row; a single one may be a missing sample.
     first = layout.first - 1
     commented = [k for k in range(first, len(lines)) if _is_comment(lines[k])]
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
-    double = 2 * len(blank) >= len(lines) - first - len(commented) - 2
-    skipped = {*commented, *(blank if double else ())}
-    body = [line for k, line in enumerate(lines[first:], first) if k not in skipped]
+    n_others = len(lines) - first - len(commented)
+    skipped = set(commented)
+    # Where half of the lines are blank, but for two, the line ends were written twice.
+    if 2 * len(blank) >= n_others - 2:
+        skipped.update(blank)
+    numbered_lines = enumerate(lines[first:], first)
+    body = [line for k, line in numbered_lines if k not in skipped]
     if not body:
         raise ValueError(": no rows under the header line; expected numbers")
-    layout = replace(layout, skipped=tuple(k + 1 for k in sorted(skipped)), commented=len(commented))
+    skipped_lines = tuple(k + 1 for k in sorted(skipped))
+    layout = replace(layout, skipped=skipped_lines, commented=len(commented))
     rows = _rows(body, layout.separator)
 
     # Words under the last row are no reading, and a row in which the file ends is no whole one.
     footer = _footer(rows, layout.decimal)
+    ends_inside_row = not text.endswith("\n") and len(lines) not in skipped
     if footer:
         layout = replace(layout, footer=layout.line(len(rows) - len(footer)))
         del rows[-len(footer) :]
         if not layout.units:
             layout = replace(layout, units=_units_of(footer[0], layout.names))
-    elif not text.endswith("\n") and len(lines) not in skipped and _is_cut(rows, layout.decimal):
+    elif ends_inside_row and _is_cut(rows, layout.decimal):
         del rows[-1]
         layout = replace(layout, cut=len(lines))
 
-    # Every row has to have a cell for each name.
+    # Every row has to have a cell for each name: empty ones are added, and taken off at the end.
     width = len(layout.names)
     lengths = set(map(len, rows))
     if max(lengths) > width:
@@ -163,23 +275,29 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
         for row in rows:
             row.extend([""] * (width - len(row)))
     sign = layout.decimal
-    proven = any(sign in cell and shows_decimals(cell, sign) for row in rows for cell in row)
+    # Nearly all cells end at the first test, which is fast.
+    sign_is_plain = any(sign in cell and shows_decimals(cell, sign) for row in rows for cell in row)
     columns = dict(zip(layout.names, zip(*rows, strict=True), strict=True))
 
     # '0.005 sec' in every row is a column of numbers in seconds.
     units = dict(layout.units)
     for name, cells in columns.items():
-        if bare := without_units(cells, layout.decimal):
+        bare = without_units(cells, layout.decimal)
+        if bare is not None:
             columns[name], units[name] = bare
-    return replace(layout, plain=proven, units=units), columns
+    return replace(layout, plain=sign_is_plain, units=units), columns
 
 
 def _footer(rows: Sequence[Sequence[str]], decimal: str) -> list[Sequence[str]]:
-    """The last rows, three at most, that hold words and not one number, where four rows stand above."""
+    """The last rows that hold words and not one value, where enough rows stand above; else none.
+
+    rows: the cells of each. Empty, too, where there are more of them than a footer has.
+    """
     begin = len(rows)
-    while (
-        begin > 4 and any(rows[begin - 1]) and not any(_is_value(cell, decimal) for cell in rows[begin - 1])
-    ):
+    while begin > _FEWEST_ROWS:
+        cells = rows[begin - 1]
+        if not any(cells) or any(_is_value(cell, decimal) for cell in cells):
+            break
         begin -= 1
     if len(rows) - begin > _MOST_FOOTER_LINES:
         return []
@@ -187,95 +305,130 @@ def _footer(rows: Sequence[Sequence[str]], decimal: str) -> list[Sequence[str]]:
 
 
 def _units_of(cells: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Units by name, of a line that holds units alone: empty cells, and columns that it does not reach, have
-    none."""
-    words = [cell.strip("[](){} ") for cell in cells]
-    if len(words) > len(names) or not all(is_unit(word) for word in words if word):
+    """Units by name, where every cell of a line that is not empty is a unit; else empty.
+
+    cells: of the line, which may end before the names do. Empty cells, and columns that the line does not
+    reach, have no unit.
+    """
+    words = [cell.strip(_AROUND_UNITS) for cell in cells]
+    if len(words) > len(names):
+        return {}
+    if not all(is_unit(word) for word in words if word):
         return {}
     return {name: word for name, word in zip(names, words, strict=False) if word}
 
 
-def _bare(lines: list[str]) -> tuple[list[str], list[str]]:
+def _without_labels(lines: list[str]) -> tuple[list[str], list[str]]:
     """Lines of a serial port as a table has them, and the names of their first columns.
 
-    Without 'angle:' before each number; the stamp that a monitor puts before each line is a cell of its own.
+    'angle:0.01' becomes 0.01 in a column named angle; the stamp that a monitor puts before each line becomes
+    the first cell, named time. Lines without either come back as they are, without names.
     """
-    sample = [_arrival(line) for line in lines[:_SAMPLE]]
-    arrived = 2 * sum(is_stamp(stamp) for stamp, _ in sample) > len(sample)
+    # Most lines of the sample have to begin with a stamp.
+    sample = [_arrival(line) for line in lines[:_SAMPLE_LINES]]
+    n_stamped = sum(is_stamp(stamp) for stamp, _ in sample)
+    has_stamps = 2 * n_stamped > len(sample)
     stamps = list[str]()
-    if arrived:
+    if has_stamps:
         parts = [_arrival(line) for line in lines]
         stamps = [stamp for stamp, _ in parts]
         lines = [line for _, line in parts]
 
     # Most lines of the sample have to be numbers with the same names.
-    samples = [tuple(name for name, _, _ in _labelled(line)) for line in lines[:_SAMPLE]]
-    ((labels, times),) = Counter(samples).most_common(1)
-    names = list(labels) if 2 * times > len(samples) else []
+    names_of_lines = Counter[tuple[str, ...]]()
+    for line in lines[:_SAMPLE_LINES]:
+        numbers = _labelled(line)
+        names_of_lines[tuple(name for name, _, _ in numbers)] += 1
+    ((labels, n_alike),) = names_of_lines.most_common(1)
+    names = list[str]()
+    if 2 * n_alike > len(sample):
+        names = list(labels)
     if names:
         usual_separator = " " if len(names) > 1 else ";"
         bare = list[str]()
         for line in lines:
             numbers = _labelled(line)
-            if tuple(name for name, _, _ in numbers) == labels:
-                line = "".join(value + (separator or usual_separator) for _, value, separator in numbers)
+            names_of_line = tuple(name for name, _, _ in numbers)
+            if names_of_line == labels:
+                line = "".join(f"{value}{separator or usual_separator}" for _, value, separator in numbers)
             # Another line stays as it is: whoever takes the column is told.
             bare.append(line)
         lines = bare
 
-    if arrived:
-        sign = next((sign for sign in ";\t,|" if sign in lines[len(lines) // 2].strip()), " ")
-        lines = [
-            f'"{stamp}"{sign}{line}' if stamp else line for stamp, line in zip(stamps, lines, strict=True)
-        ]
+    # The stamp is set apart by the separator of a line in the middle, in quotes as it may hold that itself.
+    if has_stamps:
+        middle_line = lines[len(lines) // 2].strip()
+        separator = next((sign for sign in ";\t,|" if sign in middle_line), " ")
+        stamped = list[str]()
+        for stamp, line in zip(stamps, lines, strict=True):
+            stamped.append(f'"{stamp}"{separator}{line}' if stamp else line)
+        lines = stamped
         names = ["time", *names]
     return lines, names
 
 
 def _arrival(line: str) -> tuple[str, str]:
-    """The stamp that a serial monitor puts before a line, or empty, and the line without it."""
+    """The text that a serial monitor may have put before a line, or empty, and the line without it."""
     head = _ARRIVED.match(line[:_LONGEST_ARRIVAL])
-    return (head[1] or head[2], line[head.end() :]) if head else ("", line)
+    if head is None:
+        return "", line
+    return head[1] or head[2], line[head.end() :]
 
 
 def _labelled(line: str) -> list[tuple[str, str, str]]:
-    """Name, number and separator of each number in a line that holds nothing else; empty for another line."""
+    """Name, number and separator (or empty) of each number with a name in a line; empty where the line holds
+    anything else."""
     numbers = list[tuple[str, str, str]]()
-    at = len(line) - len(line.lstrip())
-    while at < len(line):
-        found = _LABELLED.match(line, at)
-        if found is None:
+    position = len(line) - len(line.lstrip())
+    while position < len(line):
+        labelled = _LABELLED.match(line, position)
+        if labelled is None:
             return []
-        numbers.append((found[1].rstrip(), found[2], found[3]))
-        at = found.end()
+        name, value, separator = labelled.groups()
+        numbers.append((name.rstrip(), value, separator))
+        position = labelled.end()
     return numbers
 
 
 def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
-    """Whether the last of four rows and more ends too early: with fewer cells than all others, or in a number
-    of fewer digits (behind the decimal sign, where there is one)."""
+    """Whether the last of some rows ends too early, so that the file ends inside of it.
+
+    It has fewer cells than any other row, or its last number has fewer digits than any other of that column
+    (behind the decimal sign, where some have one there). False with fewer than `_FEWEST_ROWS` rows.
+    """
+    if len(rows) < _FEWEST_ROWS:
+        return False
     widths = [len(row) - _empty_at_end(row) for row in rows]
-    if len(rows) < 4 or not widths[-1] or widths[-1] < min(widths[:-1]):
-        return len(rows) > 3
-    cells = [row[widths[-1] - 1].lstrip("+-") for row in rows if len(row) >= widths[-1]]
+    last_width = widths[-1]
+    if last_width == 0 or last_width < min(widths[:-1]):
+        return True
+    cells = [row[last_width - 1].lstrip("+-") for row in rows if len(row) >= last_width]
+    if len(cells) < _FEWEST_ROWS or not all(is_number(cell, decimal) for cell in cells[:-1]):
+        return False
+    if not is_number(cells[-1], decimal):
+        return True
     parts = [cell.partition(decimal) for cell in cells]
-    digits = [len(part[2] if any(part[2] for part in parts) else part[0]) for part in parts]
-    known = len(cells) > 3 and all(is_number(cell, decimal) for cell in cells[:-1])
-    return known and (digits[-1] < min(digits[:-1]) or not is_number(cells[-1], decimal))
+    has_decimals = any(decimals for _, _, decimals in parts)
+    n_digits = [len(decimals if has_decimals else whole) for whole, _, decimals in parts]
+    return n_digits[-1] < min(n_digits[:-1])
 
 
 def _layout(lines: Sequence[str], n_lines: int) -> Layout:
-    """The layout of the separator and the decimal sign that fit best; the first of equals."""
-    rows = {separator: _rows(lines, separator) for separator in dict.fromkeys(kind[0] for kind in _KINDS)}
-    known: dict[str, dict[str, bool]] = {
-        ".": {},
-        ",": {},
-    }  # of cells, by decimal sign: whether they are values
+    """The layout of the separator and the decimal sign that fit best; the first of equals.
+
+    lines: the first ones of the file; n_lines: how many it has. Raises ValueError where none of them makes
+    numbers, or a line has too many cells.
+    """
+    separators = dict.fromkeys(separator for separator, _ in _DIALECTS)
+    rows = {separator: _rows(lines, separator) for separator in separators}
+    # Whether a cell is a value, by decimal sign: each text is looked at once, whatever separates it.
+    value_of_cell: dict[str, dict[str, bool]] = {".": {}, ",": {}}
     fits = [
-        _Fit.of(lines, rows[separator], separator, decimal, known[decimal]) for separator, decimal in _KINDS
+        _Fit.of(lines, rows[separator], separator, decimal, value_of_cell[decimal])
+        for separator, decimal in _DIALECTS
     ]
     best = max(fits, key=lambda fit: fit.score)
-    if not best.share:
+    if not best.value_share:
         if n_lines == 1:
             raise ValueError(": no rows under the header line; expected numbers")
         raise ValueError(": no table of numbers was found; expected a header line and rows of numbers")
@@ -284,21 +437,38 @@ def _layout(lines: Sequence[str], n_lines: int) -> Layout:
 
 @dataclass(frozen=True)
 class _Fit:
-    """How well a separator and a decimal sign fit: first of all there must be as many names as numbers.
+    """One separator with one decimal sign, and how well the first lines of a file fit to them.
 
-    first: of the lines that look like a row; start: of those that begin the table, a row that is followed by
-    another one, with no word where the others hold numbers.
+    Attributes
+    ----------
+    separator, decimal : str
+        What is tried, as in `Layout`.
+    lines : sequence of str
+        The first lines of the file; lines and rows are counted from 0 here.
+    rows : list of list of str
+        The cells of each line between these separators.
+    n_columns : int
+        Cells of a usual row without empty ones at its end, which a separator at the end of each line makes.
+    n_cells : int
+        Cells of a usual row, with those.
+    value_share : float
+        Share of the cells of usual rows that hold a value; 0 where this separator makes no table.
+    first_alike : int
+        First line that looks like a row.
+    first_row : int
+        First line of those that begins the table: it is followed by another row, and has no word where the
+        others hold numbers.
     """
 
     separator: str
     decimal: str
     lines: Sequence[str]
     rows: list[list[str]]
-    least: int = 0
-    most: int = 0
-    share: float = 0.0
-    first: int = 0
-    start: int = 0
+    n_columns: int = 0
+    n_cells: int = 0
+    value_share: float = 0.0
+    first_alike: int = 0
+    first_row: int = 0
 
     @classmethod
     def of(
@@ -307,238 +477,391 @@ class _Fit:
         rows: list[list[str]],
         separator: str,
         decimal: str,
-        known: dict[str, bool],
+        value_of_cell: dict[str, bool],
     ) -> _Fit:
-        """The fit of lines whose cells are `rows`; known: whether a cell is a value, as far as looked at."""
-        none = cls(separator, decimal, lines, rows)
-        live = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
-        widest = max(live, key=lambda k: len(rows[k]), default=0)
+        """The fit of a separator and a decimal sign to the first lines of a file.
+
+        rows: the cells of each line; value_of_cell: whether a text is a value with this decimal sign, as far
+        as looked at, which is added to. Raises ValueError where a line has more than `MOST_COLUMNS` cells.
+        """
+        no_table = cls(separator, decimal, lines, rows)
+        filled_lines = [k for k, row in enumerate(rows) if any(row) and not _is_comment(lines[k])]
+        widest = max(filled_lines, key=lambda k: len(rows[k]), default=0)
         if len(rows[widest]) > MOST_COLUMNS:
             what = f"{len(rows[widest])} cells; expected at most {MOST_COLUMNS} columns, a row per sample"
             raise ValueError(f", line {widest + 1}: {what}")
+
         # Which cells of a line are values; each text is looked at once.
-        for cell in {cell for k in live for cell in rows[k]} - known.keys():
-            known[cell] = bool(cell) and _is_value(cell, decimal)
-        values = {k: [known[cell] for cell in rows[k]] for k in live}
+        texts = {cell for k in filled_lines for cell in rows[k]}
+        for text in texts - value_of_cell.keys():
+            value_of_cell[text] = bool(text) and _is_value(text, decimal)
+        is_value = {k: [value_of_cell[cell] for cell in rows[k]] for k in filled_lines}
 
         # The usual width of a row is that of the last lines that hold values.
-        filled = [k for k in live[-100:] if any(values[k])]
-        if not filled:
-            return none
-        most = Counter(len(rows[k]) for k in filled).most_common(1)[0][0]
-        usual = [k for k in filled if len(rows[k]) == most]
+        last_lines = filled_lines[-_USUAL_LINES:]
+        valued_lines = [k for k in last_lines if any(is_value[k])]
+        if not valued_lines:
+            return no_table
+        ((n_cells, _),) = Counter(len(rows[k]) for k in valued_lines).most_common(1)
+        usual_lines = [k for k in valued_lines if len(rows[k]) == n_cells]
         # A separator at the end of each line makes an empty cell of no column.
-        least = max(len(rows[k]) - _empty_at_end(rows[k]) for k in usual)
-        numbers = [sum(values[k]) for k in usual]
-        typical = sorted(numbers)[len(numbers) // 2]
-        present = [sum(map(bool, column)) for column in zip(*(rows[k] for k in usual), strict=True)]
-        valued = [sum(column) for column in zip(*(values[k] for k in usual), strict=True)]
-        if not typical or (most == 1 and separator != ";"):
-            return none
-        if separator == " " and all("\t" in lines[k].strip() for k in live[-100:]):
-            return none  # blanks are then inside of cells
+        n_columns = max(len(rows[k]) - _empty_at_end(rows[k]) for k in usual_lines)
+        values_of_lines = sorted(sum(is_value[k]) for k in usual_lines)
+        usual_values = values_of_lines[len(values_of_lines) // 2]
+        if usual_values == 0:
+            return no_table
+        # Any file has one cell a line between separators that it does not have: one column is of semicolons.
+        if n_cells == 1 and separator != ";":
+            return no_table
+        # Where tabs are in each line, blanks are inside of cells.
+        if separator == " " and all("\t" in lines[k].strip() for k in last_lines):
+            return no_table
 
         # A row is as wide as the usual one, and holds half as many values at least.
-        looks = {k for k in live if len(rows[k]) == most and 2 * sum(values[k]) >= typical}
-        first = next(k for k in live if k in looks)
-        numeric = [column for column in range(most) if 2 * valued[column] > present[column]]
+        as_wide = [k for k in filled_lines if len(rows[k]) == n_cells]
+        alike = {k for k in as_wide if 2 * sum(is_value[k]) >= usual_values}
+        first_alike = next(k for k in filled_lines if k in alike)
+        # Columns of numbers are those in which more than half of the cells that are filled are values.
+        cells_of_columns = zip(*(rows[k] for k in usual_lines), strict=True)
+        filled_cells = [sum(map(bool, cells)) for cells in cells_of_columns]
+        flags_of_columns = zip(*(is_value[k] for k in usual_lines), strict=True)
+        value_cells = [sum(flags) for flags in flags_of_columns]
+        numeric = [j for j in range(n_cells) if 2 * value_cells[j] > filled_cells[j]]
 
-        def fits(k: int) -> bool:
-            return k in looks and all(values[k][column] or not rows[k][column] for column in numeric)
+        def is_row(k: int) -> bool:
+            """Whether a line looks like a row and has no word in a column of numbers."""
+            return k in alike and all(is_value[k][j] or not rows[k][j] for j in numeric)
 
-        start = first
-        for k, after in zip(live, [*live[1:], live[-1]], strict=True):
-            if fits(k) and fits(after):
-                start = k
+        first_row = first_alike
+        next_lines = [*filled_lines[1:], filled_lines[-1]]
+        for k, next_line in zip(filled_lines, next_lines, strict=True):
+            if is_row(k) and is_row(next_line):
+                first_row = k
                 break
-        return cls(separator, decimal, lines, rows, least, most, sum(numbers) / sum(present), first, start)
+        return cls(
+            separator,
+            decimal,
+            lines,
+            rows,
+            n_columns=n_columns,
+            n_cells=n_cells,
+            value_share=sum(values_of_lines) / sum(filled_cells),
+            first_alike=first_alike,
+            first_row=first_row,
+        )
 
     @property
     def score(self) -> tuple[bool, float, int]:
-        above = self._above(self.start)
+        """How well it fits, larger is better: whether there are as many names as numbers, then the share of
+        values among the cells, then the number of columns."""
+        above = self._above(self.first_row)
         header = self._header()
-        # A line above the rows that is neither names nor 'XInc:,5e-3' belongs to another separator. Comments
-        # are sentences: they need not fit.
-        matches = header is not None or all(
-            self.rows[k][0].endswith(":") or _is_comment(self.lines[k]) for k in above
-        )
-        if header is not None and _is_comment(self.lines[header]):
+        if header is None:
+            # A line above the rows that is neither names nor 'XInc:,5e-3' belongs to another separator.
+            # Comments are sentences: they need not fit.
+            matches = all(self.rows[k][0].endswith(":") or _is_comment(self.lines[k]) for k in above)
+        elif _is_comment(self.lines[header]):
             # Words of a comment are no names where a line of the table stands below them.
             matches = all(k <= header or _is_comment(self.lines[k]) for k in above)
-        return bool(self.share) and matches, self.share, self.least
+        else:
+            matches = True
+        return bool(self.value_share) and matches, self.value_share, self.n_columns
 
     def _above(self, row: int) -> list[int]:
-        """The next three lines above that are not blank, and comments between them that are no rows; of names
-        there may be a faulty row in between."""
-        found, lines = list[int](), 0
+        """Lines above a row in which its names may stand, the nearest first.
+
+        The next `_LINES_ABOVE` that are not blank, and comments between them that are no rows.
+        """
+        above = list[int]()
+        n_lines = 0
         for k in range(row - 1, -1, -1):
             comment = _is_comment(self.lines[k])
             if any(self.rows[k]) and not (comment and self._has_value(k)):
-                found.append(k)
-                lines += not comment
-            if lines == 3:
+                above.append(k)
+                if not comment:
+                    n_lines += 1
+            if n_lines == _LINES_ABOVE:
                 break
-        return found
+        return above
 
     def _has_value(self, row: int) -> bool:
+        """Whether a cell of a line is a number, with or without its unit, or a stamp."""
         return any(_is_value(cell, self.decimal) for cell in self.rows[row])
 
     def _names_at(self, row: int, numbered: bool = False) -> list[str] | None:
-        """The cells of a line, if they can be the names of the columns; numbered: channels 1, 2, ... too.
+        """The cells of a line, if they can be the names of the columns; else None.
 
-        There has to be a cell for each column of numbers: of a comment, too, which may separate its names
-        otherwise than the rows their numbers, as numpy.savetxt(header="t [s], u [V]") does.
+        There has to be a cell for each column of numbers, and most have to be words. numbered: names may be
+        the numbers of channels, too. A comment may separate its names otherwise than the rows their numbers,
+        as numpy.savetxt(header="t [s], u [V]") does.
         """
         cells = self.rows[row]
-        if self.separator == " " and len(cells) > self.most:  # names of several words
+        if self.separator == " " and len(cells) > self.n_cells:
+            # Names of several words are two blanks apart.
             cells = re.split(r"\s{2,}|\t", self._without_sign(row))
-        if _is_comment(self.lines[row]) and not self.least <= len(cells) <= self.most:
-            ways = ([cell.strip() for cell in self._without_sign(row).split(sign)] for sign in ",;\t|")
-            cells = next((way for way in ways if len(way) == self.least), cells)
+        if _is_comment(self.lines[row]) and not self.n_columns <= len(cells) <= self.n_cells:
+            for sign in ",;\t|":
+                parts = [part.strip() for part in self._without_sign(row).split(sign)]
+                if len(parts) == self.n_columns:
+                    cells = parts
+                    break
         cells = cells[: len(cells) - _empty_at_end(cells)]
-        if all(_BEYOND.fullmatch(cell) for cell in cells[self.most :]):
-            cells = cells[: self.most]
-        if _is_key(cells):
+        if all(_BEHIND_NAMES.fullmatch(cell) for cell in cells[self.n_cells :]):
+            cells = cells[: self.n_cells]
+        if _is_statement(cells):
             return None
+
         # A number is no name, whatever its decimal sign.
-        words = sum(bool(cell) and not any(_is_value(cell, sign) for sign in ".,") for cell in cells)
+        n_words = 0
+        for cell in cells:
+            is_numeric = any(_is_value(cell, sign) for sign in ".,")
+            if cell and not is_numeric:
+                n_words += 1
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
-            words = len(cells)
-        return cells if self.least <= len(cells) <= self.most and 2 * words > len(cells) else None
+            n_words = len(cells)
+        if not self.n_columns <= len(cells) <= self.n_cells:
+            return None
+        return cells if 2 * n_words > len(cells) else None
 
     def _without_sign(self, row: int) -> str:
         """A line without the sign of a comment."""
         return _COMMENT.sub("", self.lines[row]).strip()
 
     def _header(self) -> int | None:
-        """The line of the names: the nearest; a comment only where it says time, or no other line will do."""
-        found = [k for k in self._above(self.start) if self._names_at(k) is not None]
-        live = [k for k in found if not _is_comment(self.lines[k])]
-        if not live or not found:
-            return found[0] if found else None
-        for k in found:
-            if k == live[0] or self._has_value(live[0]) or any(map(says_time, self._names_at(k) or [])):
-                return k
-        return live[0]
+        """The line of the names; None where no line above can be it.
+
+        The nearest that is no comment; but a comment nearer to the rows that says time, or any comment where
+        that line holds a value, as a faulty row does.
+        """
+        candidates = [k for k in self._above(self.first_row) if self._names_at(k) is not None]
+        plain_lines = [k for k in candidates if not _is_comment(self.lines[k])]
+        if not candidates:
+            return None
+        if not plain_lines:
+            return candidates[0]
+        nearest = plain_lines[0]
+        if self._has_value(nearest):
+            return candidates[0]
+        for comment in candidates[: candidates.index(nearest)]:
+            if any(map(says_time, self._names_at(comment) or [])):
+                return comment
+        return nearest
 
     def layout(self) -> Layout:
-        above, header = self._above(self.start), self._header()
+        """The layout of the table, with the names, units, and start and step that stand around its first row.
+
+        Raises ValueError where the words above the rows are too few or too many to be names.
+        """
+        header = self._header()
         if header is None:
-            # Words above the rows that are too few or too many; a comment may be any sentence.
-            candidates = (k for k in above if len(self.rows[k]) > 1 and not _is_comment(self.lines[k]))
-            named = next((k for k in candidates if not (_is_key(self.rows[k]) or self._has_value(k))), None)
-            if named is not None and named + 1 < len(self.rows):
-                there, cells = (len(self.rows[k]) - _empty_at_end(self.rows[k]) for k in (named, named + 1))
-                raise ValueError(_ragged(named + 2, cells, named + 1, there, self.separator))
-            numbered = tuple(f"column {k + 1}" for k in range(self.least))
-            stated = any(map(_is_key, self.rows[: self.start]))
-            sampling = self._increment(self.start, [], []) if stated else None
-            first = self.start if stated else self.first
-            return Layout(self.separator, self.decimal, numbered, {}, 0, first + 1, increment=sampling)
-        if channels := self._channels():
-            every = distinct([name for name, _ in channels])
-            own = {name: unit for name, (_, unit) in zip(every, channels, strict=True) if unit}
-            return Layout(self.separator, self.decimal, tuple(every), own, header + 1, self.start + 1)
-        names, units, below = self._names_at(header) or [], list[str](), header + 1
-        over = self._above(header)[:1]
-        longer = self._names_at(over[0], numbered=True) if over else None
-        if longer is not None and self._are_units(names):
-            units, names, header = names, longer, over[0]
-        elif over and len(self.rows[over[0]]) >= len(names) and self._are_units(self.rows[over[0]]):
+            return self._layout_without_names()
+        channels = self._channels()
+        if channels:
+            names = distinct([name for name, _ in channels])
+            units = {name: unit for name, (_, unit) in zip(names, channels, strict=True) if unit}
+            return Layout(
+                self.separator, self.decimal, tuple(names), units, header + 1, first=self.first_row + 1
+            )
+
+        # A line of units stands below the names or above them; what was taken for names may be the units.
+        header_cells = self._names_at(header) or []
+        unit_cells = list[str]()
+        below = header + 1
+        over = next(iter(self._above(header)), None)
+        names_over = None if over is None else self._names_at(over, numbered=True)
+        if over is not None and names_over is not None and self._are_units(header_cells):
+            unit_cells = header_cells
+            header_cells = names_over
+            header = over
+        elif (
+            over is not None
+            and len(self.rows[over]) >= len(header_cells)
+            and self._are_units(self.rows[over])
+        ):
             # Of some loggers they stand above the names; columns without a unit have an empty cell.
-            units = self.rows[over[0]]
-        elif below < self.first and any(self.rows[below]) and self._are_units(self.rows[below]):
+            unit_cells = self.rows[over]
+        elif below < self.first_alike and any(self.rows[below]) and self._are_units(self.rows[below]):
             # Cells at its end are empty: those columns have no unit.
-            units, below = self.rows[below], below + 1
+            unit_cells = self.rows[below]
+            below += 1
         while not any(self.rows[below]) and below + 1 < len(self.rows):
             below += 1
-        columns = distinct([name or f"column {k + 1}" for k, name in enumerate(names)])
-        pairs = zip(columns, units, strict=False)
-        known = {name: unit.strip("[](){} ") for name, unit in pairs if not _is_value(unit, self.decimal)}
-        known = {name: unit for name, unit in known.items() if unit not in ("", "-", "1")}
-        beside = {columns[k]: unit for k, unit in self._units_above(header).items() if k < len(columns)}
-        sampling = self._increment(header, columns, units)
-        separator, decimal = self.separator, self.decimal
+
+        # Units of that line count more than those of lines further above; numbers there are start and step.
+        columns = distinct([name or f"column {k + 1}" for k, name in enumerate(header_cells)])
+        units = dict[str, str]()
+        for k, unit in self._units_above(header).items():
+            if k < len(columns):
+                units[columns[k]] = unit
+        for name, cell in zip(columns, unit_cells, strict=False):
+            unit = cell.strip(_AROUND_UNITS)
+            if unit not in ("", "-", "1") and not _is_value(cell, self.decimal):
+                units[name] = unit
         return Layout(
-            separator, decimal, tuple(columns), beside | known, header + 1, below + 1, increment=sampling
+            self.separator,
+            self.decimal,
+            tuple(columns),
+            units,
+            header + 1,
+            first=below + 1,
+            increment=self._increment(header, columns, unit_cells),
         )
 
+    def _layout_without_names(self) -> Layout:
+        """The layout of a table without a line of names: its columns are numbered.
+
+        Raises ValueError where words stand above the rows that are too few or too many for names.
+        """
+        for k in self._above(self.first_row):
+            cells = self.rows[k]
+            # A comment may be any sentence, and so may a single cell.
+            if len(cells) < 2 or _is_comment(self.lines[k]):
+                continue
+            if _is_statement(cells) or self._has_value(k):
+                continue
+            next_cells = self.rows[k + 1]
+            n_names = len(cells) - _empty_at_end(cells)
+            n_next = len(next_cells) - _empty_at_end(next_cells)
+            raise ValueError(_ragged(k + 2, n_next, k + 1, n_names, self.separator))
+        names = tuple(f"column {k + 1}" for k in range(self.n_columns))
+        first = self.first_alike
+        increment = None
+        # In a preamble of statements, 'Points:,80', a line may look like a row; it may say start and step.
+        if any(map(_is_statement, self.rows[: self.first_row])):
+            first = self.first_row
+            increment = self._increment(self.first_row, [], [])
+        return Layout(self.separator, self.decimal, names, {}, header=0, first=first + 1, increment=increment)
+
     def _channels(self) -> list[tuple[str, str]] | None:
-        """Names and units of the columns where each channel has a time and a value, and lines above say of
-        each what it is: 'Name, drive, Name, hub', as scopes of a PLC do."""
-        above = [row[: self.most] for row in self.rows[: self.start] if len(row) >= self.most]
-        told = {row[0].lower(): row[1::2] for row in above if row[0] and set(row[::2]) == {row[0]}}
-        keys = {
-            found[1]: told[found[0]][0]
-            for key in told
-            if (found := re.fullmatch(r"sampl.*[\[(](\w+)[\])]", key))
-        }
-        unit, every = next(iter(keys.items()), ("", ""))
-        names = told.get("name", [])
-        # In a table of two columns any line is of two cells.
-        if self.most % 2 or not all(names) or not names or (self.most == 2 and not unit):
+        """Names and units of the columns where each channel has a time and a value, as scopes of a PLC write.
+
+        Lines above the rows then state something of each channel: 'Name, drive, Name, hub'. None for another
+        table. The unit of the times is that of a stated step with which the first two stamps agree, else
+        empty.
+        """
+        # A table of an odd number of cells has no pairs.
+        if self.n_cells % 2:
             return None
+        # What is stated of each channel, by the word before it in lower case.
+        stated = dict[str, list[str]]()
+        for row in self.rows[: self.first_row]:
+            cells = row[: self.n_cells]
+            if len(cells) == self.n_cells and cells[0] and set(cells[::2]) == {cells[0]}:
+                stated[cells[0].lower()] = cells[1::2]
+        names = stated.get("name", [])
+        steps = dict[str, str]()
+        for word, values in stated.items():
+            step_word = _STEP_OF_CHANNEL.fullmatch(word)
+            if step_word is not None:
+                steps[step_word[1]] = values[0]
+        time_unit, step_cell = next(iter(steps.items()), ("", ""))
+        # In a table of two columns any line is of two cells.
+        if not names or not all(names) or (self.n_cells == 2 and not time_unit):
+            return None
+
+        # The step may be that of the controller, and stamps be counted otherwise. Without a second row, or
+        # where one of the cells is no number, nothing is said against it.
+        stamp_cells = [row[0] for row in self.rows[self.first_row : self.first_row + 2]]
         with suppress(ValueError):
-            first, second, step = (
-                number(cell, self.decimal)
-                for cell in (self.rows[self.start][0], self.rows[self.start + 1][0], every)
-            )
-            unit = unit if abs(second - first - step) < 0.01 * step else ""
-        units = [text.strip("[](){} ") for text in told.get("unit", [""] * len(names))]
-        return [
-            column for name, own in zip(names, units, strict=True) for column in (("time", unit), (name, own))
-        ]
+            first, second = (number(cell, self.decimal) for cell in stamp_cells)
+            step = number(step_cell, self.decimal)
+            if not abs(second - first - step) < _SAME_STEP * step:
+                time_unit = ""
+        no_units = [""] * len(names)
+        units = [text.strip(_AROUND_UNITS) for text in stated.get("unit", no_units)]
+        columns = list[tuple[str, str]]()
+        for name, unit in zip(names, units, strict=True):
+            columns += [("time", time_unit), (name, unit)]
+        return columns
 
     def _are_units(self, cells: Sequence[str]) -> bool:
         """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""
-        words = [cell for cell in cells if cell and not (cell != "1" and _is_value(cell, self.decimal))]
-        known = [
-            bool(re.fullmatch(r"[\[(].*[\])]|-|1|sequence", cell, re.I)) or is_unit(cell) for cell in words
-        ]
-        return bool(words) and 2 * sum(known) > len(words)
+        n_words = 0
+        n_units = 0
+        for cell in cells:
+            # A '1' is the unit of what has none.
+            is_numeric = cell != "1" and _is_value(cell, self.decimal)
+            if not cell or is_numeric:
+                continue
+            n_words += 1
+            if _UNIT_BY_FORM.fullmatch(cell) or is_unit(cell):
+                n_units += 1
+        return 2 * n_units > n_words
 
     def _units_above(self, header: int) -> dict[int, str]:
-        """Units that lines above the names state with a word before them, by column."""
-        found = dict[int, str]()
+        """Units that lines above the names state behind a word for them, by column (from 0)."""
+        units = dict[int, str]()
         for row in self.rows[:header]:
             if _UNITS_OF_X.match(row[0]) and len(row) > 1:
-                found[0] = "s" if row[1].lower() == "time" else row[1]
+                units[0] = "s" if row[1].lower() == "time" else row[1]
             elif _UNITS_OF_Y.match(row[0]):
-                found |= {k: unit for k, unit in enumerate(row) if k and is_unit(unit)}
-        return found
+                for k, unit in enumerate(row):
+                    if k > 0 and is_unit(unit):
+                        units[k] = unit
+        return units
 
     def _increment(
         self, header: int, names: Sequence[str], units: Sequence[str]
     ) -> tuple[float, float] | None:
-        """Start and step of the rows [s], as oscilloscopes state them beside or above the names."""
-        told = list(zip(names, units, strict=False))
-        told += zip(self.rows[header], self.rows[min(header + 1, len(self.rows) - 1)], strict=False)
-        told += [(name, value) for name, _, value in (cell.partition("=") for cell in names) if value]
-        told += [(row[0], row[1]) for row in self.rows[:header] if len(row) > 1]
-        values = [(name.strip(), value.strip()) for name, value in told if is_number(value, self.decimal)]
+        """Start and step of the rows in seconds, as oscilloscopes state them; None where no step is stated.
 
-        def of(pattern: re.Pattern[str]) -> float | None:
-            return next((number(value, self.decimal) for name, value in values if pattern.match(name)), None)
+        header: line of the names; names: of the columns; units: the cells of the line of units. What is said
+        beside the names counts more than what is said above them. A start that is not stated is 0.
+        """
+        # Words and what may be their numbers, in the order in which they count.
+        pairs = list(zip(names, units, strict=False))
+        row_below = self.rows[min(header + 1, len(self.rows) - 1)]
+        pairs += zip(self.rows[header], row_below, strict=False)
+        for name in names:
+            word, _, value = name.partition("=")
+            if value:
+                pairs.append((word, value))
+        pairs += [(row[0], row[1]) for row in self.rows[:header] if len(row) > 1]
+        numbers = list[tuple[str, str]]()
+        for word, value in pairs:
+            if is_number(value, self.decimal):
+                numbers.append((word.strip(), value.strip()))
 
-        step, start = of(_INCREMENT), of(_START)
-        return (start or 0.0, step) if step is not None and step > 0 else None
+        def first_of(pattern: re.Pattern[str]) -> float | None:
+            """The number behind the first word that the pattern matches."""
+            for word, value in numbers:
+                if pattern.match(word):
+                    return number(value, self.decimal)
+            return None
+
+        step = first_of(_INCREMENT)
+        start = first_of(_START)
+        if step is None or not step > 0:
+            return None
+        return start or 0.0, step
 
 
-def _is_key(cells: Sequence[str]) -> bool:
-    """Whether a line of a preamble states something of a name: 'XInc:,5e-3'."""
-    return bool(cells) and cells[0].endswith(":") and not all(cell.endswith(":") for cell in cells)
+def _is_statement(cells: Sequence[str]) -> bool:
+    """Whether a line of a preamble states something of a word: 'XInc:,5e-3'.
+
+    Where every cell ends with a colon, they may be names.
+    """
+    if not cells or not cells[0].endswith(":"):
+        return False
+    return not all(cell.endswith(":") for cell in cells)
 
 
 def _is_comment(line: str) -> bool:
-    return line.lstrip()[:1] in _SIGNS and _COMMENT.match(line) is not None
+    """Whether a line begins with a sign of a comment."""
+    return line.lstrip()[:1] in _COMMENT_BEGINNINGS and _COMMENT.match(line) is not None
 
 
 def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
-    """The cells of every line, without blanks around them; of comment lines without the sign."""
+    """The cells of every line, without blanks around them; of comment lines without the sign.
+
+    Cells in quotation marks may hold the separator. An empty line is one empty cell. Raises ValueError where
+    a quotation mark is not closed.
+    """
     if separator == " ":
         words = [re.findall(r'"[^"]*"|\S+', _COMMENT.sub("", line)) for line in lines]
         return [[word.strip('"') for word in row] or [""] for row in words]
     plain = [_COMMENT.sub("", line) if _is_comment(line) else line for line in lines]
+    # Without quotation marks, as most tables are, splitting is several times faster than the reader of csv.
     if not any('"' in line for line in plain):
         return [[cell.strip() for cell in line.split(separator)] for line in plain]
     try:
@@ -552,6 +875,7 @@ def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
 
 
 def _empty_at_end(row: Sequence[str]) -> int:
+    """How many cells at the end of a row are empty."""
     return next((k for k, cell in enumerate(reversed(row)) if cell), len(row))
 
 
@@ -560,14 +884,16 @@ def _is_value(cell: str, decimal: str) -> bool:
     return is_number(cell, decimal) or is_stamp(cell) or quantity(cell, decimal) is not None
 
 
-def _ragged(line: int, cells: int, header: int, names: int, separator: str) -> str:
-    there = f"line {header} has {names}" if header else f"{names} are expected"
-    commas = cells > names and separator == ","
-    hint = "; decimal commas? then separate the columns by semicolons" if commas else ""
+def _ragged(line: int, n_cells: int, header: int, n_names: int, separator: str) -> str:
+    """The complaint that a line has more or fewer cells than there are names, beginning with ', line 3:'.
+
+    line: of the row; header: of the names, 0 for none; both from 1.
+    """
+    names = f"line {header} has {n_names}" if header else f"{n_names} are expected"
+    hint = ""
+    if n_cells > n_names and separator == ",":
+        hint = "; decimal commas? then separate the columns by semicolons"
     return (
-        f", line {line}: {cells} cells where {there}; expected one per column, separated by "
-        f"{_WORDS[separator]}, and a decimal point{hint}"
+        f", line {line}: {n_cells} cells where {names}; expected one per column, separated by "
+        f"{_SEPARATOR_WORDS[separator]}, and a decimal point{hint}"
     )
-
-
-_WORDS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars"}

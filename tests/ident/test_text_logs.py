@@ -14,6 +14,7 @@ from ident.data.finding import FindingKind
 from ident.data.record import Record
 from ident.data.record_files import read_table
 from ident.data.roles import roles_of, time_of
+from ident.data.text_tables import read_text
 from ident.data.units import unit_of_time
 
 N, DT_S = 80, 0.005
@@ -336,6 +337,12 @@ def test_instruments(name, tmp_path):
     np.testing.assert_allclose(record.output[:, 0], Y, rtol=1e-6)
     if "Volt" in above and "Infiniium" not in name:
         assert record.input_units == ("V",)
+
+
+def test_a_single_column_named_like_a_step_of_sampling_is_read():
+    layout, columns = read_text("Sampling [ms]\n1\n2\n3\n4\n")
+    assert columns == {"Sampling [ms]": ("1", "2", "3", "4")}
+    assert (layout.header, layout.first) == (1, 2)
 
 
 @pytest.mark.parametrize("share", [1, 3])
