@@ -1,6 +1,9 @@
 """Numbers as people and programs write them in cells of text.
 
-Digits in groups, signs of several kinds, a unit behind the number ('0.005 sec', '30 %').
+A cell may have a decimal point or a decimal comma, digits in groups of three, a minus sign of several kinds,
+and a unit behind the number ('0.005 sec', '30 %'). `is_number` says whether it is a number with a given
+decimal sign, `number` which one; `quantity` and `without_units` take a unit off. Whether '1.500' is one and a
+half or fifteen hundred no cell says by itself: `doubtful_groups` looks at the whole column.
 """
 
 from __future__ import annotations
@@ -10,30 +13,37 @@ from collections.abc import Sequence
 
 from ident.data.units import TIME_UNITS, is_unit
 
-# No alternative can match what another one left over, so that time is linear in the length of a cell. Fortran
-# writes 1.0D-03, always with the sign of the exponent.
+# A plain number, with a point. No alternative can match what another one left over, so that time is linear in
+# the length of a cell. Fortran writes 1.0D-03, always with the sign of the exponent.
 _NUMBER = re.compile(
     r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+|[dD][+-]\d+)?|[+-]?(?:nan|inf|infinity)", re.IGNORECASE
 )
-_FORTRAN = re.compile(r"[dD](?=[+-])")
-# Digits in groups of three, by a comma or a point as others write decimals, or by what is neither.
+_FORTRAN_EXPONENT = re.compile(r"[dD](?=[+-])")
+# Digits in groups of three, by decimal sign: between them stands what others write decimals with, or what is
+# neither.
 _GROUPED_NUMBER = {
     sign: re.compile(
         rf"[+-]?[1-9]\d{{0,2}}([{other}'’ \u00a0\u202f\u2009])\d{{3}}(\1\d{{3}})*({re.escape(sign)}\d*)?"
     )
     for sign, other in ((".", ","), (",", "."))
 }
+# One sign with three digits behind it: a group of thousands, or three decimals.
 _ONE_GROUP = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+# A whole number below a thousand, which is written alike with groups and without.
+_BELOW_THOUSAND = re.compile(r"[+-]?\d{1,3}")
 # Minus as typesetters have it (U+2212), an en dash, small and wide hyphens: before a number, or its exponent.
 _MINUS_SIGNS = "\u2212\u2013\ufe63\uff0d"
 _TYPESET_MINUS = re.compile(rf"(?:(?<![\w)\]])|(?<=\d[eE]))[{_MINUS_SIGNS}](?=[.,]?\d)")
 # A number and its unit, as letters behind it.
 _QUANTITY = re.compile(r"((?=[(+\-.,\d]).*?[\d.)])(\s*)([^\W\d_]{1,12}|[%°])")
-_LONGEST_QUANTITY = 60  # characters; a number of a double has 24
+# Characters of a number with its unit: a number of a double has 24, a unit here 12 at most. Longer cells are
+# text; the expression above takes a square of the length.
+_LONGEST_QUANTITY = 60
 
 
 def with_plain_minus(text: str) -> str:
     """The text with '-' wherever another minus sign stands before a number."""
+    # Most texts have none, which is faster to see.
     if not any(sign in text for sign in _MINUS_SIGNS):
         return text
     return _TYPESET_MINUS.sub("-", text)
@@ -55,10 +65,24 @@ def is_bookkept(cell: str, decimal: str) -> bool:
 
 
 def is_number(cell: str, decimal: str) -> bool:
-    """Whether the cell is a number with this decimal sign; blanks around it do no harm."""
+    """Whether the cell is a number with this decimal sign; blanks around it do no harm.
+
+    Parameters
+    ----------
+    cell : str
+        Any text.
+    decimal : str
+        Point or comma.
+
+    Returns
+    -------
+    bool
+        True, too, for 'nan' and 'inf'; False for an empty cell.
+    """
     text = cell.strip()
     if decimal == ".":
-        if _NUMBER.fullmatch(text):  # nearly all cells
+        # Nearly all cells end here.
+        if _NUMBER.fullmatch(text):
             return True
     elif "." not in text and _NUMBER.fullmatch(text.replace(",", ".")):
         return True
@@ -69,46 +93,77 @@ def is_number(cell: str, decimal: str) -> bool:
 
 
 def number(cell: str, decimal: str) -> float:
-    """The number in a cell for which `is_number` holds; digits in groups of three are one number."""
+    """The number in a cell for which `is_number` holds; digits in groups of three are one number.
+
+    Raises ValueError where the cell is none.
+    """
     text = _with_leading_sign(cell.strip())
     grouped = _GROUPED_NUMBER[decimal].fullmatch(text)
     if grouped:
         text = text.replace(grouped[1], "")
-    return float(_FORTRAN.sub("e", text.replace(",", ".")))
+    with_point = text.replace(",", ".")
+    return float(_FORTRAN_EXPONENT.sub("e", with_point))
 
 
 def quantity(cell: str, decimal: str) -> tuple[str, str] | None:
-    """The number and the unit in a cell like '0.005 sec' or '30 %'; None where it is no such cell.
+    """The number and the unit in a cell like '0.005 sec' or '30 %', as text; None for another cell.
 
+    Parameters
+    ----------
+    cell : str
+        Any text.
+    decimal : str
+        Point or comma.
+
+    Notes
+    -----
     A unit of signals that follows at once ('3V') counts only behind a decimal sign: '3A' may be a name.
     """
     if len(cell) > _LONGEST_QUANTITY:
         return None
     text = cell.strip()
-    if text[:1] == "(" and text[-1:] == ")":  # (2.5 %) is (2.5) %
+    # (2.5 %) is (2.5) %.
+    if text[:1] == "(" and text[-1:] == ")":
         inside = quantity(text[1:-1], decimal)
-        return (f"({inside[0]})", inside[1]) if inside and inside[0][:1].isdigit() else None
-    found = _QUANTITY.fullmatch(text)
-    if found is None or not is_number(found[1], decimal):
+        if inside is None or not inside[0][:1].isdigit():
+            return None
+        return f"({inside[0]})", inside[1]
+    parts = _QUANTITY.fullmatch(text)
+    if parts is None or not is_number(parts[1], decimal):
         return None
-    value, blank, unit = found.groups()
-    apart = bool(blank) or unit in "%°" or decimal in value or unit.lower() in TIME_UNITS
-    return (value, unit) if apart and is_unit(unit) else None
+    value, blank, unit = parts.groups()
+    is_set_apart = bool(blank) or unit in "%°"
+    may_follow_at_once = decimal in value or unit.lower() in TIME_UNITS
+    if (is_set_apart or may_follow_at_once) and is_unit(unit):
+        return value, unit
+    return None
 
 
 def without_units(cells: Sequence[str], decimal: str) -> tuple[tuple[str, ...], str] | None:
-    """The numbers of a column, and their unit, where every cell that is neither empty nor a plain 'nan' is a
-    number with one and the same unit; else None."""
-    first = next((cell for cell in cells if cell), "")
-    begins = quantity(first, decimal)
-    if begins is None:
+    """The numbers of a column as text, and their unit, where every cell has one and the same; else None.
+
+    Parameters
+    ----------
+    cells : sequence of str
+        The column.
+    decimal : str
+        Point or comma.
+
+    Returns
+    -------
+    tuple or None
+        A tuple of as many numbers, and the unit. Cells that are empty or a plain 'nan' stay as they are.
+    """
+    first_filled = next((cell for cell in cells if cell), "")
+    first_quantity = quantity(first_filled, decimal)
+    if first_quantity is None:
         return None
-    unit = begins[1]
+    _, unit = first_quantity
     numbers = list[str]()
     for cell in cells:
-        found = quantity(cell, decimal)
-        if found is not None and found[1] == unit:
-            numbers.append(found[0])
+        cell_quantity = quantity(cell, decimal)
+        if cell_quantity is not None and cell_quantity[1] == unit:
+            numbers.append(cell_quantity[0])
         elif cell.lower() in ("", "nan"):
             numbers.append(cell)
         else:
@@ -139,14 +194,19 @@ def doubtful_groups(cells: Sequence[str], decimal: str, *, proven: bool) -> int 
         Row, from 0. None where the column itself says which ('1,020.5', '1,020,300', '0,125'), or where
         whole numbers of four digits and more stand beside: these would be grouped, too.
     """
-    other = "," if decimal == "." else "."
-    rows = [k for k, cell in enumerate(cells) if other in cell]
+    # The other sign may separate groups, or it is the decimal sign after all.
+    other_sign = "," if decimal == "." else "."
+    rows = [k for k, cell in enumerate(cells) if other_sign in cell]
     if rows:
-        return rows[0] if all(_ONE_GROUP.fullmatch(cells[k]) for k in rows) else None
+        all_may_be_groups = all(_ONE_GROUP.fullmatch(cells[k]) for k in rows)
+        return rows[0] if all_may_be_groups else None
     if proven:
         return None
+
+    # The decimal sign itself may separate groups, where each has three digits behind it.
     rows = [k for k, cell in enumerate(cells) if decimal in cell]
     if not rows or not all(_ONE_GROUP.fullmatch(cells[k]) for k in rows):
         return None
-    whole = [cell for cell in cells if cell and decimal not in cell]
-    return rows[0] if all(re.fullmatch(r"[+-]?\d{1,3}", cell) for cell in whole) else None
+    whole_numbers = [cell for cell in cells if cell and decimal not in cell]
+    all_below_thousand = all(_BELOW_THOUSAND.fullmatch(cell) for cell in whole_numbers)
+    return rows[0] if all_below_thousand else None
