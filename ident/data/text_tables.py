@@ -81,7 +81,7 @@ _UNIT_BY_FORM = re.compile(r"[\[(].*[\])]|-|1|sequence", re.IGNORECASE)
 _AROUND_UNITS = "[](){} "
 # What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
 _ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
-# Characters of a line in which that is looked for: a date and a time with their signs have 40. Chosen above that.
+# Characters of a line in which that is looked for: a date and a time with their signs have 40 at most.
 _LONGEST_ARRIVAL = 120
 # A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'. No part matches
 # what the next one begins with, so that time is linear in the length of a line.
