@@ -1,5 +1,10 @@
-"""Which columns of a table are a frequency response, under the names that analysers and programs give them:
-by a word of the name, and the unit stated. A unit that is not stated is asked for."""
+"""Which columns of a table are a frequency response, under the names that analysers and programs give them.
+
+A column is a frequency, a gain, a phase, a real or an imaginary part by a word of its name, or by its unit
+where no word says it (`response_columns`). `read_response` converts the columns to rad/s and complex numbers;
+where a file has real and imaginary parts beside gain and phase, they have to agree. A unit that is not
+stated, or not known, is asked for: dB and a factor, rad and degrees are never guessed.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +20,20 @@ from ident.data.table import Table
 from ident.data.units import written_unit
 
 Convert = Callable[[RealArray], RealArray]
+"""From the numbers (K,) of a column to those in rad/s, a factor, or rad."""
 
 
 def _times(factor: float) -> Convert:
+    """The conversion that takes numbers times a factor."""
     return lambda values: np.asarray(values * factor, dtype=np.float64)
 
 
+def _from_db(values: RealArray) -> RealArray:
+    """Factors (K,) of gains (K,) in dB: 20 dB are a factor of ten."""
+    return np.asarray(10 ** (values / 20), dtype=np.float64)
+
+
+# Conversions by role and unit in lower case; real and imaginary parts are taken as they are.
 _UNITS: Mapping[str, Mapping[str, Convert]] = {
     "frequency": {
         **dict.fromkeys(("hz", "1/s", "cycles/s"), _times(2 * np.pi)),
@@ -29,7 +42,7 @@ _UNITS: Mapping[str, Mapping[str, Convert]] = {
         **dict.fromkeys(("rpm", "1/min"), _times(2 * np.pi / 60)),
     },
     "gain": {
-        "db": lambda values: np.asarray(10 ** (values / 20), dtype=np.float64),
+        "db": _from_db,
         **dict.fromkeys(("abs", "absolute", "1", "-", "lin", "linear", "ratio", "factor"), _times(1.0)),
     },
     "phase": {
@@ -39,6 +52,8 @@ _UNITS: Mapping[str, Mapping[str, Convert]] = {
     "real": {},
     "imag": {},
 }
+_KNOWN_UNITS = frozenset(unit for units in _UNITS.values() for unit in units)
+# Words of a name, in lower case, by role.
 _SPELLED = {
     "frequency": "frequency freq frequenz fréquence frecuencia f omega ω w hz",
     "gain": "gain mag magnitude amplitude ampl amp betrag modulus verstärkung abs db",
@@ -47,6 +62,9 @@ _SPELLED = {
     "imag": "im imag imaginary imaginaer imaginär imaginärteil",
 }
 _WORDS = {role: frozenset(words.split()) for role, words in _SPELLED.items()}
+# Roles in the order in which a name with words of several is tried: the word of a frequency may be that of
+# what the column is at.
+_ROLES_BY_RANK = ("real", "imag", "phase", "gain", "frequency")
 # Beside such a word a column is about something else: its spread, its sign turned, its slope.
 _SPELLED_OTHER = (
     "variance var std stddev sigma error err coherence coh covariance cov noise margin delay group lag "
@@ -55,15 +73,33 @@ _SPELLED_OTHER = (
 _OTHER = frozenset(_SPELLED_OTHER.split())
 # Units and letters, that count where no other word says what it is.
 _SHORT = frozenset({"hz", "db", "deg", "f", "w", "amp", "re", "im"})
+# Letters of a frequency that may be a force or a power.
+_LETTERS_OF_FREQUENCY = frozenset({"f", "w"})
 # Words of a gain that no signal of a log is called by.
-_CLEARLY = frozenset({"gain", "magnitude", "mag", "betrag", "db", "modulus"})
+_CLEARLY_GAIN = frozenset({"gain", "magnitude", "mag", "betrag", "db", "modulus"})
+# Words of a time: such a table is a log.
+_TIME_WORDS = frozenset({"time", "zeit", "timestamp", "t"})
+# What is asked of a unit, and how to write it.
 _ASKED = {
     "frequency": ("Hz or rad/s", "'Frequency (Hz)' or 'Frequency (rad/s)'"),
     "gain": ("a factor or in dB", "'Gain (abs)' or 'Gain (dB)'"),
     "phase": ("rad or degrees", "'Phase (rad)' or 'Phase (deg)'"),
 }
-# Two columns of one quantity may differ by the digits they are printed with.
+# Where a word begins inside of another: gainDb, frequencyKHz.
+_CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z][A-Za-z])")
+# The magnitude in bars, '|G|', and a unit in the last brackets of a name.
+_IN_BARS = re.compile(r"\s*\|.*\|")
+_LAST_BRACKETS = re.compile(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$")
+# What parts the words of a name.
+_BETWEEN_WORDS = re.compile(r"[\s_./:,;\-\[\]()]+")
+# Words at the end of a name that a unit has at most: 'rad per s'.
+_MOST_UNIT_WORDS = 3
+# Relative difference up to which two columns of one quantity agree: they may differ by the digits they are
+# printed with, and two digits are the fewest.
 _AGREE = 0.02
+# Share of the largest value below which a column is compared with this share instead: of a value near zero
+# the last digit may be all.
+_NEAR_ZERO = 1e-3
 
 
 class DoubtError(ValueError):
@@ -71,39 +107,55 @@ class DoubtError(ValueError):
 
 
 def response_columns(table: Table) -> dict[str, list[str]] | None:
-    """The columns of a frequency response by their role, those of real and imag or of gain and phase first;
-    None where the table is none: it has no frequency, or a time.
+    """The columns of a frequency response by their role; None where the table is none.
 
-    Raises DoubtError: one line that says what is not understood and what to write.
+    Parameters
+    ----------
+    table : Table
+        Named columns with their units.
+
+    Returns
+    -------
+    dict of str to list of str, or None
+        Names by role: 'frequency', and 'real' and 'imag', or 'gain' and 'phase', or all four, real and imag
+        first. A role may have several columns of one quantity. None where there is no frequency, or a time.
+
+    Raises
+    ------
+    DoubtError
+        A part is missing, or there are two of the real or the imaginary part. One line that says what is not
+        understood.
     """
-    found: dict[str, list[str]] = {role: [] for role in _WORDS}
+    names: dict[str, list[str]] = {role: [] for role in _WORDS}
     for name in table.names:
         role = _role(name, _stated(table, name))
         if role is not None:
-            found[role].append(name)
-    rectangular = bool(found["real"] and found["imag"])
-    polar = bool(found["phase"]) or any(_words(name) & _CLEARLY for name in found["gain"])
-    timed = any(_words(name) & {"time", "zeit", "timestamp", "t"} for name in table.names)
-    if not found["frequency"] or not (polar or rectangular) or timed:
+            names[role].append(name)
+
+    # An amplitude beside a frequency may be anything: a word for a gain, a phase, or both parts tell.
+    is_rectangular = bool(names["real"] and names["imag"])
+    is_polar = bool(names["phase"]) or any(_words(name) & _CLEARLY_GAIN for name in names["gain"])
+    has_time = any(_words(name) & _TIME_WORDS for name in table.names)
+    if not names["frequency"] or has_time or not (is_polar or is_rectangular):
         return None
-    wanted = ("real", "imag") if rectangular else ("gain", "phase")
-    lacking = [role for role in wanted if not found[role]]
+    wanted = ["real", "imag"] if is_rectangular else ["gain", "phase"]
+    lacking = [role for role in wanted if not names[role]]
     if lacking:
         listed = shown(", ".join(shown(name, 30) for name in table.names), 120)
         raise DoubtError(
             f"{table.path}: a frequency response without {lacking[0]}: it needs real and imag, or gain and "
             f"phase; found {listed}"
         )
-    if rectangular:
+    if is_rectangular:
         for role in wanted:
-            if len(found[role]) > 1:
+            if len(names[role]) > 1:
                 raise DoubtError(
-                    f"{table.path}: {' and '.join(map(repr, found[role]))} are both {role} parts: keep the "
+                    f"{table.path}: {' and '.join(map(repr, names[role]))} are both {role} parts: keep the "
                     "columns of one response"
                 )
-    both = rectangular and bool(found["gain"] and found["phase"])
-    used = ("frequency", *wanted, *(("gain", "phase") if both else ()))
-    return {role: found[role] for role in used}
+        if names["gain"] and names["phase"]:
+            wanted += ["gain", "phase"]
+    return {role: names[role] for role in ("frequency", *wanted)}
 
 
 def has_response(table: Table) -> bool:
@@ -115,38 +167,80 @@ def has_response(table: Table) -> bool:
 
 
 def read_response(table: Table) -> tuple[RealArray, ComplexArray]:
-    """omega (K,) in rad/s and response (K,) of a table that has to be one. Raises ValueError."""
+    """The frequency response of a table that has to be one.
+
+    Parameters
+    ----------
+    table : Table
+        Named columns with their units.
+
+    Returns
+    -------
+    omega_rad_s : ndarray, shape (K,)
+        In the order of the file.
+    response : ndarray, shape (K,)
+        In the unit of its real part or its gain.
+
+    Raises
+    ------
+    DoubtError
+        A unit is not stated or not known, a part is missing, or columns of one quantity contradict each
+        other by more than `_AGREE`.
+    ValueError
+        The table is no frequency response, or a column holds no finite numbers.
+    """
     columns = response_columns(table)
     if columns is None:
-        found = {_role(name, _stated(table, name)) for name in table.names}
+        roles = {_role(name, _stated(table, name)) for name in table.names}
         need = "one of real, imag and gain, phase_rad"
-        if "frequency" not in found:
+        if "frequency" not in roles:
             need = "exactly one of the columns omega_rad_s, frequency_Hz"
-        elif {"real", "imag"} & found:
-            need += f"; no column {'imag' if 'real' in found else 'real'!r}"
+        elif "real" in roles:
+            need += "; no column 'imag'"
+        elif "imag" in roles:
+            need += "; no column 'real'"
         listed = ", ".join(shown(name, 30) for name in table.names)
         raise ValueError(f"{table.path}, line 1: need {need}; the file has {shown(listed, 120)}")
-    convert = {
-        name: _conversion(table, role, name, columns) for role, names in columns.items() for name in names
-    }
-    given = table.columns(list(convert))
-    values = {name: convert[name](numbers) for name, numbers in given.items()}
-    for one, *others in columns.values():
-        for two in others:
-            scale = np.maximum(np.abs(values[one]), 1e-3 * np.max(np.abs(values[one]), initial=0.0))
-            _refuse_apart(table, np.abs(values[two] - values[one]) > _AGREE * scale, one, two)
-    of = {role: values[names[0]] for role, names in columns.items()}
-    polar: ComplexArray = of["gain"] * np.exp(1j * of["phase"]) if "gain" in of else np.zeros(0, complex)
-    response: ComplexArray = of["real"] + 1j * of["imag"] if "real" in of else polar
-    if "real" in of and polar.size:
-        pairs = [
-            " and ".join(columns[role][0] for role in two) for two in (("real", "imag"), ("gain", "phase"))
-        ]
-        _refuse_apart(table, np.abs(polar - response) > _AGREE * np.abs(response), *pairs)
-    return of["frequency"], response
+
+    # Every column in rad/s, as a factor, or in rad.
+    conversions = dict[str, Convert]()
+    for role, names in columns.items():
+        for name in names:
+            conversions[name] = _conversion(table, role, name, columns)
+    raw_numbers = table.columns(list(conversions))
+    values = {name: conversions[name](numbers) for name, numbers in raw_numbers.items()}
+
+    # Several columns of one role are one quantity in several units.
+    for first_name, *other_names in columns.values():
+        first = values[first_name]
+        for other_name in other_names:
+            smallest_scale = _NEAR_ZERO * np.max(np.abs(first), initial=0.0)
+            scale = np.maximum(np.abs(first), smallest_scale)
+            is_apart = np.abs(values[other_name] - first) > _AGREE * scale
+            _refuse_apart(table, is_apart, first_name, other_name)
+
+    # Real and imaginary parts count where there are both forms, which have to agree.
+    of_role = {role: values[names[0]] for role, names in columns.items()}
+    omega_rad_s = of_role["frequency"]
+    polar: ComplexArray | None = None
+    if "gain" in of_role:
+        polar = of_role["gain"] * np.exp(1j * of_role["phase"])
+        if "real" not in of_role:
+            return omega_rad_s, polar
+    response: ComplexArray = of_role["real"] + 1j * of_role["imag"]
+    if polar is not None and polar.size:
+        is_apart = np.abs(polar - response) > _AGREE * np.abs(response)
+        rectangular_names = f"{columns['real'][0]} and {columns['imag'][0]}"
+        polar_names = f"{columns['gain'][0]} and {columns['phase'][0]}"
+        _refuse_apart(table, is_apart, rectangular_names, polar_names)
+    return omega_rad_s, response
 
 
-def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence[str]]) -> Convert:
+def _conversion(table: Table, role: str, name: str, columns: Mapping[str, Sequence[str]]) -> Convert:
+    """The conversion of a column of a role from its unit; columns: names by role.
+
+    Raises DoubtError where the unit is not stated or not known.
+    """
     units = _UNITS[role]
     if not units:
         return _times(1.0)
@@ -156,70 +250,103 @@ def _conversion(table: Table, role: str, name: str, found: Mapping[str, Sequence
     if role == "frequency" and not unit and _words(name) & {"omega", "ω"}:
         return units["rad/s"]
     # The table of our own documentation: gain beside phase_rad is a factor.
-    if name == "gain" and not unit and "phase_rad" in found.get("phase", ()):
+    if name == "gain" and not unit and "phase_rad" in columns.get("phase", ()):
         return units["abs"]
+    # A gain of one unit per another, as rad/V, is a factor.
     if role == "gain" and re.fullmatch(r"\S+/\S+", unit) and "db" not in unit:
-        return units["abs"]  # of one unit per another, as rad/V
+        return units["abs"]
     what, write = _ASKED[role]
-    raise DoubtError(
-        f"{table.path}: is {shown(name, 60)!r} {what}? "
-        + (f"Unit '{shown(unit, 20)}' is not known. " if unit else "Its name does not say. ")
-        + f"Call the column {write} in the file"
-    )
+    why = f"Unit '{shown(unit, 20)}' is not known. " if unit else "Its name does not say. "
+    raise DoubtError(f"{table.path}: is {shown(name, 60)!r} {what}? {why}Call the column {write} in the file")
 
 
 def _stated(table: Table, name: str) -> str:
-    """The unit as it is written: 'grad' may be a degree or a gradian, and is asked for."""
+    """The unit of a column as it is written, or empty.
+
+    It is not put into another spelling: 'grad' may be a degree or a gradian, and is asked for.
+    """
     return written_unit(name) or table.units.get(name, "")
 
 
 def _role(name: str, unit: str) -> str | None:
-    """What a column is by the words of its name; by its unit where these are none that is known."""
-    words, plain = _words(name), unicodedata.normalize("NFKC", name)
+    """What a column is by the words of its name, a key of `_WORDS`; None where it is none of these.
+
+    unit: as written, which decides between words of several roles. Units in the name count where no other
+    word says what it is.
+    """
+    words = _words(name)
     if words & _OTHER:
         return None
-    if words & {"f", "w"} and (stated := _unit(name, unit)) and stated not in _UNITS["frequency"]:
-        return None  # a force in N, a power in W
-    if re.match(r"\s*\|.*\|", plain):
+    # A force in N, a power in W.
+    if words & _LETTERS_OF_FREQUENCY:
+        unit_of_letter = _unit(name, unit)
+        if unit_of_letter and unit_of_letter not in _UNITS["frequency"]:
+            return None
+    if _IN_BARS.match(unicodedata.normalize("NFKC", name)):
         return "gain"
-    hits = [role for role in ("real", "imag", "phase", "gain", "frequency") if words & _WORDS[role]]
-    hits = [role for role in hits if words & _WORDS[role] - _SHORT] or hits
-    if len(hits) > 1:
-        # 'Trace 1: Gain: Phase (°)': what the unit is of.
-        hits = [role for role in hits if _unit(name, unit) in _UNITS[role]] or hits[:1]
-    return hits[0] if hits else None
+    roles = [role for role in _ROLES_BY_RANK if words & _WORDS[role]]
+    by_long_words = [role for role in roles if words & (_WORDS[role] - _SHORT)]
+    roles = by_long_words or roles
+    if not roles:
+        return None
+    # 'Trace 1: Gain: Phase (°)': what the unit is of.
+    if len(roles) > 1:
+        known_unit = _unit(name, unit)
+        for role in roles:
+            if known_unit in _UNITS[role]:
+                return role
+    return roles[0]
 
 
 def _words(name: str) -> frozenset[str]:
     """Words of a name in lower case, parted at blanks, signs and capitals."""
-    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", unicodedata.normalize("NFKC", name)).lower()
-    return frozenset(re.findall(r"[^\W\d_]+", parted))
+    words = _CAMEL.sub(" ", unicodedata.normalize("NFKC", name)).lower()
+    return frozenset(re.findall(r"[^\W\d_]+", words))
 
 
 def _unit(name: str, stated: str) -> str:
-    """The unit in lower case: what the file states, else in the last brackets, else the last words."""
-    # Of 'Re(G)' and '|G| (dB)' only the latter is a unit.
-    plain = unicodedata.normalize("NFKC", name).strip().lower()
+    """The unit of a column in lower case, or empty.
+
+    What the file states, else what stands in the last brackets of the name, else its last words.
+
+    stated: as written, or empty. A unit that is not known comes back as it is stated; empty where none is,
+    or where it is a single letter in brackets: of 'Re(G)' and '|G| (dB)' only the latter is a unit.
+    """
     text = unicodedata.normalize("NFKC", stated).strip().lower().strip("[]() ")
     text = text.replace(" ", "").replace("·", "")
-    known = {unit for units in _UNITS.values() for unit in units}
-    if text in known or text.replace("_", "/") in known:
-        return text if text in known else text.replace("_", "/")
-    bracket = re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", plain)
-    if bracket and bracket[1].replace(" ", "") in known:
-        return bracket[1].replace(" ", "")
-    parted = re.sub(r"(?<=[a-z])(?=[A-Z][A-Za-z])", " ", unicodedata.normalize("NFKC", name)).lower()
-    words = re.split(r"[\s_./:,;\-\[\]()]+", parted.strip("[]() "))
-    for count in (3, 2, 1):
-        last = "/".join(word for word in words[-count:] if word)
-        if len(words) >= count and last in known and not (last == "abs" and len(words) == 1):
-            return last
-    return "" if bracket and text == bracket[1] and re.fullmatch(r"\w", text) else text
+    if text in _KNOWN_UNITS:
+        return text
+    with_slashes = text.replace("_", "/")
+    if with_slashes in _KNOWN_UNITS:
+        return with_slashes
+
+    # In the last brackets of the name.
+    plain_name = unicodedata.normalize("NFKC", name).strip()
+    bracketed = _LAST_BRACKETS.search(plain_name.lower())
+    if bracketed:
+        in_brackets = bracketed[1].replace(" ", "")
+        if in_brackets in _KNOWN_UNITS:
+            return in_brackets
+
+    # Its last words, the longest unit first. 'abs' alone may be any magnitude.
+    name_in_words = _CAMEL.sub(" ", unicodedata.normalize("NFKC", name)).lower()
+    words = _BETWEEN_WORDS.split(name_in_words.strip("[]() "))
+    for count in range(_MOST_UNIT_WORDS, 0, -1):
+        if len(words) < count:
+            continue
+        last_words = "/".join(word for word in words[-count:] if word)
+        is_abs_alone = last_words == "abs" and len(words) == 1
+        if last_words in _KNOWN_UNITS and not is_abs_alone:
+            return last_words
+    is_argument = bracketed is not None and text == bracketed[1] and re.fullmatch(r"\w", text) is not None
+    return "" if is_argument else text
 
 
-def _refuse_apart(table: Table, apart: BoolArray, one: str, two: str) -> None:
-    if np.any(apart):
+def _refuse_apart(table: Table, is_apart: BoolArray, name: str, other_name: str) -> None:
+    """Raise DoubtError where two columns, or pairs of them, contradict each other; is_apart (K,): by row."""
+    if np.any(is_apart):
+        place = table.place(int(np.argmax(is_apart)))
         raise DoubtError(
-            f"{table.path}, {table.place(int(np.argmax(apart)))}: {shown(one, 60)} and {shown(two, 60)} "
-            "contradict each other: keep the columns of one response"
+            f"{table.path}, {place}: {shown(name, 60)} and {shown(other_name, 60)} contradict each other: "
+            "keep the columns of one response"
         )

@@ -1,10 +1,16 @@
-"""Settings checked by pydantic: every complaint in one line, the fields in the docstring."""
+"""Settings checked by pydantic: every complaint in one line, the fields in the docstring.
+
+`Settings` is the base of every class of options (of `identify`, of a specification, ...). It is frozen,
+refuses what it does not know, and says so in one line of plain words (`first_complaint`), where pydantic
+prints a paragraph with links. The same lines are made of what stands in a configuration file, whose keys are
+named as the user wrote them.
+"""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Any, get_args, get_type_hints
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic_core import ErrorDetails
@@ -14,16 +20,21 @@ if TYPE_CHECKING:
 else:
     ModelMetaclass = type(BaseModel)
 
+# Likeness (difflib's ratio: twice the share of letters in common) from which on a known word is proposed for
+# an unknown one: half, so that a letter too few or exchanged is seen in words of three letters.
+_LEAST_LIKENESS = 0.5
+
 
 class _Fields(ModelMetaclass):
-    """`help` lists what a reader sets, which stands in the docstring, and nothing of pydantic's."""
+    """Metaclass of settings: `help` lists what a reader sets, and nothing of pydantic's."""
 
     def __dir__(self) -> list[str]:
+        """Names of the fields that this class declares."""
         return [name for name in self.__annotations__ if not name.startswith("_")]
 
 
 class Settings(BaseModel, metaclass=_Fields):
-    """Frozen; an unknown key is refused by name."""
+    """Base of options: frozen; an unknown key is refused by name."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,94 +50,157 @@ class Settings(BaseModel, metaclass=_Fields):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        fields = (
-            f"{name}{'' if field.is_required() else f' = {field.get_default(call_default_factory=True)!r}'}: "
-            f"{field.description or ''}"
-            for name, field in cls.model_fields.items()
-        )
-        cls.__doc__ = "\n    ".join([(cls.__doc__ or "").rstrip(), "", "Fields", "------", *fields])
-        plain = get_type_hints(cls)  # without what only pydantic reads
-        own = cls.__signature__
-        cls.__signature__ = own.replace(
-            parameters=[each.replace(annotation=plain[each.name]) for each in own.parameters.values()]
-        )
+        """Write the fields with their defaults into the docstring, and plain types into the signature."""
+        lines = [(cls.__doc__ or "").rstrip(), "", "Fields", "------"]
+        for name, field in cls.model_fields.items():
+            default = ""
+            if not field.is_required():
+                default = f" = {field.get_default(call_default_factory=True)!r}"
+            lines.append(f"{name}{default}: {field.description or ''}")
+        cls.__doc__ = "\n    ".join(lines)
+
+        # Types without what only pydantic reads, as limits.
+        plain_types = get_type_hints(cls)
+        signature = cls.__signature__
+        parameters = [
+            parameter.replace(annotation=plain_types[parameter.name])
+            for parameter in signature.parameters.values()
+        ]
+        cls.__signature__ = signature.replace(parameters=parameters)
 
 
 def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
-    """The gravest complaint in one line: dotted key, what was expected, what came."""
+    """The gravest complaint of a validation in one line: dotted key, what was expected, what came.
+
+    Parameters
+    ----------
+    model : type of BaseModel
+        What was validated.
+    error : ValidationError
+        What pydantic says of it.
+
+    Returns
+    -------
+    str
+        An unknown key before all others; where only keys are missing, all of these.
+    """
     # A misspelt key is also a missing one: the unknown key is what the reader can act on, so it goes first.
-    details = sorted(error.errors(include_url=False), key=lambda item: item["type"] != "extra_forbidden")
-    if len(details) > 1 and all(item["type"] == "missing" for item in details):
-        return "missing keys " + ", ".join(_walk(model, item["loc"])[0] for item in details)
-    return _complaint(model, details[0]) + (f" (and {len(details) - 1} more)" if len(details) > 1 else "")
+    details = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    if len(details) > 1 and all(detail["type"] == "missing" for detail in details):
+        keys = [_walk(model, detail["loc"]).key for detail in details]
+        return "missing keys " + ", ".join(keys)
+    complaint = _complaint(model, details[0])
+    if len(details) > 1:
+        complaint += f" (and {len(details) - 1} more)"
+    return complaint
 
 
 def meant(word: str, known: Sequence[str], what: str) -> str:
-    """What to write in place of a word that nobody knows: the known one that looks like it, else all."""
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.5)
+    """What to write in place of a word that nobody knows: the known one that looks like it, else all.
+
+    Parameters
+    ----------
+    word : str
+        What was written.
+    known : sequence of str
+        What may be written.
+    what : str
+        What these are, in the plural: 'keys'.
+    """
+    close = difflib.get_close_matches(word, known, n=1, cutoff=_LEAST_LIKENESS)
     return f"did you mean {close[0]}?" if close else f"known {what}: {', '.join(known)}"
 
 
 def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
-    kind, message = detail["type"], detail["msg"]
-    key, known = _walk(model, detail["loc"])
+    """One complaint of pydantic about a model in one line; detail: its kind, place, message and input."""
+    kind = detail["type"]
+    key, known_keys = _walk(model, detail["loc"])
+
+    # Keys that are unknown or missing; of a union the key that says which member it is.
     if kind == "extra_forbidden":
-        return f"unknown key {key} ({meant(str(detail['loc'][-1]), sorted(known), 'keys')})"
+        return f"unknown key {key} ({meant(str(detail['loc'][-1]), sorted(known_keys), 'keys')})"
     if kind == "missing":
         return f"missing key {key}"
     if kind == "union_tag_not_found":
-        return f"missing key {key}.{_bare(detail['ctx']['discriminator'])}"
+        return f"missing key {key}.{_without_quotes(detail['ctx']['discriminator'])}"
     if kind == "union_tag_invalid":
         context = detail["ctx"]
-        discriminator = _bare(context["discriminator"])
+        discriminator = _without_quotes(context["discriminator"])
         return f"{key}.{discriminator}: expected one of {context['expected_tags']}, got {context['tag']!r}"
-    message = message.removeprefix("Value error, ")
+
+    # Values: messages of our own as they are, those of pydantic as the end of a sentence, with what came.
+    message = detail["msg"].removeprefix("Value error, ")
     where = f"{key}: " if key else ""
     if kind == "value_error":
         return where + message
     message = message[:1].lower() + message[1:]
     try:
-        given = f"{detail['input']!r:.80}"
+        value = f"{detail['input']!r:.80}"
     except ValueError:  # Python writes no integer of more than 4300 digits
-        given = "a number of too many digits"
-    return f"{where}{message}, got {given}"
+        value = "a number of too many digits"
+    return f"{where}{message}, got {value}"
 
 
-def _bare(text: object) -> str:
+def _without_quotes(text: object) -> str:
+    """A word without the quotes that pydantic puts around it."""
     return str(text).strip("'")
 
 
-def _walk(model: type[BaseModel], location: Iterable[int | str]) -> tuple[str, list[str]]:
-    """Dotted key as the user wrote it, and the keys known where it stands.
+class _Place(NamedTuple):
+    """A place in settings: its dotted key as the user wrote it, and the keys that are known there."""
+
+    key: str
+    known_keys: list[str]
+
+
+def _walk(model: type[BaseModel], location: Iterable[int | str]) -> _Place:
+    """The place in a model that pydantic calls by keys and indices.
 
     pydantic puts the tag of a discriminated union into the location; the user never wrote it, so it is left
     out.
     """
-    parts: list[str] = []
-    here: list[type[BaseModel]] = [model]
-    known = _keys(here)
+    key_parts: list[str] = []
+    # Models that may stand at the place so far: of a union there are several.
+    models: list[type[BaseModel]] = [model]
+    known_keys = _keys(models)
     for step in location:
         if isinstance(step, int):
-            parts.append(f"[{step}]")
+            key_parts.append(f"[{step}]")
             continue
-        kinds = [(candidate, candidate.model_fields.get("kind")) for candidate in here]
-        tagged = [candidate for candidate, kind in kinds if kind and step in get_args(kind.annotation)]
-        if tagged and not any(step in candidate.model_fields for candidate in here):
-            here = tagged
-            known = _keys(here)
+
+        # A tag picks models, where no field is called so.
+        tagged = list[type[BaseModel]]()
+        for candidate in models:
+            kind = candidate.model_fields.get("kind")
+            if kind and step in get_args(kind.annotation):
+                tagged.append(candidate)
+        is_field = any(step in candidate.model_fields for candidate in models)
+        if tagged and not is_field:
+            models = tagged
+            known_keys = _keys(models)
             continue
-        known = _keys(here)
-        parts.append(f".{step}" if parts else step)
-        annotations = [c.model_fields[step].annotation for c in here if step in c.model_fields]
-        here = [found for annotation in annotations for found in _models_in(annotation)]
-    return "".join(parts), known
+
+        # A key leads to the models in the type of its field.
+        known_keys = _keys(models)
+        key_parts.append(f".{step}" if key_parts else step)
+        inner_models = list[type[BaseModel]]()
+        for candidate in models:
+            if step in candidate.model_fields:
+                inner_models += _models_in(candidate.model_fields[step].annotation)
+        models = inner_models
+    return _Place("".join(key_parts), known_keys)
 
 
 def _keys(models: Iterable[type[BaseModel]]) -> list[str]:
+    """Keys of the fields of some models as a user writes them, sorted."""
     return sorted({field.alias or name for model in models for name, field in model.model_fields.items()})
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Models in the type of a field: itself, or those in its union, tuple or list."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [found for part in get_args(annotation) for found in _models_in(part)]
+    models = list[type[BaseModel]]()
+    for part in get_args(annotation):
+        models += _models_in(part)
+    return models

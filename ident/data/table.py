@@ -1,5 +1,11 @@
-"""Named columns of one log file, checked where they are asked for; complaints name file, place,
-expectation."""
+"""Named columns of one log file, checked where they are asked for; complaints name file, place, expectation.
+
+A `Table` is what every reader of files makes: the columns as the file has them, text or arrays, and what is
+known of their lines and units. Nothing is converted before it is asked for, so that a column that nobody
+needs may hold anything. `Table.columns` gives equally long vectors of finite numbers, `Table.stamps` times
+that increase, in seconds; a cell that cannot be taken is quoted with its line. Where nobody can tell what a
+cell means, as of '1.500', the user is asked.
+"""
 
 from __future__ import annotations
 
@@ -23,21 +29,47 @@ from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds
 from ident.data.units import COUNTED, SIGNAL_WORDS, TimeColumn, kind_of, says_counts, size_of, written_unit
 from ident.data.wrapping import timer_period
 
-# Sums of squares of larger samples, and products of those with coefficients, leave the range of doubles.
 LARGEST = 1e100
+"""Largest size of a sample: sums of squares of larger ones, and products of those with coefficients, leave
+the range of doubles (1e308)."""
+# A list in a cell of text, as Python and numpy print it: '[0.1, 0.2]', 'array([0.1, ...'.
 _LIST = re.compile(r"(?:array\()?\[[\s\[]*(?:np\.\w+\()?[-+.\d]")
-# Larger stamps, as those since 1970, lose digits where they are divided by a unit.
+_NUMPY_WORDS = re.compile(r"np\.\w+|array")
+_LIST_ENTRY = re.compile(r"[^][()\s,;]+")
+# Size of a stamp, in any unit, from which on what passed since the first is taken before the stamp is divided
+# by its unit: doubles hold a second since 1970 (above 1e9) to .2 microseconds only. Smaller stamps lose less.
 _LONG_STAMP = 1e9
+# Names that a complaint lists at most, and its characters.
+_MOST_LISTED = 20
+_LONGEST_LIST = 160
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
     """Named columns of one file.
 
-    raw: by name, an array, or text cells (a tuple of str) as `layout` says. A matrix (T, C) is offered as C
-    columns name[0], name[1], ... first_line: file line of row 0, None where rows have no lines (npz, mat).
-    units: by name, where the file states them apart from the names. begin, run: row of the file at which a
-    run of it begins, and what it is called. parsed: columns of text that were read as numbers, by name.
+    Attributes
+    ----------
+    path : Path
+        The file, for complaints.
+    raw : mapping
+        By name an array (T,), or text cells (a tuple of T str) as `layout` says, or `Unread`. A matrix (T, C)
+        is offered as C columns name[0], name[1], ...
+    first_line : int or None
+        Line of the file (from 1) of row 0; None where rows have no lines (npz, mat).
+    layout : Layout or None
+        How a table of text is written.
+    units : mapping of str to str
+        By name, where the file states them apart from the names.
+    clocks : mapping of str to ndarray
+        By name the times (T,) at which values of a column came, increasing, where columns have rows of their
+        own; empty for most files. Of text: the row in the file.
+    begin : int
+        Row of the file at which this run of it begins.
+    run : str
+        What the run is called.
+    parsed : dict
+        Columns of text that were read as numbers, by name: what was asked for before.
     """
 
     path: Path
@@ -51,6 +83,7 @@ class Table:
     parsed: dict[str, RealArray] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        """Take matrices and lists apart. Raises ValueError for more than `MOST_COLUMNS` columns."""
         columns: dict[str, Any] = {}
         for name, values in self.raw.items():
             columns |= _split(name, values)
@@ -60,43 +93,67 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of the columns, in the order of the file."""
         return tuple(self.raw)
 
     def place(self, row: int, name: str | None = None) -> str:
+        """Where a row (from 0) of this run stands in the file: 'line 12', or 'index 11' without lines.
+
+        name: the column, where columns may have rows of their own.
+        """
         if self.first_line is None:
             return f"index {row + self.begin}"
+        # Of a column with rows of its own the clock is the row in the file.
         if name is not None and name in self.clocks:
             row = int(self.clocks[name][row])
-        row += self.begin
-        return f"line {self.layout.line(row) if self.layout else row + self.first_line}"
+        row_of_file = row + self.begin
+        line = self.layout.line(row_of_file) if self.layout else row_of_file + self.first_line
+        return f"line {line}"
 
     def runs(self, time: str | None) -> list[Table]:
-        """The parts of a table in which time starts again where another column changes, and only there: its
-        number or name of the run; else the table alone."""
+        """The runs in a table: its parts, where time starts again and another column says so.
+
+        Parameters
+        ----------
+        time : str or None
+            Column of time.
+
+        Returns
+        -------
+        list of Table
+            The parts between the rows at which time falls, if another column changes there and only there,
+            as the number or name of a run does; each two rows long at least. Else the table alone.
+        """
         if time is None or self.clocks or time not in self.raw:
             return [self]
         try:
-            falls = np.flatnonzero(np.diff(self.columns([time])[time]) < 0) + 1
+            stamps = self.columns([time])[time]
         except ValueError:  # who takes the stamps is told what is wrong with them
             return [self]
-        size = np.shape(self.raw[time]) if falls.size else ()
-        alike = (
-            [name for name, values in self.raw.items() if np.shape(values)[:1] == size] if falls.size else []
-        )
-        columns, ends = {name: np.asarray(self.raw[name]) for name in alike}, [0, *falls.tolist(), *size]
-        changes = {name: np.flatnonzero(values[1:] != values[:-1]) + 1 for name, values in columns.items()}
-        of = next((name for name, rows in changes.items() if np.array_equal(rows, falls)), None)
-        if of is None or min(np.diff(ends)) < 2:
+        starts = np.flatnonzero(np.diff(stamps) < 0) + 1
+        if not starts.size:
             return [self]
-        return [
-            replace(
-                self,
-                raw={**self.raw, **{name: self.raw[name][start:stop] for name in alike}},
-                begin=start,
-                run=f"{of} {columns[of][start]}",
-            )
-            for start, stop in pairwise(ends)
-        ]
+
+        # The first column, of those as long as time, that changes at the same rows.
+        length = np.shape(self.raw[time])
+        alike = [name for name, values in self.raw.items() if np.shape(values)[:1] == length]
+        columns = {name: np.asarray(self.raw[name]) for name in alike}
+        run_name = None
+        for name, values in columns.items():
+            changes = np.flatnonzero(values[1:] != values[:-1]) + 1
+            if np.array_equal(changes, starts):
+                run_name = name
+                break
+        # A run of a single row has no sampling time.
+        bounds = [0, *starts.tolist(), *length]
+        if run_name is None or min(np.diff(bounds)) < 2:
+            return [self]
+        runs = list[Table]()
+        for start, stop in pairwise(bounds):
+            parts = {name: self.raw[name][start:stop] for name in alike}
+            run = f"{run_name} {columns[run_name][start]}"
+            runs.append(replace(self, raw={**self.raw, **parts}, begin=start, run=run))
+        return runs
 
     @property
     def sparse(self) -> bool:
@@ -104,7 +161,10 @@ class Table:
         return bool(self.clocks) and self.layout is not None
 
     def with_decimal(self, sign: str | None) -> Table:
-        """The same text with this decimal sign, then not asked for. Raises ValueError for another."""
+        """The table with its text read with this decimal sign, which is then not asked for; None: as it is.
+
+        sign: 'point', 'comma', or the sign itself. Raises ValueError for another, or where there is no text.
+        """
         if sign is None:
             return self
         sign = {"point": ".", "comma": ","}.get(sign, sign)
@@ -120,59 +180,99 @@ class Table:
         return SIGNAL_WORDS.get(unit.lower(), unit)
 
     def contradiction(self, name: str) -> str:
-        """The two units of a signal whose name says another one than the file does beside it, else empty."""
-        beside, written = self.units.get(name, ""), written_unit(name)
-        both = size_of(beside), size_of(written)
-        return f"{written} and {beside}" if all(both) and both[0] != both[1] else ""
+        """The two units of a signal, 'deg and rad', whose name says another one than the file does beside it.
+
+        Empty where they agree, or one of them is not known.
+        """
+        beside = self.units.get(name, "")
+        written = written_unit(name)
+        size_beside = size_of(beside)
+        size_written = size_of(written)
+        if size_beside is None or size_written is None or size_beside == size_written:
+            return ""
+        return f"{written} and {beside}"
 
     def columns(self, wanted: Sequence[str], rows_of: str | None = None) -> dict[str, RealArray]:
-        """The wanted columns as equally long finite vectors; dates and clock times in seconds. With clocks,
-        on the rows of the first, or of `rows_of`: the others hold what came last, from where all have come.
+        """The wanted columns as equally long vectors of finite numbers, by name.
 
-        Raises ValueError if one is missing (lists those there are), not numeric, not finite or of another
-        length.
+        Parameters
+        ----------
+        wanted : sequence of str
+            Names.
+        rows_of : str, optional
+            Column whose rows count, where columns have rows of their own; else the first wanted one.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (T,)
+            Dates and clock times are in seconds since the first. Where columns have rows of their own, the
+            others hold what came last, from the row on at which all have come.
+
+        Raises
+        ------
+        ValueError
+            A column is missing (the message lists those there are), not numeric, not finite, or of another
+            length.
         """
         for name in wanted:
             if name not in self.raw:
-                there = "several" if self._alike(name) else "no"
-                columns = f"{there} column{'s' if there == 'several' else ''} '{shown(name)}'"
-                raise ValueError(f"{self.path}: {columns}; the file has {self.listed(name)}")
-        found = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
+                count = "several columns" if self._alike(name) else "no column"
+                raise ValueError(f"{self.path}: {count} '{shown(name)}'; the file has {self.listed(name)}")
+        columns = {name: self._numbers(name) for name in dict.fromkeys(wanted)}
+        # Columns with rows of their own: what each of them held at the times of one.
         if self.clocks:
-            base = self.clocks[rows_of or next(iter(found))]
-            rows = base[base >= max(self.clocks[name][0] for name in found)]
-            held = {name: np.searchsorted(self.clocks[name], rows, side="right") - 1 for name in found}
-            found = {name: values[held[name]] for name, values in found.items()}
-        sizes = {name: column.size for name, column in found.items()}
+            base_times = self.clocks[rows_of or next(iter(columns))]
+            all_have_come = max(self.clocks[name][0] for name in columns)
+            times = base_times[base_times >= all_have_come]
+            for name, values in columns.items():
+                last_rows = np.searchsorted(self.clocks[name], times, side="right") - 1
+                columns[name] = values[last_rows]
+        sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(
                 f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}: cut them to the "
                 "samples of one time"
             )
-        return found
+        return columns
 
     def _alike(self, wanted: str) -> list[str]:
-        """Columns of one name, as `distinct` tells them apart."""
-        return [name for name in self.names if wanted and re.fullmatch(rf"#\d+ {re.escape(wanted)}", name)]
+        """Columns of one name, as `distinct` tells them apart: '#1 angle', '#2 angle'."""
+        if not wanted:
+            return []
+        return [name for name in self.names if re.fullmatch(rf"#\d+ {re.escape(wanted)}", name)]
 
     def listed(self, wanted: str = "") -> str:
-        """Names in a line: all, or the columns of a matrix or struct that was asked for by its own name."""
-        parts = [name for name in self.names if wanted and name.startswith((f"{wanted}[", f"{wanted}."))]
-        items = self._alike(wanted) or parts or list(self.names)
-        more = f", ... ({len(items)} in all)" if len(items) > 20 else ""
-        hint = (
-            " (numbers?); expected column names in line 1" if self.layout and not self.layout.header else ""
-        )
-        return shown(f"{', '.join(map(shown, items[:20])) or 'no columns'}{more}", 160) + hint
+        """Names of columns in a line for a complaint: all, or those that are meant by a name.
+
+        wanted: the name of a matrix or struct, whose columns are listed, or one that several columns have.
+        """
+        names = self._alike(wanted)
+        if not names and wanted:
+            names = [name for name in self.names if name.startswith((f"{wanted}[", f"{wanted}."))]
+        if not names:
+            names = list(self.names)
+        listed = ", ".join(map(shown, names[:_MOST_LISTED])) or "no columns"
+        if len(names) > _MOST_LISTED:
+            listed += f", ... ({len(names)} in all)"
+        hint = ""
+        if self.layout and not self.layout.header:
+            hint = " (numbers?); expected column names in line 1"
+        return shown(listed, _LONGEST_LIST) + hint
 
     def is_clock(self, name: str) -> bool:
         """Whether a column holds dates or clock times, which need no unit."""
         values = self.raw[name]
         if isinstance(values, tuple):
-            return is_stamp(next((cell for cell in values if cell), ""))
-        return getattr(values, "dtype", np.dtype(float)).kind in "Mm"
+            first_filled = next((cell for cell in values if cell), "")
+            return is_stamp(first_filled)
+        dtype = getattr(values, "dtype", np.dtype(float))
+        return dtype.kind in "Mm"
 
     def _numbers(self, name: str) -> RealArray:
+        """A column as finite numbers (T,); dates and clock times in seconds since the first.
+
+        Raises ValueError that quotes what cannot be taken.
+        """
         column = self.raw[name]
         if isinstance(column, tuple):
             return self._finite(name, self._parsed(name, column), column)
@@ -180,6 +280,7 @@ class Table:
             values = as_numbers(column)
         except ValueError as error:
             raise ValueError(f"{self.path}: column '{shown(name)}' {error}") from None
+        # What `_split` could not take apart, as an array of three dimensions.
         if values.ndim != 1:
             raise ValueError(
                 f"{self.path}: column '{shown(name)}' has shape {values.shape}; expected a vector"
@@ -188,11 +289,16 @@ class Table:
             if np.isnat(values).any():
                 row = int(np.argmax(np.isnat(values)))
                 raise ValueError(f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is empty")
-            values = (values - values[:1]) / np.timedelta64(1, "ns") / 1e9
+            # The difference first: instants are exact, doubles of them are not.
+            since_first = values - values[:1]
+            values = since_first / np.timedelta64(1, "ns") / 1e9
         return self._finite(name, values.astype(np.float64), values)
 
     def _parsed(self, name: str, cells: tuple[str, ...]) -> RealArray:
-        """Text as numbers; NaN for what is none."""
+        """Numbers (T,) of a column of text, NaN for what is none; stamps in seconds since the first.
+
+        Raises ValueError for a stamp that is none, and where a sign may separate decimals or thousands.
+        """
         if name in self.parsed:
             return self.parsed[name].copy()
         decimal = self.layout.decimal if self.layout else "."
@@ -210,23 +316,25 @@ class Table:
         numbers = None
         if "_" not in text and not (decimal == "," and "." in text):
             with suppress(ValueError):
-                plain = text.replace(",", ".").split("\n") if decimal == "," else cells
-                numbers = np.array(list(map(float, plain)))
+                with_points = text.replace(",", ".").split("\n") if decimal == "," else cells
+                numbers = np.array(list(map(float, with_points)))
         if numbers is None:
-            numbers = np.array(
-                [number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells]
-            )
+            values = [number(cell, decimal) if is_number(cell, decimal) else np.nan for cell in cells]
+            numbers = np.array(values)
         self.parsed[name] = numbers
         return numbers.copy()
 
     def _refuse_doubtful_groups(self, name: str, cells: tuple[str, ...]) -> None:
-        """Raise ValueError where '1.500' in a column may be one and a half, or fifteen hundred."""
+        """Raise ValueError where '1.500' in a column may be one and a half, or fifteen hundred.
+
+        Nothing is refused where the user stated the decimal sign.
+        """
         if self.layout is None or self.layout.stated:
             return
         # Between commas a point is a decimal sign, but in a column of counts, which are whole.
-        counted = says_counts(name) or kind_of(self.unit(name)) in COUNTED - {"%"}
-        proven = self.layout.plain or (self.layout.separator == "," and not counted)
-        row = doubtful_groups(cells, self.layout.decimal, proven=proven)
+        is_counted = says_counts(name) or kind_of(self.unit(name)) in COUNTED - {"%"}
+        is_proven = self.layout.plain or (self.layout.separator == "," and not is_counted)
+        row = doubtful_groups(cells, self.layout.decimal, proven=is_proven)
         if row is not None:
             sign = "," if "," in cells[row] else "."
             raise ValueError(
@@ -236,69 +344,115 @@ class Table:
             )
 
     def _finite(self, name: str, numbers: RealArray, cells: Any) -> RealArray:
-        """The numbers if all are finite; else a complaint that quotes the first that is not."""
-        bad = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
-        if not bad.size:
+        """The numbers (T,) of a column, where all are finite and `LARGEST` at most.
+
+        cells: what they were read from. Raises ValueError that quotes the first that is not, and says what to
+        do.
+        """
+        bad_rows = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
+        if not bad_rows.size:
             return numbers
-        row = int(bad[0])
-        found = str(cells[row])
-        if isinstance(cells, tuple):
-            found = f"'{shown(found, 40)}'" if found else "empty"
-            if row and not any(cells[row:]):
-                raise ValueError(
-                    f"{self.path}: column '{shown(name)}' ends at {self.place(row - 1, name)}, others at "
-                    f"{self.place(len(cells) - 1, name)}; expected equal lengths: cut the rows behind it"
-                )
-        sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
-        remedy = ""
-        if isinstance(cells, tuple) and str(cells[row]).startswith("="):
+        row = int(bad_rows[0])
+        is_text = isinstance(cells, tuple)
+        content = str(cells[row])
+        quoted = content
+        if is_text:
+            quoted = f"'{shown(content, 40)}'" if content else "empty"
+        place = f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {quoted}"
+
+        # Nothing but empty cells from there on: a vector that is shorter than the others.
+        if is_text and row > 0 and not any(cells[row:]):
             raise ValueError(
-                f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}, a formula without "
-                "its value; open the file in Excel or LibreOffice and save it again, or write values"
+                f"{self.path}: column '{shown(name)}' ends at {self.place(row - 1, name)}, others at "
+                f"{self.place(len(cells) - 1, name)}; expected equal lengths: cut the rows behind it"
             )
-        if 2 * bad.size < numbers.size and not np.isfinite(numbers[row]):  # else it is no column of numbers
+        if is_text and content.startswith("="):
+            raise ValueError(
+                f"{place}, a formula without its value; open the file in Excel or LibreOffice and save it "
+                "again, or write values"
+            )
+
+        # A few such rows may be left out; of more it is no column of numbers.
+        is_too_large = bool(np.isfinite(numbers[row]))
+        sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
+        limit = " up to 1e100" if is_too_large else ""
+        remedy = ""
+        if 2 * bad_rows.size < numbers.size and not is_too_large:
             remedy = (
-                f"; delete such rows ({bad.size} here): with a time column, flexlink init fills the gap that "
-                "this leaves, other commands with --repair"
+                f"; delete such rows ({bad_rows.size} here): with a time column, flexlink init fills the gap "
+                "that this leaves, other commands with --repair"
             )
-        raise ValueError(
-            f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is {found}; "
-            f"expected a finite number{sign}{' up to 1e100' if np.isfinite(numbers[row]) else ''}"
-            f"{remedy}"
-        )
+        raise ValueError(f"{place}; expected a finite number{sign}{limit}{remedy}")
 
     def seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
-        """Time stamps in seconds, and what was taken for which. Raises ValueError for an unknown unit."""
+        """Time stamps in seconds, and what was taken for which.
+
+        Parameters
+        ----------
+        name : str
+            Column of time.
+        stamps : ndarray, shape (T,)
+            Its numbers, as of `columns`.
+        unit : str or None
+            Unit that the user states.
+
+        Returns
+        -------
+        seconds : ndarray, shape (T,)
+            Since the first where stamps are long or a timer starts again, which then goes on; else as they
+            are.
+        column : TimeColumn
+            The unit that was taken, whether that is doubtful, and how often a timer starts again.
+
+        Raises
+        ------
+        ValueError
+            The unit is not known, has to be asked for, or makes no time of any clock or machine; a unit is
+            stated of clock times that need none.
+        """
         if self.is_clock(name):
             return self._clock_seconds(name, stamps, unit)
         # A timer that starts again goes on, so that a long log is one.
         period = timer_period(stamps)
-        wraps = int(np.sum(np.diff(stamps) < 0)) if period else 0
+        n_wraps = 0
         if period:
-            stamps = stamps + period * np.concatenate([[0], np.cumsum(np.diff(stamps) < 0)])
+            wraps_before = np.cumsum(np.diff(stamps) < 0)
+            n_wraps = int(wraps_before[-1])
+            stamps = stamps + period * np.concatenate([[0], wraps_before])
         try:
             column = TimeColumn.of(name, unit, self.units.get(name, ""))
             column.refuse_stamps(stamps)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from None
-        doubtful = column.doubtful_for(stamps)
+        is_doubtful = column.doubtful_for(stamps)
         passed = stamps - stamps[0] if period else self._since_first(name, stamps)
-        return column.seconds(passed), replace(column, doubtful=doubtful, wraps_at=period, wraps=wraps)
+        column = replace(column, doubtful=is_doubtful, wraps_at=period, wraps=n_wraps)
+        return column.seconds(passed), column
 
     def _clock_seconds(self, name: str, stamps: RealArray, unit: str | None) -> tuple[RealArray, TimeColumn]:
+        """Clock times (T,) in seconds, with the column they are from.
+
+        stamps: in seconds, where '12:30' was taken for hours and minutes. unit: stated by the user, 'h' or
+        'min' for what stands first in such a stamp. Raises ValueError where it has to be stated, and where
+        another unit is.
+        """
         cells = self.raw[name]
-        doubt = isinstance(cells, tuple) and may_be_minutes(cells)
-        if doubt and unit is None:
+        is_unclear = isinstance(cells, tuple) and may_be_minutes(cells)
+        if is_unclear and unit is None:
             raise ValueError(
                 f"{self.path}: time '{shown(name, 40)}' like '{shown(cells[0], 20)}' may be hours:minutes or "
                 "minutes:seconds; state what comes first: --time-unit h, or --time-unit min"
             )
-        if unit is not None and not (doubt and unit in ("h", "min")):
+        if unit is not None and not (is_unclear and unit in ("h", "min")):
             raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
-        return (stamps / 60 if unit == "min" else stamps), TimeColumn(name, "s", "s", stated=True)
+        seconds = stamps / 60 if unit == "min" else stamps
+        return seconds, TimeColumn(name, "s", "s", stated=True)
 
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
-        """Stamps; of integers and text with more digits than doubles keep what passed since the first."""
+        """Stamps (T,) of a column, in its unit; since the first one where they are long (`_LONG_STAMP`).
+
+        Integers and text with more digits than doubles keep them in the difference.
+        """
         values = self.raw[name]
         if not stamps.size or abs(stamps[0]) < _LONG_STAMP:
             return stamps
@@ -306,59 +460,101 @@ class Table:
             return np.asarray(stamps - stamps[0])
         if isinstance(values, tuple):
             decimal = self.layout.decimal if self.layout else "."
+            # Decimals keep every digit of the text.
             try:
                 exact = [Decimal(cell.replace(decimal, ".")) for cell in values]
                 return np.array([float(value - exact[0]) for value in exact])
             except InvalidOperation:
                 return np.asarray(stamps - stamps[0])
-        if getattr(values, "dtype", np.dtype(float)).kind not in "iu":
+        dtype = getattr(values, "dtype", np.dtype(float))
+        if dtype.kind not in "iu":
             return np.asarray(stamps - stamps[0])
         # The difference of unsigned integers, taken as signed ones, is right whichever is larger.
-        return np.asarray((values - values[0]).astype(np.int64), dtype=np.float64)
+        differences = (values - values[0]).astype(np.int64)
+        return np.asarray(differences, dtype=np.float64)
 
     def stamps(self, name: str, rows_of: str | None, unit: str | None) -> tuple[RealArray, TimeColumn]:
-        """Time stamps [s] that increase, of a column; rows_of: whose rows count where columns have rows of
-        their own. Raises ValueError."""
-        columns = self.columns([name] if rows_of is None else [name, rows_of], rows_of)
-        stamps, column = self.seconds(name, columns[name], unit)
-        self.increasing(stamps, name)
-        return stamps, column
+        """Time stamps of a column in seconds, which increase, and what was taken for which.
+
+        Parameters
+        ----------
+        name : str
+            Column of time.
+        rows_of : str or None
+            Column whose rows count, where columns have rows of their own.
+        unit : str or None
+            Unit that the user states.
+
+        Returns
+        -------
+        seconds : ndarray, shape (T,)
+        column : TimeColumn
+
+        Raises
+        ------
+        ValueError
+            As of `columns`, `seconds` and `increasing`.
+        """
+        wanted = [name] if rows_of is None else [name, rows_of]
+        numbers = self.columns(wanted, rows_of)[name]
+        seconds, column = self.seconds(name, numbers, unit)
+        self.increasing(seconds, name)
+        return seconds, column
 
     def increasing(self, stamps: RealArray, name: str | None) -> None:
-        """Raises ValueError unless there are two time stamps at least, each later than the one before."""
+        """Raise ValueError unless there are two time stamps (T,) at least, each later than the one before.
+
+        stamps: in seconds; name: of their column. The message says what to do: of a repeated row, a single
+        row without a time, or a log that starts again.
+        """
         if stamps.size < 2:
             raise ValueError(
                 f"{self.path}: a single row of numbers; expected at least 2 to find the sampling time"
             )
         backwards = np.flatnonzero(~(np.diff(stamps) > 0))
-        if backwards.size:
-            row = int(backwards[0]) + 1
+        if not backwards.size:
+            return
+        row = int(backwards[0]) + 1
+        # A single stamp that is none: without it, or without the one before, time goes on.
+        is_only = backwards.size == 1
+        has_next = row < stamps.size - 1
+        if stamps[row] == stamps[row - 1]:
+            what = "take the repeated row out"
+        elif is_only and has_next and row > 1 and stamps[row - 2] < stamps[row]:
+            what = "delete the row before, which has no time, and give --repair"
+        elif is_only and has_next and stamps[row - 1] < stamps[row + 1]:
+            what = "delete this row, which has no time, and give --repair"
+        else:
             what = "split the file there, or number its runs in a column"
-            if stamps[row] == stamps[row - 1]:
-                what = "take the repeated row out"
-            elif backwards.size == 1 and 1 < row < stamps.size - 1 and stamps[row - 2] < stamps[row]:
-                what = "delete the row before, which has no time, and give --repair"
-            elif backwards.size == 1 and row < stamps.size - 1 and stamps[row - 1] < stamps[row + 1]:
-                what = "delete this row, which has no time, and give --repair"
-            raise ValueError(
-                f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
-                f"{stamps[row]:.9g} s; expected increasing time ({what})"
-            )
+        raise ValueError(
+            f"{self.path}, {self.place(row)}: time '{name}' goes from {stamps[row - 1]:.9g} to "
+            f"{stamps[row]:.9g} s; expected increasing time ({what})"
+        )
 
 
 def _split(name: str, values: Any) -> dict[str, Any]:
-    """A matrix (T, C), or (C, T) as of Simulink, as C columns; (T, 1), (1, T) as vectors; records by
-    field; lists in cells of text, '[0.1, 0.2]', as `columns_in`."""
+    """The columns, by name, that one named thing of a file is: itself, or several name[0], name[1], ...
+
+    A matrix (T, C), or (C, T) as of Simulink, is C columns; (T, 1) and (1, T) are vectors. An array of
+    records is a column for each field, name.field; lists in cells of text, '[0.1, 0.2]', are as of
+    `columns_in`.
+    """
     if isinstance(values, tuple) and values and _LIST.match(values[0]):
-        plain = (re.sub(r"np\.\w+|array", "", cell) for cell in values)
-        return columns_in(name, [re.findall(r"[^][()\s,;]+", cell) or None for cell in plain])
-    if isinstance(values, np.ndarray) and values.dtype.names and values.ndim == 1:
-        return {f"{name}.{field}": values[field] for field in values.dtype.names}
-    if not isinstance(values, np.ndarray) or values.ndim != 2:
+        lists = list[list[str] | None]()
+        for cell in values:
+            entries = _LIST_ENTRY.findall(_NUMPY_WORDS.sub("", cell))
+            lists.append(entries or None)
+        return columns_in(name, lists)
+    if not isinstance(values, np.ndarray):
+        return {name: values}
+    if values.dtype.names and values.ndim == 1:
+        return {f"{name}.{entry}": values[entry] for entry in values.dtype.names}
+    if values.ndim != 2:
         return {name: values}
     if 1 in values.shape or values.size == 0:
         return {name: values.ravel()}
     if min(values.shape) > MOST_COLUMNS:
         return {name: values}
-    columns = values if values.shape[0] >= values.shape[1] else values.T
-    return {f"{name}[{k}]": column for k, column in enumerate(columns.T)}
+    # There are more samples than signals.
+    matrix = values if values.shape[0] >= values.shape[1] else values.T
+    return {f"{name}[{k}]": column for k, column in enumerate(matrix.T)}

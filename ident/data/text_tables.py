@@ -37,7 +37,7 @@ from ident.data.units import is_unit, says_time
 # text logs moves.
 _SAMPLE_LINES = 400
 # Lines from the end of these that say how wide a row is and which columns hold numbers: there the preamble is
-# over. Doubled, no test of text logs moves.
+# over. Doubled or halved, no test of text logs moves.
 _USUAL_LINES = 100
 # Separators and decimal signs that are tried. Of several that fit alike the first is taken, so plain ones
 # come first; comma and comma are last, as such a table cannot be told from one of integers.
@@ -87,13 +87,13 @@ _LONGEST_ARRIVAL = 120
 # what the next one begins with, so that time is linear in the length of a line.
 _LABELLED = re.compile(r"([^\W\d_][^:=,;\t|]*)[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=,;\t| ]*) *([,;\t|]?)\s*")
 # Lines of words under a table that are left out: units, a count of rows, the name of the recorder. More are
-# no footer, and are complained of.
+# no footer, and are complained of. Doubled, no test moves; with one, two lines of words are refused.
 _MOST_FOOTER_LINES = 3
 # Rows that stand above a footer, or besides one in which the file ends, before either is told from a row:
 # fewer do not say what a row looks like. Chosen.
 _FEWEST_ROWS = 4
 # Lines above the first row in which the names are looked for: names, units, and a faulty row or an empty
-# statement between.
+# statement between. Doubled, no test of text logs moves.
 _LINES_ABOVE = 3
 # Control characters that no text has.
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")

@@ -195,11 +195,11 @@ _FEWEST_LINES = 8
 # factor of 1.1 there. With 1.15 a slow loop in another unit is no longer seen (test_units).
 _FOLLOWS_WITHIN = 1.3
 # Coherence from which on an output follows at all: that of measured and simulated loops is .9 and more there.
-# At 1 only what is computed follows (12 tests of units fail).
+# Halved, no test of units moves; doubled, only what is computed follows.
 _COHERENT = 0.5
 
 # Samples from which on a log with long steps is rather one in milliseconds: a thousand steps of half a second
-# are eight minutes, longer than a machine is excited.
+# are eight minutes, longer than a machine is excited. Doubled or halved, a test of doubted steps fails.
 _MANY_SAMPLES = 1000
 LONG_STEP_S = 0.5
 """Step, s, from which on a log is doubted to be in seconds: machines are logged faster than twice a
