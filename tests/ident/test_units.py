@@ -165,10 +165,10 @@ def test_what_is_stated_decides():
     assert roles_of(three, "a.csv", output="tip_m") == Roles("t_s", "u_V", "tip_m")
     with pytest.raises(ValueError) as caught:
         roles_of(three, "'my log.csv'")
-    assert str(caught.value) == (
-        "a.csv: which is the output, hub_rad or tip_m? It has t_s, u_V, hub_rad, tip_m; type: flexlink "
-        "identify 'my log.csv' --input u_V --output hub_rad --time t_s"
-    )
+    question, _, command = str(caught.value).partition("; type: ")
+    assert question.startswith("a.csv: ")
+    assert "output, hub_rad or tip_m" in question
+    assert command == "flexlink identify 'my log.csv' --input u_V --output hub_rad --time t_s"
 
 
 def test_of_two_columns_without_a_known_name_the_follower_is_the_output():
