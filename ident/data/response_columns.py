@@ -95,10 +95,10 @@ _BETWEEN_WORDS = re.compile(r"[\s_./:,;\-\[\]()]+")
 # Words at the end of a name that a unit has at most: 'rad per s'.
 _MOST_UNIT_WORDS = 3
 # Relative difference up to which two columns of one quantity agree: they may differ by the digits they are
-# printed with, and two digits are the fewest.
+# printed with, and two digits are the fewest. Doubled or halved, no test of responses moves.
 _AGREE = 0.02
 # Share of the largest value below which a column is compared with this share instead: of a value near zero
-# the last digit may be all.
+# the last digit may be all. Doubled or halved, no test of responses moves.
 _NEAR_ZERO = 1e-3
 
 

@@ -81,10 +81,12 @@ _MOVED_KINDS = frozenset(
 # Where a word begins inside of another: posRef, SetAngle.
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 # Letters in which names of a reference and its output differ behind what they share: y and yr, qg and qm, x1
-# and xr. Two columns that are called by whole words are asked about.
+# and xr. Two columns that are called by whole words are asked about. Doubled or halved, no test of units
+# moves.
 _TWIN_LETTERS = 2
 # Columns that are compared with each other at most: the number of pairs grows with their square, and a pair
-# takes up to twelve least-squares fits of the whole log. More are asked about.
+# takes up to twelve least-squares fits of the whole log. More are asked about. Halved, no test of units
+# moves.
 _MOST_TWINS = 12
 # Signs of a rate in a unit, and words for one in a name.
 _RATE = re.compile(r"/s|_s|rpm|u/min|/min|hz", re.I)

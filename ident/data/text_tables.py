@@ -90,10 +90,10 @@ _LABELLED = re.compile(r"([^\W\d_][^:=,;\t|]*)[:=]\s*([+-]?(?:\.?\d|nan|inf)[^:=
 # no footer, and are complained of. Doubled, no test moves; with one, two lines of words are refused.
 _MOST_FOOTER_LINES = 3
 # Rows that stand above a footer, or besides one in which the file ends, before either is told from a row:
-# fewer do not say what a row looks like. Chosen.
+# fewer do not say what a row looks like. Doubled or halved, no test of footers moves.
 _FEWEST_ROWS = 4
 # Lines above the first row in which the names are looked for: names, units, and a faulty row or an empty
-# statement between. Doubled, no test of text logs moves.
+# statement between. Chosen: neither with six nor with one does a test of text logs move.
 _LINES_ABOVE = 3
 # Control characters that no text has.
 _NO_TEXT = re.compile(r"[\x00-\x08\x0e-\x1f]")
