@@ -403,7 +403,7 @@ def _ask(
         output = next((name for name in candidates if name != command), "NAME")
     if pair:
         reference = pair.leading
-    elif not known.get("reference") and output in table.names:
+    elif wished and not known.get("reference") and output in table.names:
         output_quantity = _quantity(table, output)
         of_output = [name for name in wished if _quantity(table, name) == output_quantity]
         reference = next(iter(of_output), reference)

@@ -133,10 +133,9 @@ def quantity(cell: str, decimal: str) -> tuple[str, str] | None:
         return None
     value, blank, unit = parts.groups()
     is_set_apart = bool(blank) or unit in "%°"
-    may_follow_at_once = decimal in value or unit.lower() in TIME_UNITS
-    if (is_set_apart or may_follow_at_once) and is_unit(unit):
-        return value, unit
-    return None
+    if not is_set_apart and decimal not in value and unit.lower() not in TIME_UNITS:
+        return None
+    return (value, unit) if is_unit(unit) else None
 
 
 def without_units(cells: Sequence[str], decimal: str) -> tuple[tuple[str, ...], str] | None:
