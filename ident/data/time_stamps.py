@@ -85,8 +85,9 @@ _ISO_DURATION = re.compile(
 # '01.03.24' of this century, and '10:00:00:250' with a colon before the fraction.
 _YEAR_OF_TWO_DIGITS = re.compile(r"(\d\d?\.\d\d?\.)(\d\d)(?=[\s,]|$)")
 _FRACTION_BEHIND_COLON = re.compile(r"(:\d\d:\d\d):(\d{3,9})")
-# Nanoseconds after which a clock time without a day begins again, and minutes and seconds without an hour.
+# Nanoseconds after which a clock time without a day begins again.
 _DAY_NS = 86_400 * 10**9
+# Nanoseconds after which minutes and seconds without an hour begin again.
 _HOUR_NS = 3600 * 10**9
 # Digits of a fraction of a second, filled up with zeros: nanoseconds.
 _FRACTION_DIGITS = 9

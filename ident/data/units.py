@@ -217,8 +217,9 @@ _DOUBTFUL_S = 10 * _SHORTEST_S
 # Shortest step, s, of stamps whose unit nobody states: what makes less than a second in days is rather that,
 # as Excel and MATLAB (datenum) count.
 _SHORTEST_UNSTATED_S = _LONGEST_WITH_JITTER_S / _SECONDS_PER["d"]
-# Seconds since 1970 of the years 2001 and 2100: stamps in between, in whatever unit, are dates.
+# Seconds from 1970 to 2001: stamps from there up to the year 2100, in whatever unit, are dates.
 _FIRST_DATE_S = 978_307_200.0
+# Seconds from 1970 to 2100.
 _LAST_DATE_S = 4_102_444_800.0
 # Longest time of a clock, s: none counts 3000 years.
 _NO_CLOCK_S = 1e11
