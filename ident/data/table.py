@@ -39,7 +39,7 @@ _LIST_ENTRY = re.compile(r"[^][()\s,;]+")
 # Size of a stamp, in any unit, from which on what passed since the first is taken before the stamp is divided
 # by its unit: doubles hold a second since 1970 (above 1e9) to .2 microseconds only. Smaller stamps lose less.
 _LONG_STAMP = 1e9
-# Names that a complaint lists at most: more than a log of one machine has columns.
+# Names that a complaint lists at most: as many of eight characters as fit into the list below.
 _MOST_LISTED = 20
 # Characters of such a list: with the rest of the complaint it stays below the 300 of any message.
 _LONGEST_LIST = 160
