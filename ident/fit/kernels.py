@@ -1,8 +1,15 @@
-"""Compiled inner loops: the cost of candidate poles and the linearisation of a fit, for one or more inputs.
+"""Compiled inner loops of a fit to records: cost of candidate poles, and linearisation at given poles.
 
-Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1];
-matrices are kept as rows. A function whose products and sums may be fused or reordered is always compiled
-into its callers (forceinline): copies round differently.
+A search asks thousands of times what residual sum of squares some poles leave, and a refinement asks how it
+changes with them (Kaufman, BIT 15, 1975). Both are answered here from inner products of columns and Cholesky
+factors, never from an orthogonal factorisation of the columns, which costs several times as much; where the
+columns are too dependent for products, `linearise` says so and its caller factorises. `cost_of_point` and
+`linearise` are the two ways in; the functions before them are their parts.
+
+Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1], starts
+(K + 1,) beginning with 0; matrices are kept as rows, so that a column of the regression lies in one piece. A
+function whose products and sums may be fused or reordered is always compiled into its callers (forceinline):
+copies round differently.
 """
 
 from __future__ import annotations
@@ -16,9 +23,17 @@ from ident.basis.coordinates import blocks_of_point
 from ident.basis.functions import run_cascade, run_cascade_free
 from ident.data.arrays import COMPILED, INSIDE
 
-# A column whose part outside the columns before it is below this share of its length says nothing.
-_RANK_TOLERANCE = 1e-11
-# Least square of a column's part outside the ones before: the inverse is wrong by 1e-16 over this.
+# Least square of a column's part outside the columns before it, as a share of its own square, that counts in
+# the cost of a candidate. Products are rounded to about 1e-15 of it, so what is above has four digits.
+# Chosen; doubled, halved, 1e-15 or 1e-8, no test moves: it matters where candidates of a search coincide.
+_LEAST_SQUARE_OF_CANDIDATE = 1e-11
+# Least length of a free response outside the rows before it, as a share of its length: one that is a sum of
+# others to that share is left out. Two passes of Gram-Schmidt leave 1e-16. Chosen; 1e-15 or 1e-6, no test
+# moves.
+_LEAST_LENGTH_OF_FREE_ROW = 1e-11
+# Least square of a column's part outside the ones before, as a share of its own, that `linearise` accepts.
+# The inverse of the products is wrong by 1e-16 over this, 1e-8, and one step of refinement squares that to
+# rounding. Doubled or halved, no test moves; at 1e-12 a test of nearly dependent columns fails.
 _LEAST_PIVOT = 1e-8
 # numpy's scalars: of Python's own numba compiles a version of the called function for each value.
 _START: Any = np.int64(0)
@@ -29,9 +44,11 @@ _called = numba.njit(**INSIDE)
 
 @numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
+    """Inner product of a (N,) and b (N,) over the samples lo..hi."""
     # Slices counted from 0: a[k], lo <= k < hi, allows for negative k and is not vectorised (ten times
     # slower).
-    x, y = a[lo:hi], b[lo:hi]
+    x = a[lo:hi]
+    y = b[lo:hi]
     total = 0.0
     for k in range(x.size):
         total += x[k] * y[k]
@@ -40,12 +57,19 @@ def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
 
 @numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> Any:
-    """Products of a with rows j .. j + 3, or `last` in place of what lies beyond it, then those of b: each
-    number read from memory is used more than once."""
-    x, z = a[lo:hi], b[lo:hi]
-    y0, y1 = rows[j, lo:hi], rows[min(j + 1, last), lo:hi]
-    y2, y3 = rows[min(j + 2, last), lo:hi], rows[min(j + 3, last), lo:hi]
-    s0 = s1 = s2 = s3 = t0 = t1 = t2 = t3 = 0.0
+    """Inner products over lo..hi of a (N,) with rows j .. j + 3, and those of b (N,) with them: two tuples.
+
+    Row `last` stands in for rows beyond it, so that the caller need not count. Eight at a time, because each
+    number that is read from memory is then used more than once: that is what the loop waits for.
+    """
+    x = a[lo:hi]
+    z = b[lo:hi]
+    y0 = rows[j, lo:hi]
+    y1 = rows[min(j + 1, last), lo:hi]
+    y2 = rows[min(j + 2, last), lo:hi]
+    y3 = rows[min(j + 3, last), lo:hi]
+    s0 = s1 = s2 = s3 = 0.0
+    t0 = t1 = t2 = t3 = 0.0
     for k in range(x.size):
         s0 += x[k] * y0[k]
         s1 += x[k] * y1[k]
@@ -60,27 +84,34 @@ def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) 
 
 @_called
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
-    """target[i, j] = row i times other row j over lo..hi, from row `first` on; `lower`: for j <= i. Targets
-    are always slices of both axes: one type, one compilation."""
+    """Fill target[i, j] with the inner product over lo..hi of rows[i] and others[j], from row `first` on.
+
+    rows (R, N), others (S, N), target (R, S); with `lower` only j <= i. Targets are always slices of both
+    axes: one type, one compilation.
+    """
     for i in range(first, rows.shape[0], 2):
+        # Two rows at a time; an odd last one is paired with itself.
         second = min(i + 1, rows.shape[0] - 1)
         last = second if lower else others.shape[0] - 1
         for j in range(0, last + 1, 4):
-            ours, theirs = _eight_dots(rows[i], rows[second], others, j, last, lo, hi)
+            of_first, of_second = _eight_dots(rows[i], rows[second], others, j, last, lo, hi)
             for q in range(min(4, last + 1 - j)):
-                target[i, j + q] = ours[q]
-                target[second, j + q] = theirs[q]
+                target[i, j + q] = of_first[q]
+                target[second, j + q] = of_second[q]
 
 
 @_called
 def _subtract(target: Any, factor: float, row: Any, lo: int, hi: int) -> None:
-    x, y = target[lo:hi], row[lo:hi]
+    """Take factor times row (N,) out of target (N,), in place, over the samples lo..hi."""
+    x = target[lo:hi]
+    y = row[lo:hi]
     for k in range(x.size):
         x[k] -= factor * y[k]
 
 
 @_called
 def _copy(target: Any, source: Any) -> None:
+    """Copy source (n,) into the first n numbers of target."""
     # Array assignments would do, but each makes numba compile seconds of broadcasting code.
     for k in range(source.size):
         target[k] = source[k]
@@ -88,7 +119,7 @@ def _copy(target: Any, source: Any) -> None:
 
 @_called
 def _subtract_squares(target: Any, a: Any, first: int) -> None:
-    """target[i, j] -= a[i] a[j]^T, lower triangle from row `first` on."""
+    """Take a a^T out of the lower triangle of target (R, R), from row `first` on; a (R, Q)."""
     for i in range(first, a.shape[0]):
         for j in range(i + 1):
             total = 0.0
@@ -99,7 +130,21 @@ def _subtract_squares(target: Any, a: Any, first: int) -> None:
 
 @_called
 def schur_drop(gram: Any, b: Any) -> float:
-    """b^T gram^-1 b by Cholesky in place; dependent columns are left out."""
+    """Fall b^T gram^-1 b of the residual sum of squares when columns with these products join a fit.
+
+    Parameters
+    ----------
+    gram : ndarray, shape (n, n)
+        Inner products of the new columns, those before taken out: lower triangle. Overwritten.
+    b : ndarray, shape (n,)
+        Inner products of the new columns with the residual. Overwritten.
+
+    Returns
+    -------
+    float
+        At least 0. A column that depends on those before it to within `_LEAST_SQUARE_OF_CANDIDATE` is left
+        out.
+    """
     n = b.size
     drop = 0.0
     for j in range(n):
@@ -107,7 +152,8 @@ def schur_drop(gram: Any, b: Any) -> float:
         pivot = diagonal
         for i in range(j):
             pivot -= gram[j, i] ** 2
-        if not pivot > _RANK_TOLERANCE * diagonal:
+        if not pivot > _LEAST_SQUARE_OF_CANDIDATE * diagonal:
+            # A column of zeros in the factor: those after it do not see this one.
             for i in range(j, n):
                 gram[i, j] = 0.0
             continue
@@ -128,7 +174,11 @@ def schur_drop(gram: Any, b: Any) -> float:
 
 @_called
 def factorise(gram: Any, n: int, least_pivot: float) -> bool:
-    """Cholesky factor into the lower triangle of gram[:n, :n]; False if a pivot is below its least share."""
+    """Whether gram[:n, :n] has a Cholesky factor L L^T, which then stands in its lower triangle.
+
+    False, with the triangle half overwritten, if the square of a column's part outside the ones before is
+    not above `least_pivot` times its own square.
+    """
     for j in range(n):
         diagonal = gram[j, j]
         pivot = diagonal
@@ -147,7 +197,7 @@ def factorise(gram: Any, n: int, least_pivot: float) -> bool:
 
 @_called
 def forward(factor: Any, n: int, b: Any) -> None:
-    """b[:n] = L^-1 b[:n]."""
+    """Replace b[:n] by L^-1 b[:n], L the lower triangle of factor[:n, :n]."""
     for i in range(n):
         for j in range(i):
             b[i] -= factor[i, j] * b[j]
@@ -156,7 +206,7 @@ def forward(factor: Any, n: int, b: Any) -> None:
 
 @_called
 def backward(factor: Any, n: int, b: Any) -> None:
-    """b[:n] = L^-T b[:n]."""
+    """Replace b[:n] by L^-T b[:n], L the lower triangle of factor[:n, :n]."""
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
             b[i] -= factor[j, i] * b[j]
@@ -165,8 +215,22 @@ def backward(factor: Any, n: int, b: Any) -> None:
 
 @numba.njit(**COMPILED)
 def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) -> None:
-    """States of a cascade driven by each of the signals (U, N), record by record from rest, into rows
-    (U B, N); signals become what its all-pass makes of them."""
+    """Fill rows (U B, N) with the states of a cascade driven by each of the signals (U, N).
+
+    Parameters
+    ----------
+    blocks : ndarray, shape (R + P, 4)
+        Cascade of R = n_real real poles and P pairs, as `ident.basis.functions.block_parameters` makes them;
+        B = R + 2 P.
+    n_real : int
+        How many of the blocks are real poles; they come first.
+    signals : ndarray, shape (U, N)
+        Each record starts from rest. Overwritten by what the all-pass of the cascade makes of them.
+    starts : ndarray of int, shape (K + 1,)
+        Where the records begin, and N.
+    rows : ndarray, shape (U B, N) or more
+        Filled: states of the first signal, then of the second.
+    """
     order = 2 * blocks.shape[0] - n_real
     for i in range(signals.shape[0]):
         for r in range(starts.size - 1):
@@ -175,8 +239,9 @@ def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) 
 
 @numba.njit(**COMPILED, inline="always")
 def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
-    """Free responses of a cascade over the longest record (B, T)."""
-    longest = starts[0]  # 0; of Python's own numba would compile `run_cascade_free` once more
+    """Free responses (B, T) of a cascade over the longest record, T samples; shorter ones use their start."""
+    # starts[0] is 0; Python's own 0 would make numba compile `run_cascade_free` once more.
+    longest = starts[0]
     for r in range(starts.size - 1):
         longest = max(longest, starts[r + 1] - starts[r])
     rows = np.empty((2 * blocks.shape[0] - n_real, longest))
@@ -197,23 +262,51 @@ def cost_of_point(
     local_q: Any,
     free: bool,
 ) -> float:
-    """Residual sum of squares when the blocks of a point (D,) of the unit cube (box low, high) join what is
-    fitted.
+    """Residual sum of squares when the blocks of a point of the unit cube join what is fitted.
 
-    drive (U, N): signals that drive the candidate blocks; frozen (Q + 1, N): columns common to all records
-    made orthonormal, then the residual; local_q (L, N): columns of single records made orthonormal in each.
-    free: the candidate poles get their free responses per record, too. J = |r|^2 - b^T G^-1 b with products G
-    of what the new columns add, b those with r: good to about 1e-10 of |r|^2.
+    Parameters
+    ----------
+    unit : ndarray, shape (D,)
+        Point of the search: D = R + 2 P numbers from 0 to 1.
+    n_real, low, high, raw
+        Search space: number R of real poles, ends (3,) of its box, whether its coordinates are the paper's.
+    drive : ndarray, shape (U, N)
+        Signals that drive the candidate blocks: each input behind the all-pass of the frozen poles.
+    frozen : ndarray, shape (Q + 1, N)
+        Columns common to all records made orthonormal, then the residual that they leave.
+    starts : ndarray of int, shape (K + 1,)
+        Where the records begin, and N.
+    local_q : ndarray, shape (L, N)
+        Columns of single records (polynomials, free responses), orthonormal in each.
+    free : bool
+        The candidate poles get their free responses in each record, too.
+
+    Returns
+    -------
+    float
+        Square of the unit of the output.
+
+    Notes
+    -----
+    J = |r|^2 - b^T G^-1 b with products G of what the new columns add, b those with r: good to about 1e-10 of
+    |r|^2. What a column adds has products x^T y - (Q x)^T (Q y), Q the orthonormal rows before it, so that
+    no column need be projected.
     """
     blocks = blocks_of_point(unit, n_real, low, high, raw)
-    n_records, n_inputs, n_total = starts.size - 1, drive.shape[0], drive.shape[1]
-    order, n_frozen = 2 * blocks.shape[0] - n_real, frozen.shape[0] - 1
+    n_records = starts.size - 1
+    n_inputs = drive.shape[0]
+    n_total = drive.shape[1]
+    order = 2 * blocks.shape[0] - n_real
+    n_frozen = frozen.shape[0] - 1
     # Free responses first: that of record r and state i is row r * order + i.
     first = order * n_records if free else 0
     m = first + n_inputs * order
+
+    # Driven columns: products among them, and with the frozen columns and the residual.
     phi = np.empty((n_inputs * order, n_total))
     driven_rows(blocks, n_real, drive.copy(), starts, phi)
-    gram, on_frozen = np.zeros((m, m)), np.empty((m, n_frozen + 1))
+    gram = np.zeros((m, m))
+    on_frozen = np.empty((m, n_frozen + 1))
     _products(phi, phi, _START, n_total, _LOWER, _START, gram[first:, first:])
     _products(phi, frozen, _START, n_total, _ALL, _START, on_frozen[first:, :])
     on_local = np.empty((phi.shape[0], local_q.shape[0]))
@@ -221,11 +314,15 @@ def cost_of_point(
         response = _free_rows(blocks, n_real, starts)
         placed = np.empty((order, n_total))
         free_on_local = np.empty((order, local_q.shape[0]))
+
+    # Columns of single records: take out the local part, record by record.
     for r in range(n_records):
-        lo, hi = starts[r], starts[r + 1]
+        lo = starts[r]
+        hi = starts[r + 1]
         _products(phi, local_q, lo, hi, _ALL, _START, on_local[:, :])
         _subtract_squares(gram[first:, first:], on_local[:, :], _START)
         if free:
+            # Free responses of this record are zero in all others: their products are a block of their own.
             at = r * order
             for i in range(order):
                 _copy(placed[i, lo:hi], response[i, : hi - lo])
@@ -238,30 +335,39 @@ def cost_of_point(
                 for j in range(order):
                     for q in range(local_q.shape[0]):
                         gram[first + i, at + j] -= on_local[i, q] * free_on_local[j, q]
+
+    # What is left of all products without the frozen columns, and what the new columns so explain.
     _subtract_squares(gram[:, :], on_frozen[:, :n_frozen], _START)
+    on_residual = on_frozen[:, n_frozen].copy()
     residual = frozen[n_frozen]
-    return float(_dot(residual, residual, _START, n_total) - schur_drop(gram, on_frozen[:, n_frozen].copy()))
+    return float(_dot(residual, residual, _START, n_total) - schur_drop(gram, on_residual))
 
 
 @numba.njit(**COMPILED, inline="always")
 def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> Any:
-    """Polynomials and free responses (L, N), orthonormal in each record (modified Gram-Schmidt, twice)."""
+    """Polynomials and free responses (Q + B, N), orthonormal in each record.
+
+    polynomials_q (Q, N) are orthonormal already. Modified Gram-Schmidt, twice, which is as exact as a
+    factorisation. A free response that depends on the rows before it becomes zero.
+    """
     n_known = polynomials_q.shape[0]
     response = _free_rows(blocks, n_real, starts)
     rows = np.zeros((n_known + response.shape[0], polynomials_q.shape[1]))
     for i in range(n_known):
         _copy(rows[i], polynomials_q[i])
     for r in range(starts.size - 1):
-        lo, hi = starts[r], starts[r + 1]
+        lo = starts[r]
+        hi = starts[r + 1]
         for i in range(n_known, rows.shape[0]):
             part = rows[i, lo:hi]
             _copy(part, response[i - n_known, : hi - lo])
-            before = _dot(part, part, _START, part.size)
+            square_before = _dot(part, part, _START, part.size)
             for _ in range(2):
                 for j in range(i):
                     _subtract(rows[i], _dot(rows[j], rows[i], lo, hi), rows[j], lo, hi)
-            size = _dot(part, part, _START, part.size)
-            factor = 1 / np.sqrt(size) if size > _RANK_TOLERANCE**2 * before else 0.0
+            square = _dot(part, part, _START, part.size)
+            is_independent = square > _LEAST_LENGTH_OF_FREE_ROW**2 * square_before
+            factor = 1 / np.sqrt(square) if is_independent else 0.0
             for k in range(part.size):
                 part[k] *= factor
     return rows
@@ -269,20 +375,26 @@ def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> An
 
 @_called
 def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
+    """Take the local columns local_q (L, N), orthonormal in each record, out of target (N,), in place."""
     for r in range(starts.size - 1):
-        lo, hi = starts[r], starts[r + 1]
+        lo = starts[r]
+        hi = starts[r + 1]
         for i in range(local_q.shape[0]):
             _subtract(target, _dot(local_q[i], target, lo, hi), local_q[i], lo, hi)
 
 
 @_called
 def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
-    """Products of rows first .. with all rows before them, local columns taken out of both."""
+    """Fill gram (R, R) with products of rows `first` .. with all rows before them, local columns taken out.
+
+    rows (R, N); local_q (L, N). on_local (R, L K) receives the products with local_q, record after record;
+    its first `first` rows are read, from an earlier call.
+    """
     n_local = local_q.shape[0]
     _products(rows, rows, _START, rows.shape[1], _LOWER, first, gram[:, :])
     for r in range(starts.size - 1):
-        here = on_local[:, r * n_local : (r + 1) * n_local]
-        _products(rows, local_q, starts[r], starts[r + 1], _ALL, first, here)
+        of_record = on_local[:, r * n_local : (r + 1) * n_local]
+        _products(rows, local_q, starts[r], starts[r + 1], _ALL, first, of_record)
     _subtract_squares(gram[:, :], on_local[: rows.shape[0], :], first)
 
 
@@ -300,12 +412,38 @@ def linearise(
     normal: Any,
     gradient: Any,
 ) -> float:
-    """Residual sum of squares J of the fit with all blocks, and its Kaufman linearisation; or -1 if the
-    columns are too dependent for products.
+    """Residual sum of squares J of the fit with all blocks, and its Kaufman linearisation.
 
-    u (U, N); y (N,) without its part in polynomials_q (Q, N), orthonormal in each record. If J < below, fills
-    normal (B, B) = S^T S and gradient (B,) = S^T r, S the states of each block driven by the fitted output,
-    projected off the regression. With the columns Phi as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y,
+    Parameters
+    ----------
+    blocks : ndarray, shape (R + P, 4)
+        Cascade of R = n_real real poles and P pairs; B = R + 2 P.
+    n_real : int
+        How many of the blocks are real poles; they come first.
+    u : ndarray, shape (U, N)
+        Inputs.
+    y : ndarray, shape (N,)
+        Output without its part in polynomials_q.
+    starts : ndarray of int, shape (K + 1,)
+        Where the records begin, and N.
+    polynomials_q : ndarray, shape (Q, N)
+        Polynomial columns, orthonormal in each record.
+    feedthrough, free : bool
+        The fit has a direct term for each input; free responses of all poles in each record.
+    below : float
+        Only where J is below this, normal and gradient are filled.
+    normal, gradient : ndarray, shapes (B, B) and (B,)
+        Filled with S^T S and S^T r: S (N, B) the states of each block driven by the fitted output, projected
+        off the regression; r (N,) the residual.
+
+    Returns
+    -------
+    float
+        J, square of the unit of the output; -1 if the columns are too dependent for products.
+
+    Notes
+    -----
+    With the columns Phi as rows, G = Phi Phi^T and e = y - Phi^T G^-1 Phi y,
     r^T r = e^T e - (Phi e)^T G^-1 (Phi e), and
 
         S P S^T = S S^T - (S Phi^T) G^-1 (Phi S^T),   S r = S e - (S Phi^T) G^-1 (Phi e).
@@ -313,8 +451,12 @@ def linearise(
     The terms in Phi e, zero but for rounding, are a step of iterative refinement: with the condition of G
     bounded (`_LEAST_PIVOT`) they bring the precision of an orthogonal factorisation.
     """
-    n, n_inputs, n_total = normal.shape[0], u.shape[0], y.size
+    n = normal.shape[0]
+    n_inputs = u.shape[0]
+    n_total = y.size
     n_columns = n_inputs * (n + (1 if feedthrough else 0))
+
+    # Rows: the columns of the regression, and room below for the directions S of its change.
     rows = np.empty((n_columns + n, n_total))
     local_q = _local_rows(blocks, n_real, polynomials_q, starts) if free else polynomials_q
     output = y.copy()
@@ -324,11 +466,15 @@ def linearise(
     if feedthrough:
         for i in range(n_inputs):
             _copy(rows[n_inputs * n + i], u[i])
+
+    # Cholesky factor of their products, in the first rows of gram.
     gram = np.empty((rows.shape[0], rows.shape[0]))
     on_local = np.empty((rows.shape[0], local_q.shape[0] * (starts.size - 1)))
     _off_local_products(rows[:n_columns], _START, local_q, starts, on_local, gram)
     if not factorise(gram, n_columns, _LEAST_PIVOT):
         return -1.0
+
+    # Coefficients theta, and what they leave of the output: e of the text.
     theta = np.empty(n_columns)
     for i in range(n_columns):
         theta[i] = _dot(rows[i], output, _START, n_total)
@@ -345,6 +491,8 @@ def linearise(
         # Free responses are part of the output that the poles make; a polynomial part stays in their span.
         for k in range(n_total):
             fitted[0, k] = y[k] - residual[k]
+
+    # L^-1 Phi e, and J with its step of refinement.
     on_residual = np.empty(rows.shape[0])
     for i in range(n_columns):
         on_residual[i] = _dot(rows[i], residual, _START, n_total)
@@ -354,12 +502,17 @@ def linearise(
         rss -= on_residual[q] ** 2
     if not rss < below:
         return float(rss)
+
+    # Directions S: each block by itself, driven by the fitted output.
     signal = np.empty((1, n_total))
     at = n_columns
     for i in range(blocks.shape[0]):
+        is_real = i < n_real
         _copy(signal[0], fitted[0])
-        driven_rows(blocks[i : i + 1], 1 if i < n_real else 0, signal, starts, rows[at:])
-        at += 1 if i < n_real else 2
+        driven_rows(blocks[i : i + 1], 1 if is_real else 0, signal, starts, rows[at:])
+        at += 1 if is_real else 2
+
+    # Their products among each other and with the residual, the regression taken out of both.
     _off_local_products(rows, n_columns, local_q, starts, on_local, gram)
     for i in range(n):
         row = gram[n_columns + i]
@@ -368,9 +521,9 @@ def linearise(
         for q in range(n_columns):
             gradient[i] -= row[q] * on_residual[q]
         for j in range(i + 1):
-            left = row[n_columns + j]
+            product = row[n_columns + j]
             for q in range(n_columns):
-                left -= row[q] * gram[n_columns + j, q]
-            normal[i, j] = left
-            normal[j, i] = left
+                product -= row[q] * gram[n_columns + j, q]
+            normal[i, j] = product
+            normal[j, i] = product
     return float(rss)
