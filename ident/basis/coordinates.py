@@ -1,9 +1,10 @@
 """Where the pole search looks: boxes from the data, and maps from the unit cube to poles.
 
-Coordinates "log": log10(1 - a) for a real pole, (log10 omega, log10 zeta) for a pair. Coordinates "raw":
-the paper's own x, and (beta, gamma) of (29). Poles of equal type are ordered by the triangular map s2 = s1
-+ (hi - s1) x2 on their first coordinate: two equal real poles are a saddle that DIRECT would sample and a
-descent cannot leave.
+DIRECT samples a unit cube; `SearchSpace` says which poles a point of it stands for, and `search_space` makes
+the box from the length of the records. Coordinates "log": log10(1 - a) for a real pole, (log10 omega, log10
+zeta) for a pair, omega in rad/sample. Coordinates "raw": the paper's own x, and (beta, gamma) of (29) (Ziaei
+and Wang, 2006). Poles of equal type are ordered by the triangular map s2 = s1 + (hi - s1) x2 on their first
+coordinate: two equal real poles are a saddle that DIRECT would sample and a descent cannot leave.
 """
 
 from __future__ import annotations
@@ -18,20 +19,57 @@ from numba.extending import register_jitable
 
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.data.arrays import COMPILED, RealArray, kernel_array, lock
+from ident.data.arrays import COMPILED, ComplexArray, RealArray, kernel_array, lock
 
-# A pair this close to critical damping is two real poles in disguise; its two columns become dependent.
+# Largest damping ratio of a pair: closer to critical damping it is two real poles in disguise, and its two
+# columns become dependent. Chosen.
 ZETA_LIMIT = 0.98
-# Links have more; an undamped pair with a free initial state fits any slow disturbance.
+# Least damping ratio of a pair: links have more, and an undamped pair with a free initial state fits any slow
+# disturbance (docs/decisions.md). A user who knows a lighter mode states `zeta_min`.
 ZETA_LEAST = 1e-3
+# Shortest record whose length shapes the box, samples: of fewer, the box would be empty or nearly so.
+_SHORTEST = 30
+# Slowest real pole of the box: it decays by this share of its value over the longest record. Slower ones look
+# like an offset there; a refinement may go on to a thousandth (`ident.fit.refinement.Bounds`).
+_LEAST_DECAY_PER_RECORD = 0.2
+# Fastest real pole of the box, as 1 - a: down to .3 of its value within a sample. A refinement may go on.
+_LARGEST_DISTANCE = 0.7
+# Lowest frequency of the box, periods within the longest record: with fewer a pair looks like a drift.
+_LEAST_PERIODS = 2
+# Highest frequency of the box, as a share of the Nyquist frequency: a mode there is hard to tell from one
+# that is folded back. A stated bound may go up to the second number.
+_HIGHEST_SHARE = 0.9
+_HIGHEST_STATED_SHARE = 0.99
+# Largest damping ratio of the box; a refinement may go on to ZETA_LIMIT. Chosen: more rings no more.
+_LARGEST_ZETA = 0.63
+# Damping ratio to which a pair of the raw box is moved that is real, or complex with more than this.
+_MOVED_ZETA = 0.95
+# Least damping ratio and highest frequency (over pi) of a pair that is moved: it has to be a pole of `Poles`.
+_LEAST_MOVED_ZETA = 1e-6
+_HIGHEST_MOVED_SHARE = 0.9
+# Modulus in place of a pole at z = 0, which has no logarithm. Any small one: its frequency, 6.9 rad/sample,
+# is above the limit and is cut.
+_DEADBEAT_MODULUS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class SearchSpace:
-    """Box of a search for n_real real poles and n_pairs pairs, as low and high (3,) of one pole of each type.
+    """Box of a search for n_real real poles and n_pairs pairs.
 
-    low, high: [real, pair first, pair second] in the coordinates of the module text; frequencies in
-    rad/sample.
+    Raises ValueError where a lower bound is not below its upper one.
+
+    Attributes
+    ----------
+    n_real, n_pairs : int
+        Numbers R of real poles and P of pairs; a point has D = R + 2 P coordinates: those of the real poles,
+        then two of each pair.
+    low, high : ndarray, shape (3,)
+        Ends of the box of one pole of each type, [real, pair first, pair second] in the coordinates of the
+        module text; frequencies in rad/sample.
+    raw : bool
+        The coordinates are the paper's, not logarithms.
+    dt_s : float
+        Sampling time, s.
     """
 
     n_real: int
@@ -42,101 +80,155 @@ class SearchSpace:
     dt_s: float
 
     def __post_init__(self) -> None:
+        """Lock the ends and refuse an empty box."""
         lock(self, "low", "high")
-        if not np.all(self.low < self.high):
+        is_open = self.low < self.high
+        if not np.all(is_open):
             names = ("real pole", "pair frequency", "pair damping")
-            i = int(np.flatnonzero(~(self.low < self.high))[0])
+            i = int(np.flatnonzero(~is_open)[0])
             raise ValueError(
                 f"the search box of the {names[i]} is empty: its lower bound is not below its upper bound"
             )
 
     @property
     def dimension(self) -> int:
+        """Number of coordinates D of a point."""
         return self.n_real + 2 * self.n_pairs
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Name of each coordinate, with its unit."""
-        real = "x" if self.raw else "log10(1 - a)"
-        pair = ("beta", "gamma") if self.raw else ("log10(omega [rad/s])", "log10(zeta)")
-        pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in pair]
-        return (*(f"{real} {i + 1}" for i in range(self.n_real)), *pairs)
+        """Name of each coordinate, (D,), with its unit and the number of its pole."""
+        if self.raw:
+            of_real = "x"
+            of_pair = ("beta", "gamma")
+        else:
+            of_real = "log10(1 - a)"
+            of_pair = ("log10(omega [rad/s])", "log10(zeta)")
+        reals = [f"{of_real} {i + 1}" for i in range(self.n_real)]
+        pairs = [f"{name} {i + 1}" for i in range(self.n_pairs) for name in of_pair]
+        return (*reals, *pairs)
 
     def _at(self, units: RealArray) -> RealArray:
-        """Coordinates of one point (D,), or of as many as there are columns (D, E)."""
+        """Coordinates of one point (D,) of the unit cube, or of as many as there are columns (D, E)."""
         return np.asarray(_coordinates_of_point(units, self.n_real, self.low, self.high))
 
     def blocks(self, unit: RealArray) -> RealArray:
-        """Cascade blocks (R + P, 4) of a point of the unit cube."""
-        return np.asarray(
-            blocks_of_point(kernel_array(unit), self.n_real, self.low.copy(), self.high.copy(), self.raw)
-        )
+        """Cascade blocks (R + P, 4) of a point (D,) of the unit cube, as compiled code takes them."""
+        point = kernel_array(unit)
+        blocks = blocks_of_point(point, self.n_real, self.low.copy(), self.high.copy(), self.raw)
+        return np.asarray(blocks)
 
     def poles(self, unit: RealArray) -> Poles:
-        """Poles of a point of the unit cube; a pair of the raw box that is not complex is put at zeta =
-        0.95."""
+        """Poles of a point (D,) of the unit cube.
+
+        A pair of the raw box that is not complex, or nearly not, is put at a damping ratio of .95 with the
+        frequency |log p| it has: what follows needs a pair above the axis.
+        """
         if not self.raw:
             point = self._at(unit)
-            real, first, second = point[: self.n_real], point[self.n_real :: 2], point[self.n_real + 1 :: 2]
-            omega, zeta = 10.0**first, 10.0**second
-            return Poles(1 - 10.0**real, np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
+            distance = 10.0 ** point[: self.n_real]
+            omega = 10.0 ** point[self.n_real :: 2]
+            zeta = 10.0 ** point[self.n_real + 1 :: 2]
+            return Poles(1 - distance, _pairs(omega, zeta))
+
+        # p = beta (1 + gamma)/2 + j sqrt(gamma - re^2) from (29), where that is above the axis.
         blocks = self.blocks(unit)
-        gamma, beta = blocks[self.n_real :, 0], blocks[self.n_real :, 1]
+        gamma = blocks[self.n_real :, 0]
+        beta = blocks[self.n_real :, 1]
         re = beta * (1 + gamma) / 2
         im = np.sqrt(np.maximum(gamma - re**2, 0.0))
         pairs = re + 1j * im
+
         with np.errstate(divide="ignore"):
-            log = np.log(np.where(pairs == 0, 1e-3, pairs))
-        size = np.minimum(np.abs(log), 0.9 * np.pi)
-        zeta = np.clip(-log.real / size, 1e-6, 0.95)
-        proper = (im > 0) & (-log.real < 0.95 * np.abs(log))
-        pairs = np.where(proper, pairs, np.exp(size * (-zeta + 1j * np.sqrt(1 - zeta**2))))
-        return Poles(blocks[: self.n_real, 0], pairs)
+            log = np.log(np.where(pairs == 0, _DEADBEAT_MODULUS, pairs))
+        modulus = np.abs(log)
+        is_proper = (im > 0) & (-log.real < _MOVED_ZETA * modulus)
+        omega = np.minimum(modulus, _HIGHEST_MOVED_SHARE * np.pi)
+        zeta = np.clip(-log.real / omega, _LEAST_MOVED_ZETA, _MOVED_ZETA)
+        return Poles(blocks[: self.n_real, 0], np.where(is_proper, pairs, _pairs(omega, zeta)))
 
     def levels(self, poles: Poles) -> RealArray:
-        """Where poles lie in the box, 0 to 1: (R + P,) by their first coordinate, those beyond on its
-        side."""
+        """Where poles lie between the ends of the box by their first coordinate, (R + P,), 0 to 1.
+
+        `poles` may be of any number. Those outside the box have the 0 or 1 of the side they are on.
+        """
         if self.raw:
-            first = np.concatenate([poles.real, 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)])
+            beta = 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)
+            first = np.concatenate([poles.real, beta])
         else:
-            first = np.log10(np.concatenate([1 - poles.real, np.abs(np.log(poles.pairs))]))
+            omega = np.abs(np.log(poles.pairs))
+            first = np.log10(np.concatenate([1 - poles.real, omega]))
         low = np.repeat(self.low[:2], poles.counts)
-        return np.asarray(np.clip((first - low) / (np.repeat(self.high[:2], poles.counts) - low), 0, 1))
+        high = np.repeat(self.high[:2], poles.counts)
+        return np.asarray(np.clip((first - low) / (high - low), 0, 1))
 
     def coordinates(self, units: RealArray) -> RealArray:
-        """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s."""
+        """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s, as `names` says."""
         points = self._at(units.T).T
         if not self.raw:
             points[:, self.n_real :: 2] -= np.log10(self.dt_s)
         return points
 
 
-def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: IdentOptions) -> SearchSpace:
-    """Box from record length (samples) and sampling time; bounds given in the options replace its sides.
+def _pairs(omega: RealArray, zeta: RealArray) -> ComplexArray:
+    """Poles (P,) above the axis, of frequencies omega (P,) in rad/sample and damping ratios zeta (P,) < 1."""
+    return np.asarray(np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
 
-    1 - a in [0.2/N, 0.7], omega in [4 pi/(N dt), 0.9 pi/dt], zeta in [1e-3, 0.63].
+
+def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: IdentOptions) -> SearchSpace:
+    """Box from record length and sampling time; bounds given in the options replace its sides.
+
+    Parameters
+    ----------
+    n_real, n_pairs : int
+        Numbers of poles that are sought.
+    longest : int
+        Samples N of the longest record.
+    dt_s : float
+        Sampling time, s.
+    options : IdentOptions
+        `coordinates`, and the bounds decay_min_per_s to zeta_max, None where nothing was stated.
+
+    Returns
+    -------
+    SearchSpace
+        Without bounds 1 - a in [0.2/N, 0.7], omega in [4 pi/(N dt), 0.9 pi/dt], zeta in [1e-3, 0.63]; raw: x
+        and beta up to 1 - 0.2/N, gamma from 0 to that.
+
+    Raises
+    ------
+    ValueError
+        A stated bound leaves its side of the box empty.
     """
-    n = max(longest, 30)
+    n = max(longest, _SHORTEST)
     if options.coordinates == "raw":
-        edge = 1 - 0.2 / n
-        return SearchSpace(
-            n_real, n_pairs, np.array([0.0, -edge, 0.0]), np.array([edge, edge, edge]), True, dt_s
-        )
-    low = [np.log10(0.2 / n), np.log10(4 * np.pi / n), np.log10(ZETA_LEAST)]
-    high = [np.log10(0.7), np.log10(0.9 * np.pi), np.log10(0.63)]
+        edge = 1 - _LEAST_DECAY_PER_RECORD / n
+        low_raw = np.array([0.0, -edge, 0.0])
+        high_raw = np.array([edge, edge, edge])
+        return SearchSpace(n_real, n_pairs, low_raw, high_raw, raw=True, dt_s=dt_s)
+
+    lowest_angle = 2 * _LEAST_PERIODS * np.pi / n
+    low = [np.log10(_LEAST_DECAY_PER_RECORD / n), np.log10(lowest_angle), np.log10(ZETA_LEAST)]
+    high = [np.log10(_LARGEST_DISTANCE), np.log10(_HIGHEST_SHARE * np.pi), np.log10(_LARGEST_ZETA)]
     for side, end in ((low, "min"), (high, "max")):
-        decay, omega = getattr(options, f"decay_{end}_per_s"), getattr(options, f"omega_{end}_rad_s")
-        stated = (
-            None if decay is None else -np.expm1(-decay * dt_s),
-            None if omega is None else min(omega * dt_s, 0.99 * np.pi),
-            getattr(options, f"zeta_{end}"),
-        )
-        side[:] = [was if to is None else np.log10(to) for was, to in zip(side, stated, strict=True)]
-    return SearchSpace(n_real, n_pairs, np.array(low), np.array(high), False, dt_s)
+        decay_per_s = getattr(options, f"decay_{end}_per_s")
+        if decay_per_s is not None:
+            side[0] = np.log10(-np.expm1(-decay_per_s * dt_s))
+        omega_rad_s = getattr(options, f"omega_{end}_rad_s")
+        if omega_rad_s is not None:
+            side[1] = np.log10(min(omega_rad_s * dt_s, _HIGHEST_STATED_SHARE * np.pi))
+        zeta = getattr(options, f"zeta_{end}")
+        if zeta is not None:
+            side[2] = np.log10(zeta)
+    return SearchSpace(n_real, n_pairs, np.array(low), np.array(high), raw=False, dt_s=dt_s)
 
 
 @register_jitable(inline="always")
 def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
+    """Coordinates (D,) of a point (D,) of the unit cube in the box low, high (3,).
+
+    The first coordinate of each pole lies between that of the pole before, of its type, and the end.
+    """
     point = np.empty_like(unit)
     floor = low[0]
     for i in range(n_real):
@@ -152,7 +244,12 @@ def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
 
 @numba.njit(**COMPILED)
 def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> Any:
-    """Cascade blocks (`ident.basis.functions.block_parameters`) of a point of the unit cube."""
+    """Cascade blocks (R + P, 4) of a point (D,) of the unit cube in the box low, high (3,).
+
+    Rows as `ident.basis.functions.block_parameters` makes them of poles: [a, sqrt(1 - a^2), 0, 0] of a real
+    pole, [gamma, beta, sqrt(1 - gamma^2), sqrt(1 - beta^2)] of a pair; from the coordinates, so that a pole
+    near the circle loses no digits.
+    """
     point = _coordinates_of_point(unit, n_real, low, high)
     blocks = np.zeros((n_real + (unit.size - n_real) // 2, 4))
     for i in range(n_real):
@@ -160,17 +257,23 @@ def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> A
         blocks[i, 0] = 1.0 - distance
         blocks[i, 1] = math.sqrt(distance * (2.0 - distance))
     for i in range(n_real, blocks.shape[0]):
-        first, second = point[2 * i - n_real], point[2 * i - n_real + 1]
+        first = point[2 * i - n_real]
+        second = point[2 * i - n_real + 1]
         if raw:
-            beta, gamma = first, second
+            beta = first
+            gamma = second
             sb = math.sqrt((1 - beta) * (1 + beta))
             one_minus_gamma = 1 - gamma
         else:
-            omega, zeta = 10.0**first, 10.0**second
-            decay, angle = zeta * omega, omega * math.sqrt(1 - zeta * zeta)
+            # p = exp(-decay + j angle): gamma = |p|^2, beta = 2 Re p / (1 + gamma).
+            omega = 10.0**first
+            zeta = 10.0**second
+            decay = zeta * omega
+            angle = omega * math.sqrt(1 - zeta * zeta)
             gamma = math.exp(-2 * decay)
             one_minus_gamma = -math.expm1(-2 * decay)
             beta = 2 * math.exp(-decay) * math.cos(angle) / (1 + gamma)
+            # 1 - beta^2 without cancellation.
             sb = math.sqrt(one_minus_gamma**2 + 4 * gamma * math.sin(angle) ** 2) / (1 + gamma)
         blocks[i, 0] = gamma
         blocks[i, 1] = beta

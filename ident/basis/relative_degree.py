@@ -25,7 +25,7 @@ from ident.data.arrays import COMPILED, ComplexArray, RealArray
 
 # Square roots are drawn until the matrix is this near the identity (largest row sum of the difference). The
 # quadrature then gives the logarithm to ((sqrt(1.25) - 1)/(sqrt(1.25) + 1))^16 = 1e-20. With .5 it is 1e-16
-# at best, one root less; with more roots each digit that the identity cancels is lost.
+# at best, one root less; each further root costs a bit where the identity is taken off again.
 _NEAR_IDENTITY = 0.25
 # Nodes of the Gauss-Legendre quadrature of log(T) = int_0^1 (T - 1) (1 + s (T - 1))^-1 ds. Four would leave
 # 1e-10, sixteen change nothing.

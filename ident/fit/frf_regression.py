@@ -1,8 +1,10 @@
 """A measured frequency response as a weighted least-squares problem, linear in everything but the poles.
 
 The rows of a frequency are its error, turned into the axes of its ellipse and divided by their standard
-deviations: two real numbers of unit variance. They play the part of the samples in the time domain (design
-4.2): thin QR, residual r, J = |r|^2.
+deviations: two real numbers of unit variance. They play the part of the samples in the time domain: thin QR,
+residual r, J = |r|^2. `prepare_response` makes these rows; `FrfRegression` then answers what a pole search
+and a refinement ask (`ident.fit.problem.PoleProblem`), and `fit_response` gives the coefficients at given
+poles. It is assumed that the errors of two frequencies are independent.
 """
 
 from __future__ import annotations
@@ -23,17 +25,40 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.fit.least_squares import RANK_TOLERANCE
 from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, residual_colour
 
-# A thinner ellipse (over its major axis, or the response) would let one frequency overrule all the others.
+# Least minor axis of an ellipse, as a share of its major axis. A thinner one would let one direction of one
+# frequency overrule all the others. Chosen: no ellipse of noise is that thin, those of an exact table are.
 THINNEST = 1e-4
+# How far below pi / dt, as a share, a frequency counts as pi / dt, where a response is real: rounding of
+# files.
+_NYQUIST_ROUNDING = 1e-9
+# Largest angle of a pair per sample that a search looks at, over pi: the box of the search ends there, too.
+_LARGEST_ANGLE_SHARE = 0.9
+# Least number of independent numbers that a residual is worth: the criterion takes its logarithm and divides
+# by what it leaves, and a residual of one colour throughout would be worth nothing.
+_LEAST_WORTH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class FrfRegression:
     """Everything a fit of a frequency response (F,) needs but the poles.
 
-    z (F,): exp(j omega dt). common (F,): integrators (z / (z - 1))^k and delay z^-d. turn (F,): into the axes
-    of the ellipse; weight (2, F): one over the standard deviations there, the second 0 at 0 and pi/dt, where
-    both responses are real. y (2 F,): the whitened measurement.
+    Attributes
+    ----------
+    z : ndarray of complex, shape (F,)
+        exp(j omega dt) at the measured frequencies.
+    common : ndarray of complex, shape (F,)
+        Integrators (z / (z - 1))^k and delay z^-d, which multiply every basis function.
+    turn : ndarray of complex, shape (F,)
+        Factor of modulus 1 that turns an error into the axes of its ellipse.
+    weight : ndarray, shape (2, F)
+        One over the standard deviations along these axes; the second 0 at 0 and pi / dt, where both responses
+        are real.
+    y : ndarray, shape (2 F,)
+        The whitened measurement: first axes of all frequencies, then second axes; no unit.
+    feedthrough : bool
+        Whether the fit has a direct term.
+    dt_s : float
+        Sampling time, s.
     """
 
     z: ComplexArray
@@ -51,142 +76,264 @@ class FrfRegression:
 
     @cached_property
     def power(self) -> float:
-        """|y|^2."""
+        """Square sum |y|^2 of the whitened measurement."""
         return float(self.y @ self.y)
 
     @cached_property
     def longest(self) -> int:
-        """Samples of a record that shows the lowest measured frequency twice."""
-        angle = np.angle(self.z)
-        return int(np.ceil(4 * np.pi / angle[angle > 0].min()))
+        """Samples of a record that shows two periods of the lowest measured frequency above 0."""
+        angle_rad = np.angle(self.z)
+        lowest_rad = angle_rad[angle_rad > 0].min()
+        return int(np.ceil(4 * np.pi / lowest_rad))
 
     @cached_property
     def omega_max_rad_s(self) -> float | None:
-        """The last measured frequency: beyond nothing shows where a pair is."""
-        return min(float(np.angle(self.z).max()), 0.9 * np.pi) / self.dt_s
+        """Last measured frequency, rad/s, at most .9 pi / dt: beyond it nothing shows where a pair is."""
+        last_rad = float(np.angle(self.z).max())
+        return min(last_rad, _LARGEST_ANGLE_SHARE * np.pi) / self.dt_s
 
     def n_parameters(self, order: int, n_fixed: int = 0) -> int:
-        """Number of free real numbers of a fit: coefficients, direct term, poles that are not known."""
+        """Number of free real numbers of a fit with `order` poles, `n_fixed` of them known.
+
+        Coefficients, the direct term if there is one, and the poles that are not known.
+        """
         return int(2 * order - n_fixed + self.feedthrough)
 
     def whiten(self, response: ComplexArray) -> RealArray:
-        """Complex columns (..., F, K) -> real rows of unit variance (..., 2 F, K)."""
+        """Real rows of unit variance (..., 2 F, K) of complex columns (..., F, K)."""
         aligned = response * self.turn[:, np.newaxis]
-        return np.concatenate(
-            [aligned.real * self.weight[0][:, np.newaxis], aligned.imag * self.weight[1][:, np.newaxis]],
-            axis=-2,
-        )
+        first_axis = aligned.real * self.weight[0][:, np.newaxis]
+        second_axis = aligned.imag * self.weight[1][:, np.newaxis]
+        return np.concatenate([first_axis, second_axis], axis=-2)
 
     def responses(self, poles: Poles) -> ComplexArray:
-        """Basis functions, and the direct term if there is one, times the known factor, (F, B or B + 1)."""
+        """Responses (F, B or B + 1) of the basis functions and of the direct term, if there is one.
+
+        All times the known factor `common`; whitened they are the columns of the fit.
+        """
         parts = [basis_response(poles, self.z)]
         if self.feedthrough:
             parts.append(np.ones((self.z.size, 1), dtype=np.complex128))
         return np.asarray(self.common[:, np.newaxis] * np.hstack(parts))
 
     def columns(self, poles: Poles) -> RealArray:
-        """The same whitened, (2 F, B or B + 1)."""
+        """Whitened columns (2 F, B or B + 1) of a fit with these poles."""
         return self.whiten(self.responses(poles))
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
-        """Cost and Kaufman linearisation at these poles."""
+        """Cost and Kaufman linearisation at these poles.
+
+        Parameters
+        ----------
+        real : ndarray, shape (R,)
+            Real poles.
+        pairs : ndarray of complex, shape (P,)
+            Poles above the axis, one per pair.
+        below : float
+            Where the cost is not below this, normal matrix and gradient are empty.
+
+        Returns
+        -------
+        Linearisation
+            rss, normal (B, B) and gradient (B,), B = R + 2 P.
+        """
         poles = Poles(real, pairs)
-        here = fit_response(self, poles)
-        if not here.rss < below:
-            return Linearisation(here.rss, np.zeros((0, 0)), np.zeros(0))
-        rows = self.whiten(here.response[:, np.newaxis] * block_responses(poles, self.z))
-        rows -= here.q @ (here.q.T @ rows)
-        return Linearisation(here.rss, rows.T @ rows, rows.T @ here.residual)
+        fit = fit_response(self, poles)
+        if not fit.rss < below:
+            return Linearisation(fit.rss, np.zeros((0, 0)), np.zeros(0))
+        # Each block by itself, driven by the fitted output; then off what the coefficients can re-fit.
+        driven_blocks = fit.response[:, np.newaxis] * block_responses(poles, self.z)
+        directions = self.whiten(driven_blocks)
+        directions -= fit.q @ (fit.q.T @ directions)
+        return Linearisation(fit.rss, directions.T @ directions, directions.T @ fit.residual)
 
     def residual(self, poles: Poles) -> RealArray:
         """The whitened residual (2 F,)."""
         return fit_response(self, poles).residual
 
     def colour(self, residual: RealArray) -> ResidualColour:
-        """Colour of a whitened residual (2 F,) over frequency; what it is worth counts measured numbers."""
+        """Colour of a whitened residual (2 F,) over frequency; what it is worth counts measured numbers.
+
+        The axes are two records of F numbers. At 0 and pi / dt one of the two was not measured and is zero:
+        that is no number, so the share of independent ones counts of `n_samples`.
+        """
         count = self.z.size
-        found = residual_colour(residual, np.array([0, count, 2 * count], dtype=np.int64))
-        share = found.effective_samples / residual.size
-        return ResidualColour(max(share * self.n_samples, 3.0), found.white)
+        starts = np.array([0, count, 2 * count], dtype=np.int64)
+        colour = residual_colour(residual, starts)
+        share = colour.effective_samples / residual.size
+        return ResidualColour(max(share * self.n_samples, _LEAST_WORTH), colour.white)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """J / scale + (free numbers) ln Ne, Ne = worth: a pole, of two numbers, is kept if J falls by more
-        than 2 ln Ne (a pair: 4 ln Ne). J is a chi-square because the covariances are known; where
-        it is larger than they explain, they are multiplied by its excess, the scale."""
-        scale = max(1.0, rss / max(self.n_samples - self.n_parameters(order), 1))
-        share, price = worth / self.n_samples, float(np.log(worth))
-        return lambda rss, order: share * rss / scale + self.n_parameters(order) * price
+        """Criterion (J, order) -> number, lower is better.
+
+        Parameters
+        ----------
+        rss, order
+            J and number of poles of the fit that tells how well the covariances explain the residual.
+        worth : float
+            Ne, independent numbers that its residual is worth.
+
+        Returns
+        -------
+        callable
+
+        Notes
+        -----
+        J / scale + (free numbers) ln Ne: a pole, of two numbers, is kept if J falls by more than 2 ln Ne (a
+        pair: 4 ln Ne). J is a chi-square because the covariances are known; where it is larger than they
+        explain, they are multiplied by its excess, the scale.
+        """
+        n_free = self.n_samples - self.n_parameters(order)
+        scale = max(1.0, rss / max(n_free, 1))
+        share = worth / self.n_samples
+        price = float(np.log(worth))
+
+        def value(rss: float, order: int) -> float:
+            return share * rss / scale + self.n_parameters(order) * price
+
+        return value
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
-        """Cost of candidates on top of frozen poles; a response has no free ones."""
+        """Cost of candidates on top of frozen poles.
+
+        Parameters
+        ----------
+        space : SearchSpace
+            Numbers of candidate poles and the box that their unit cube stands for.
+        shared : Poles
+            Frozen poles, taken out of the response once, here.
+        local : Poles
+            Not used: a response has no free runs.
+
+        Returns
+        -------
+        CandidateCost
+            J at points of the unit cube, one at a time or many.
+        """
         frozen = self.columns(shared)
         q = np.linalg.qr(frozen)[0] if frozen.shape[1] else frozen
         residual = self.y - q @ (q.T @ self.y)
+        # Behind the all-pass of the frozen poles the candidates' functions stay orthogonal to theirs.
         drive = self.common * all_pass_response(shared, self.z)
 
         def costs(units: RealArray) -> RealArray:
+            """J (E,) at points (E, D), all in one factorisation."""
             blocks = np.stack([space.blocks(unit) for unit in units])
             rows = self.whiten(_cascade_responses(blocks, space.n_real, self.z, drive))
-            q_new = np.linalg.qr(rows - q @ (q.T @ rows))[0]
-            return np.asarray(
-                residual @ residual - np.sum(np.einsum("enk,n->ek", q_new, residual) ** 2, axis=1)
-            )
+            new_rows = rows - q @ (q.T @ rows)
+            q_new = np.linalg.qr(new_rows)[0]
+            on_residual = np.einsum("enk,n->ek", q_new, residual)
+            fall = np.sum(on_residual**2, axis=1)
+            return np.asarray(residual @ residual - fall)
 
-        return CandidateCost(space, self.power, lambda unit: float(costs(unit[np.newaxis])[0]), costs)
+        def cost(unit: RealArray) -> float:
+            """J at a point (D,)."""
+            return float(costs(unit[np.newaxis])[0])
+
+        return CandidateCost(space, self.power, cost, costs)
 
 
 def _cascade_responses(blocks: RealArray, n_real: int, z: ComplexArray, drive: ComplexArray) -> ComplexArray:
-    """Responses (E, F, B) of E cascades, given by their blocks (E, R + P, 4), behind `drive` (F,)."""
-    drive = np.broadcast_to(drive, (len(blocks), z.size))
+    """Responses (E, F, B) of E cascades behind `drive` (F,), at the points z (F,).
+
+    blocks (E, R + P, 4): of each cascade, `n_real` real poles first, as in
+    `ident.basis.functions.block_parameters`.
+    """
+    entering = np.broadcast_to(drive, (len(blocks), z.size))
     columns = []
     for i in range(blocks.shape[1]):
         p0, p1, p2, p3 = (blocks[:, i, j, np.newaxis] for j in range(4))
         if i < n_real:
-            columns.append(p1 / (z - p0) * drive)
-            drive = drive * (1 - p0 * z) / (z - p0)
+            # Real pole a = p0, sqrt(1 - a^2) = p1; the all-pass (1 - a z)/(z - a) drives the next block.
+            columns.append(p1 / (z - p0) * entering)
+            entering = entering * (1 - p0 * z) / (z - p0)
         else:
+            # Pair with gamma = p0, beta = p1, sg = p2, sb = p3.
             below = z**2 - p1 * (1 + p0) * z + p0
-            columns += [p2 * (z - p1) / below * drive, p2 * p3 / below * drive]
-            drive = drive * (1 - p1 * (1 + p0) * z + p0 * z**2) / below
+            above = 1 - p1 * (1 + p0) * z + p0 * z**2
+            columns.append(p2 * (z - p1) / below * entering)
+            columns.append(p2 * p3 / below * entering)
+            entering = entering * above / below
     return np.stack(columns, axis=-1)
 
 
 def prepare_response(
     response: FrequencyUncertainty, *, integrators: int, delay_samples: int, feedthrough: bool
 ) -> FrfRegression:
-    """Whiten a measured response. Raises ValueError without any uncertainty, or at omega = 0 with
-    integrators."""
+    """A measured response as a least-squares problem of unit variance.
+
+    Parameters
+    ----------
+    response : FrequencyUncertainty
+        omega_rad_s (F,), ascending, not 0 with integrators, whose factor is infinite there; centre (F,), the
+        measured response; covariance (F, 2, 2) of its real and imaginary part; dt_s.
+    integrators, delay_samples : int
+        Known factor (z / (z - 1))^integrators z^-delay_samples of the model.
+    feedthrough : bool
+        Whether the model has a direct term.
+
+    Returns
+    -------
+    FrfRegression
+
+    Raises
+    ------
+    ValueError
+        A frequency without any uncertainty.
+    """
     omega = response.omega_rad_s
     s1, s2, direction = standard_axes(response.covariance)
     turn = np.conj(direction)
-    real_only = (omega == 0) | (omega >= np.pi / response.dt_s * (1 - 1e-9))
+
+    # At 0 and pi / dt a response is real: one number, with the deviation of its real part.
+    nyquist_rad_s = np.pi / response.dt_s
+    is_static = omega == 0
+    is_nyquist = omega >= nyquist_rad_s * (1 - _NYQUIST_ROUNDING)
+    real_only = is_static | is_nyquist
     turn[real_only] = 1.0
-    s1 = np.where(real_only, np.sqrt(response.covariance[:, 0, 0]), s1)
-    if not np.all(s1 > 0):
-        at = omega[int(np.argmax(~(s1 > 0)))]
+    real_std = np.sqrt(response.covariance[:, 0, 0])
+    s1 = np.where(real_only, real_std, s1)
+    is_uncertain = s1 > 0
+    if not np.all(is_uncertain):
+        at = omega[int(np.argmin(is_uncertain))]
         raise ValueError(
             f"at omega = {at:.6g} rad/s the response is given as exactly known: a fit needs a covariance at "
             "every frequency, the smallest that is still honest"
         )
-    weight = np.stack([1 / s1, np.where(real_only, 0.0, 1 / np.maximum(s2, THINNEST * s1))])
-    frame = FrfRegression(
+
+    # The second axis never counts more than 1 / THINNEST times the first.
+    second_weight = np.where(real_only, 0.0, 1 / np.maximum(s2, THINNEST * s1))
+    regression = FrfRegression(
         z=np.exp(1j * omega * response.dt_s),
         common=front_response(omega, response.dt_s, integrators, delay_samples),
         turn=turn,
-        weight=weight,
+        weight=np.stack([1 / s1, second_weight]),
         y=np.zeros(2 * omega.size),
         feedthrough=feedthrough,
         dt_s=response.dt_s,
     )
-    return replace(frame, y=frame.whiten(response.centre[:, np.newaxis])[:, 0])
+    whitened = regression.whiten(response.centre[:, np.newaxis])
+    return replace(regression, y=whitened[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class FrfFit:
     """Weighted least-squares fit for given poles.
 
-    coefficients (B,), direct term, fitted response (F,), whitened residual (2 F,) and its sum of squares;
-    q (2 F, K): orthonormal columns of the fit.
+    Attributes
+    ----------
+    coefficients : ndarray, shape (B,)
+        One per basis function, output units per input unit.
+    feedthrough : float
+        Direct term; 0 where the fit has none.
+    response : ndarray of complex, shape (F,)
+        Fitted response.
+    residual : ndarray, shape (2 F,)
+        Whitened residual.
+    rss : float
+        Its sum of squares.
+    q : ndarray, shape (2 F, B or B + 1)
+        Orthonormal columns of the fit.
     """
 
     coefficients: RealArray
@@ -198,7 +345,20 @@ class FrfFit:
 
 
 def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
-    """theta = R^-1 Q^T y by thin QR (27), on the whitened rows."""
+    """Weighted least-squares fit of a response for given poles: theta = R^-1 Q^T y by thin QR (27).
+
+    Parameters
+    ----------
+    data : FrfRegression
+        Whitened measurement (2 F,).
+    poles : Poles
+        B poles of the basis.
+
+    Returns
+    -------
+    FrfFit
+        Directions that the data do not show (`RANK_TOLERANCE`) have coefficient zero.
+    """
     responses = data.responses(poles)
     q, triangle = np.linalg.qr(data.whiten(responses))
     projected = q.T @ data.y
