@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 
 from ident.basis.coordinates import SearchSpace
-from ident.basis.functions import _blocks, block_parameters, free_response
+from ident.basis.functions import block_parameters, blocks_of_poles, free_response
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import ComplexArray, IntArray, RealArray
@@ -108,7 +108,7 @@ class Regression:
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
         """Cost and Kaufman linearisation at these poles (compiled; by orthogonal factorisation where the
         columns are nearly dependent); only the cost counts where it is not under `below`."""
-        blocks = _blocks(real, pairs)
+        blocks = blocks_of_poles(real, pairs)
         n = real.size + 2 * pairs.size
         normal, gradient = np.empty((n, n)), np.empty(n)
         rss = linearise(

@@ -1,5 +1,14 @@
-"""The unknowns of a local refinement, compiled: 1 - a of each free real pole, (s, f) of each free pair p =
-exp(-s +- j f); their bounds, the chain rule from block states to unknowns, and a Levenberg-Marquardt step.
+"""The unknowns of a local refinement, compiled, and one damped step in them.
+
+A refinement moves 1 - a of each free real pole and (s, f) of each free pair p = exp(-s +- j f), s its decay
+and f its angle per sample: in these a pole reaches the unit circle at a finite distance, and a resonance
+keeps its shape. The first functions keep unknowns inside their bounds and tell which a bound holds;
+`chain_rule` turns sensitivities to block states into sensitivities to unknowns; `scaled_system` and
+`damped_step` are the two halves of a Levenberg-Marquardt step (More, 1978), called by
+`ident.fit.refinement.refine`.
+
+Fixed poles come first of each type, and have no unknowns: with n_free_real = R - n_fixed_real, an array x
+(P,) holds 1 - a of the free real poles and then s, f of each free pair.
 """
 
 from __future__ import annotations
@@ -11,17 +20,35 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.basis.functions import _blocks
+from ident.basis.functions import blocks_of_poles
 from ident.data.arrays import COMPILED
 from ident.fit.kernels import backward, factorise, forward, schur_drop
 
 # Order of the numbers in an array of bounds (see `ident.fit.refinement.Bounds`).
-_DISTANCE_MIN, _DISTANCE_MAX, _OMEGA_MIN, _OMEGA_MAX, _ZETA_MIN, _ZETA_MAX, _S_MIN = range(7)
+_DISTANCE_MIN = 0
+_DISTANCE_MAX = 1
+_OMEGA_MIN = 2
+_OMEGA_MAX = 3
+_ZETA_MIN = 4
+_ZETA_MAX = 5
+_S_MIN = 6
 # Whatever follows these seven are measured bands [rad/sample], low and high in turn; `narrowest` reads them.
 _FIRST_BAND = 7
+# An unknown is on a bound when it is this near to it, as a share. Poles pass through exp and log on their way
+# there, which rounds 1 - a by 1e-16; at the least distance to the circle, 1e-8 in a record of 100 000
+# samples, that is a share of 1e-8.
+_CLOSE = 1e-7
+# Least angle of a pair per sample, rad: a pair has to lie above the axis, and no record shows one so slow.
+_LEAST_ANGLE_RAD = 1e-12
+# Largest angle of a pair per sample, over pi: beyond pi a mode is folded back, and at pi its pair is a real
+# pole. As in `ident.fit.refinement`.
+_LARGEST_ANGLE_SHARE = 0.995
+# Least square of a direction's length, in place of zero: a pole that moves nothing has a scale to divide by.
+_TINY = 1e-300
+# Least pivot of the damped normal matrix of unit diagonal: a step is only taken if its factor has two digits.
+_LEAST_PIVOT_OF_STEP = 1e-14
 # Pieces of the two compiled functions at the end: as functions of their own they would be compiled twice.
 _inlined = numba.njit(**COMPILED, inline="always")
-_CLOSE = 1e-7  # poles pass through exp and log on their way to a bound
 
 
 @_inlined
@@ -41,30 +68,39 @@ def narrowest(f: float, bounds: Any) -> float:
 
 @_inlined
 def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
-    """The unknowns (1 - a; s, f) inside the bounds; frequency and damping are clipped, then s and f formed.
+    """Unknowns (P,) that x (P,) becomes inside the bounds.
 
-    A pair that is narrower than its distance to the data is widened, but never beyond the largest damping.
+    Of a pair frequency |log p| and damping ratio are clipped, then s and f formed again. A pair that is
+    narrower than its distance to the data is widened, but never beyond the largest damping.
     """
     inside = np.empty_like(x)
     for i in range(n_free_real):
         inside[i] = min(max(x[i], bounds[_DISTANCE_MIN]), bounds[_DISTANCE_MAX])
     for i in range(n_free_real, x.size, 2):
-        s, f = max(x[i], bounds[_S_MIN]), max(x[i + 1], 1e-12)
+        s = max(x[i], bounds[_S_MIN])
+        f = max(x[i + 1], _LEAST_ANGLE_RAD)
         omega = math.hypot(s, f)
         zeta = min(max(s / omega, bounds[_ZETA_MIN]), bounds[_ZETA_MAX])
         omega = min(max(omega, bounds[_OMEGA_MIN]), bounds[_OMEGA_MAX])
-        inside[i] = max(zeta * omega, bounds[_S_MIN])
-        inside[i + 1] = min(omega * math.sqrt(1 - zeta * zeta), 0.995 * np.pi)
-        widest = inside[i + 1] * bounds[_ZETA_MAX] / math.sqrt(1 - bounds[_ZETA_MAX] ** 2)
-        inside[i] = max(inside[i], min(narrowest(inside[i + 1], bounds), widest))
+        decay = max(zeta * omega, bounds[_S_MIN])
+        angle = min(omega * math.sqrt(1 - zeta * zeta), _LARGEST_ANGLE_SHARE * np.pi)
+        # Decay at which the damping ratio is the largest: s = f zeta / sqrt(1 - zeta^2).
+        widest = angle * bounds[_ZETA_MAX] / math.sqrt(1 - bounds[_ZETA_MAX] ** 2)
+        inside[i] = max(decay, min(narrowest(angle, bounds), widest))
+        inside[i + 1] = angle
     return inside
 
 
 @_inlined
 def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
-    """Unknowns on a bound that would be driven out of it (a step goes along +gradient = S^T r)."""
-    held = np.zeros(x.size)  # 1: held; zeros of another type would be compiled for this alone
-    low, high = 1 + _CLOSE, 1 - _CLOSE
+    """Which unknowns x (P,) stand on a bound and would be driven out of it, (P,): 1 for yes, 0 for no.
+
+    gradient (P,) = S^T r by unknowns: a step goes along it.
+    """
+    # Floats, not booleans: zeros of another type would be compiled for this alone.
+    held = np.zeros(x.size)
+    low = 1 + _CLOSE
+    high = 1 - _CLOSE
     for i in range(n_free_real):
         if gradient[i] < 0:
             held[i] = x[i] <= bounds[_DISTANCE_MIN] * low
@@ -87,22 +123,31 @@ def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
 
 @_inlined
 def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
-    """(B, P): sensitivity to each free unknown as a combination of the block states driven by the fitted
-    output.
+    """Sensitivity of the output to each free unknown as a combination of block states, (B, P).
 
-    States of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D y_hat and sg sb/D y_hat, with
-    D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s).
+    real (R,) and pairs (P',) are all poles, the fixed ones first. The states are those of each block by
+    itself, driven by the fitted output y_hat. Of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D
+    y_hat and sg sb/D y_hat, with D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s). Moving a pole changes
+    y_hat by -(dD/dp)/D y_hat; here dD = -z dt + dg is written in the two states.
     """
-    blocks = _blocks(real, pairs)
-    n_real, n_free_real = real.size, real.size - n_fixed_real
+    blocks = blocks_of_poles(real, pairs)
+    n_real = real.size
+    n_free_real = real.size - n_fixed_real
     chain = np.zeros((n_real + 2 * pairs.size, n_free_real + 2 * (pairs.size - n_fixed_pairs)))
     for i in range(n_fixed_real, n_real):
-        chain[i, i - n_fixed_real] = -1 / blocks[i, 1]  # minus: the unknown is 1 - a
+        # Minus: the unknown is 1 - a.
+        chain[i, i - n_fixed_real] = -1 / blocks[i, 1]
     for j in range(n_fixed_pairs, pairs.size):
         block = blocks[n_real + j]
-        gamma, beta, sg, sb = block[0], block[1], block[2], block[3]
-        row, column = n_real + 2 * j, n_free_real + 2 * (j - n_fixed_pairs)
-        dt_ds, dt_df, dg_ds = -2 * pairs[j].real, -2 * pairs[j].imag, -2 * gamma
+        gamma = block[0]
+        beta = block[1]
+        sg = block[2]
+        sb = block[3]
+        row = n_real + 2 * j
+        column = n_free_real + 2 * (j - n_fixed_pairs)
+        dt_ds = -2 * pairs[j].real
+        dt_df = -2 * pairs[j].imag
+        dg_ds = -2 * gamma
         chain[row, column] = dt_ds / sg
         chain[row, column + 1] = dt_df / sg
         chain[row + 1, column] = (dt_ds * beta - dg_ds) / (sg * sb)
@@ -112,9 +157,14 @@ def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> 
 
 @_inlined
 def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
-    """Normal matrix (P, P) and S^T r (P,) of the free unknowns."""
+    """Normal matrix (P, P) and S^T r (P,) of the free unknowns.
+
+    chain (B, P) from `chain_rule`; normal (B, B) and gradient (B,) by block states. The chain has one or two
+    numbers a column, so zeros are skipped instead of multiplied.
+    """
     n, m = chain.shape
-    system, slope = np.zeros((m, m)), np.zeros(m)
+    system = np.zeros((m, m))
+    slope = np.zeros(m)
     turned = np.zeros((n, m))
     for p in range(m):
         for i in range(n):
@@ -131,32 +181,40 @@ def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
 
 
 def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
-    """1 - a of the free real poles, then s, f of each free pair."""
+    """Unknowns (P,) of poles: 1 - a of the free real poles, then s, f of each free pair.
+
+    real (R,) and pairs (P',) are all poles, the fixed ones first.
+    """
     n_free_real = real.size - n_fixed_real
     x = np.empty(n_free_real + 2 * (pairs.size - n_fixed_pairs))
     for i in range(n_free_real):
         x[i] = 1 - real[n_fixed_real + i]
     for j in range(n_fixed_pairs, pairs.size):
         log = cmath.log(pairs[j])
-        x[n_free_real + 2 * (j - n_fixed_pairs)] = -log.real
-        x[n_free_real + 2 * (j - n_fixed_pairs) + 1] = log.imag
+        at = n_free_real + 2 * (j - n_fixed_pairs)
+        x[at] = -log.real
+        x[at + 1] = log.imag
     return x
 
 
 @_inlined
 def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> None:
+    """Put the unknowns x (P,) into the free poles of real (R,) and pairs (P',), in place."""
     n_free_real = real.size - n_fixed_real
     for i in range(n_free_real):
         real[n_fixed_real + i] = 1 - x[i]
     for j in range(n_fixed_pairs, pairs.size):
-        s = x[n_free_real + 2 * (j - n_fixed_pairs)]
-        f = x[n_free_real + 2 * (j - n_fixed_pairs) + 1]
+        at = n_free_real + 2 * (j - n_fixed_pairs)
+        s = x[at]
+        f = x[at + 1]
         pairs[j] = math.exp(-s) * complex(math.cos(f), math.sin(f))
 
 
 def start(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int, bounds: Any) -> Any:
-    """The unknowns of the poles, brought inside the bounds, and the poles with them. Too seldom to be
-    compiled."""
+    """Unknowns (P,) of the poles, brought inside the bounds; the free poles are changed to match, in place.
+
+    bounds: `Bounds.array`. Called too seldom to be compiled.
+    """
     x = free_parameters(real, pairs, n_fixed_real, n_fixed_pairs)
     x = clip_parameters.py_func(x, real.size - n_fixed_real, bounds)
     set_poles.py_func(x, real, pairs, n_fixed_real, n_fixed_pairs)
@@ -174,9 +232,33 @@ def scaled_system(
     normal: Any,
     gradient: Any,
 ) -> Any:
-    """Normal matrix and S^T r of the unknowns x that no bound holds, each unknown scaled to unit length.
+    """Linearised problem of the unknowns that no bound holds, each scaled to move the output by unit length.
 
-    Also the scales, the indices of these unknowns and the fall of J that the linearisation promises.
+    Parameters
+    ----------
+    x : ndarray, shape (P,)
+        Unknowns of the free poles.
+    real, pairs : ndarray, shapes (R,) and (P',)
+        All poles, the fixed ones first.
+    n_fixed_real, n_fixed_pairs : int
+        Numbers of fixed poles.
+    bounds : ndarray
+        `Bounds.array`.
+    normal, gradient : ndarray, shapes (B, B) and (B,)
+        S^T S and S^T r by block states (`ident.fit.problem.Linearisation`).
+
+    Returns
+    -------
+    system : ndarray, shape (m, m)
+        Normal matrix of the m unknowns that are not held, unit diagonal.
+    slope : ndarray, shape (m,)
+        Their S^T r.
+    scale : ndarray, shape (m,)
+        Length of each direction; a step in an unknown is one in the scaled unknown over its scale.
+    free : ndarray of int, shape (m,)
+        Which of the unknowns they are.
+    promised : float
+        Fall of J that the linearisation promises.
     """
     chain = chain_rule(real, pairs, n_fixed_real, n_fixed_pairs)
     full_system, full_slope = _by_unknowns(chain, normal, gradient)
@@ -187,14 +269,17 @@ def scaled_system(
         if not held[i]:
             free[m] = i
             m += 1
-    system, scale, slope = np.empty((m, m)), np.empty(m), np.empty(m)
+    system = np.empty((m, m))
+    scale = np.empty(m)
+    slope = np.empty(m)
     for i in range(m):
-        scale[i] = math.sqrt(max(full_system[free[i], free[i]], 1e-300))
+        scale[i] = math.sqrt(max(full_system[free[i], free[i]], _TINY))
         slope[i] = full_slope[free[i]] / scale[i]
         for j in range(i + 1):
             system[i, j] = full_system[free[i], free[j]] / (scale[i] * scale[j])
             system[j, i] = system[i, j]
-    return system, slope, scale, free[:m], schur_drop(system.copy(), slope.copy())
+    promised = schur_drop(system.copy(), slope.copy())
+    return system, slope, scale, free[:m], promised
 
 
 @numba.njit(**COMPILED)
@@ -211,16 +296,28 @@ def damped_step(
     real: Any,
     pairs: Any,
 ) -> Any:
-    """The unknowns after one step, inside the bounds, and the fall of J it promises (0: no step possible).
+    """Unknowns (P,) after one step, inside the bounds, and the fall of J it promises (0: no step possible).
 
-    Fills the free ones of the poles real and pairs.
+    Parameters
+    ----------
+    x, n_fixed_real, n_fixed_pairs, bounds, system, slope, scale, free
+        Those of `scaled_system`, and what it returned.
+    damping : float
+        Added to the unit diagonal of the system: 0 is a Gauss-Newton step, large numbers are short steps
+        downhill.
+    real, pairs : ndarray, shapes (R,) and (P',)
+        Their free poles are filled with those of the step.
+
+    Notes
+    -----
+    The promise, 2 slope^T step - step^T system step, is of the step before the bounds cut it.
     """
     m = free.size
     factor = system.copy()
     for i in range(m):
         factor[i, i] += damping
     trial = x.copy()
-    if not factorise(factor, m, 1e-14):
+    if not factorise(factor, m, _LEAST_PIVOT_OF_STEP):
         return trial, 0.0
     step = slope.copy()
     forward(factor, m, step)

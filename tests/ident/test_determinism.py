@@ -134,7 +134,7 @@ def test_kernels_are_compiled_once_for_one_kind_of_array(fresh):
     assert [name for name, _, locked in found if locked] == []
     count = {name: number for name, number, _ in found}
     for entry in (
-        "functions._blocks",
+        "functions.blocks_of_poles",
         "kernels.cost_of_point",
         "kernels.linearise",
         "coordinates.blocks_of_point",
