@@ -23,12 +23,11 @@ from ident.fit.problem import Linearisation, Linearised
 
 # Damping of the first step near an optimum, in units of the scaled normal matrix: practically a full step.
 NEAR = 1e-3
-# Damping of the first step from afar, where a full step leads too far: half a step where directions are
-# orthogonal.
+# Damping of the first step from afar: half a step where directions are orthogonal. From there a full step
+# leads too far: half the evaluations of a refinement that starts so boldly are steps taken back.
 FAR = 1.0
 # A step that does not gain multiplies the damping by this, the next one by its square, and so on: a start
-# that is too bold is brought back in few steps. With 2, Nielsen's number, half the evaluations of such a
-# refinement are steps taken back.
+# that is too bold is brought back in few steps. Chosen; Nielsen (1999) has 2.
 _GROWTH = 4.0
 # Least fall of J, as a share of what the linearisation promised, with which a step is taken. The usual small
 # number of trust regions (More, 1978): any true fall counts.
@@ -43,7 +42,7 @@ _EXPLAINED = 1e-26
 # Decay over the longest record below which a pole cannot be told from one on the circle.
 _STILL = 1e-3
 # Largest 1 - a of a real pole: those down to -.95 are reached by refinement only; they have no continuous
-# counterpart, and stand for what the hold of the input leaves out.
+# counterpart, so no search starts there.
 _LARGEST_DISTANCE = 1.95
 # Lowest frequency of a pair, rad in the longest record: 1/63 of a period there looks like a straight line.
 _LEAST_ANGLE_PER_RECORD = 0.1

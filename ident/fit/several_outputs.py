@@ -1,6 +1,9 @@
 """Records of several outputs made ready for one fit: poles are shared, coefficients are every output's own.
-The cost is the sum of theirs, the likelihood where their noises are independent and equally strong
-(`whitened`)."""
+
+`OutputRegressions` answers what a pole search and a refinement ask (`ident.fit.problem.PoleProblem`) with the
+sums of what the single outputs answer. The cost is the sum of theirs, which is the likelihood where their
+noises are independent and equally strong: `whitened` makes them so, `prepare_outputs` stacks the records.
+"""
 
 from __future__ import annotations
 
@@ -21,52 +24,72 @@ from ident.fit.regression import prepare_inputs
 
 @dataclass(frozen=True, eq=False)
 class OutputRegressions:
-    """One `Regression` per output, of the same inputs; a `PoleProblem` whose numbers are those of all."""
+    """One `Regression` per output, of the same inputs; a `PoleProblem` whose numbers are those of all.
+
+    Attributes
+    ----------
+    each : tuple of Regression
+        Y of them, with the same records, structure and sampling time.
+    """
 
     each: tuple[Regression, ...]
 
     @property
     def structure(self) -> Structure:
+        """Integrators, delay and nuisance columns, of every output."""
         return self.each[0].structure
 
     @property
     def dt_s(self) -> float:
+        """Sampling time, s."""
         return self.each[0].dt_s
 
     @property
     def starts(self) -> IntArray:
         """Where the records begin, output after output, (Y K + 1,)."""
+        # The next output's records follow after all of this one's.
         ends = self.each[0].starts
-        return np.concatenate([ends[:1], *[ends[1:] + k * ends[-1] for k in range(len(self.each))]])
+        n_samples = ends[-1]
+        of_outputs = [ends[1:] + k * n_samples for k in range(len(self.each))]
+        return np.concatenate([ends[:1], *of_outputs])
 
     @property
     def power(self) -> float:
-        return sum(one.power for one in self.each)
+        """Square sum of the outputs without the part of constants and the like."""
+        return sum(output.power for output in self.each)
 
     @property
     def omega_max_rad_s(self) -> float | None:
+        """None: records show what lies below the Nyquist frequency."""
         return None
 
     @property
     def n_samples(self) -> int:
         """Measured numbers, Y N."""
-        return sum(one.n_samples for one in self.each)
+        return sum(output.n_samples for output in self.each)
 
     @property
     def n_inputs(self) -> int:
+        """Number of inputs U."""
         return self.each[0].n_inputs
 
     @property
     def longest(self) -> int:
+        """Samples of the longest record."""
         return self.each[0].longest
 
     def n_parameters(self, order: int) -> int:
-        """Coefficients and nuisances of every output; the poles once."""
-        return order + sum(one.n_parameters(order) - order for one in self.each)
+        """Free real numbers of a fit with `order` poles: what every output has of its own, the poles once."""
+        without_poles = [output.n_parameters(order) - order for output in self.each]
+        return order + sum(without_poles)
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
-        """Sum of the outputs' costs, normal matrices and gradients."""
-        parts = [one.linearise(real, pairs) for one in self.each]
+        """Sums of the outputs' costs, normal matrices (B, B) and gradients (B,) at these poles.
+
+        real (R,), pairs (P,): poles above the axis. `below` is not used: which output alone stays below says
+        nothing of the sum.
+        """
+        parts = [output.linearise(real, pairs) for output in self.each]
         return Linearisation(
             sum(part.rss for part in parts),
             np.sum([part.normal for part in parts], axis=0),
@@ -74,34 +97,65 @@ class OutputRegressions:
         )
 
     def residual(self, poles: Poles) -> RealArray:
-        """Output after output, (Y N,)."""
-        return np.concatenate([one.residual(poles) for one in self.each])
+        """What the fits with these poles leave, output after output, (Y N,)."""
+        return np.concatenate([output.residual(poles) for output in self.each])
 
     def colour(self, residual: RealArray) -> ResidualColour:
+        """Colour of a residual (Y N,), every record of every output by itself."""
         return residual_colour(residual, self.starts)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        return information_criterion(sum(float(one.y @ one.y) for one in self.each), self, worth)
+        """Criterion (J, order) -> number, lower is better: see `information_criterion`."""
+        power = sum(float(output.y @ output.y) for output in self.each)
+        return information_criterion(power, self, worth)
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
-        costs = [one.candidate_cost(space, shared, local) for one in self.each]
-        power = sum(float(one.y @ one.y) for one in self.each)
-        return CandidateCost(space, power, lambda unit: sum(cost.at(unit) for cost in costs))
+        """Cost of candidates on top of frozen poles: the sum of the outputs' costs.
+
+        `shared` are driven by the inputs, `local` are those of the free responses.
+        """
+        costs = [output.candidate_cost(space, shared, local) for output in self.each]
+        power = sum(float(output.y @ output.y) for output in self.each)
+
+        def total(unit: RealArray) -> float:
+            """J at a point (D,) of the unit cube."""
+            return sum(cost.at(unit) for cost in costs)
+
+        return CandidateCost(space, power, total)
 
 
 def prepare_outputs(records: Sequence[Record], structure: Structure) -> OutputRegressions:
-    """Stack records of equal inputs and outputs for one fit; raises ValueError as `prepare_inputs`."""
+    """Records of equal inputs and outputs stacked for one fit.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        input (T, U), output (T, Y).
+    structure : Structure
+        Integrators, delay and nuisance columns, of every output.
+
+    Returns
+    -------
+    OutputRegressions
+
+    Raises
+    ------
+    ValueError
+        Names of outputs differ between records; also as `prepare_inputs`.
+    """
     names = records[0].output_names if records else ("",)
     for record in records:
         if record.output_names != names:
             raise ValueError(
                 f"{record.label}: outputs {list(record.output_names)}, but the first record has {list(names)}"
             )
-    return OutputRegressions(
-        tuple(prepare_inputs([record.only(k) for record in records], structure) for k in range(len(names)))
-    )
+    regressions = []
+    for k in range(len(names)):
+        of_output = [record.only(k) for record in records]
+        regressions.append(prepare_inputs(of_output, structure))
+    return OutputRegressions(tuple(regressions))
 
 
 def whitened(records: Sequence[Record], white: RealArray) -> list[Record]:
-    """The records with outputs white y, white (Y, Y): units are gone."""
+    """Records with outputs white y, white (Y, Y) from the noise covariance of the outputs: units are gone."""
     return [replace(record, output=record.output @ white.T, output_units=()) for record in records]
