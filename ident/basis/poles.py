@@ -1,4 +1,10 @@
-"""The poles of a basis: real ones and conjugate pairs, inside the unit circle."""
+"""The poles of a basis: real ones and conjugate pairs, inside the unit circle.
+
+`Poles` keeps them in the one order that all coefficients, states and sensitivities of a basis have: real
+poles first, then two places per pair. It changes numbers of poles (`without`, `doubled`, `appended`), and
+gives their frequencies, damping ratios and decays. A pole that stays inside the circle is all that is
+assumed: zeros and repeated poles are allowed.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +19,7 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 
 @dataclass(frozen=True, eq=False)
 class Poles:
-    """Discrete-time poles inside the circle: real (R,), then pairs (P,), each by its pole of the upper half
-    plane.
+    """Discrete-time poles inside the circle: real (R,), then pairs (P,), each by its pole above the axis.
 
     Zeros (FIR) and equal poles are allowed; the order is that of the basis functions. Raises ValueError if a
     pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
@@ -24,17 +29,19 @@ class Poles:
     pairs: ComplexArray = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check every pole. Raises ValueError as the class says."""
         lock(self, "real")
         lock(self, "pairs", dtype=np.complex128)
         if self.real.ndim != 1 or self.pairs.ndim != 1:
             raise ValueError(f"poles must be 1-d arrays; got shapes {self.real.shape} and {self.pairs.shape}")
         # Number by number: a search makes tens of these, for a few poles each.
-        real, pairs = self.real.tolist(), self.pairs.tolist()
+        real = self.real.tolist()
+        pairs = self.pairs.tolist()
         for pole in (*real, *pairs):
-            if not math.hypot(pole.real, pole.imag) < 1:
+            modulus = math.hypot(pole.real, pole.imag)
+            if not modulus < 1:
                 raise ValueError(
-                    f"every pole must lie inside the unit circle; got {pole:.6g} "
-                    f"(|p| = {math.hypot(pole.real, pole.imag):.6g})"
+                    f"every pole must lie inside the unit circle; got {pole:.6g} (|p| = {modulus:.6g})"
                 )
         for pole in pairs:
             if not pole.imag > 0:
@@ -49,7 +56,28 @@ class Poles:
         zeta: Iterable[float] = (),
         dt_s: float,
     ) -> Poles:
-        """Real poles exp(-decay dt) and pairs exp((-zeta +- j sqrt(1 - zeta^2)) omega dt), 0 < zeta < 1."""
+        """Poles of a basis from those of continuous time.
+
+        Parameters
+        ----------
+        decay_per_s : iterable of float
+            Of each real pole, which becomes exp(-decay dt); 1/s, positive.
+        omega_rad_s, zeta : iterable of float, equally long
+            Undamped frequency, rad/s, and damping ratio of each pair, which becomes
+            exp((-zeta +- j sqrt(1 - zeta^2)) omega dt).
+        dt_s : float
+            Sampling time, s.
+
+        Returns
+        -------
+        Poles
+
+        Raises
+        ------
+        ValueError
+            dt_s is not positive, a damping ratio is not between 0 and 1, a damped frequency is not between 0
+            and pi / dt_s, or a pole would not lie inside the circle.
+        """
         if not (np.isfinite(dt_s) and dt_s > 0):
             raise ValueError(f"dt_s must be positive; got {dt_s}")
         omega = np.array(list(omega_rad_s), dtype=np.float64)
@@ -61,12 +89,16 @@ class Poles:
         if not (np.all(damping > 0) and np.all(damping < 1)):
             raise ValueError(f"a pair needs 0 < zeta < 1; got {damping}")
         angle = omega * np.sqrt(1 - damping**2) * dt_s
-        if not np.all((angle > 0) & (angle < np.pi)):
+        is_positive = angle > 0
+        is_below_nyquist = angle < np.pi
+        if not np.all(is_positive & is_below_nyquist):
             raise ValueError(
                 f"the damped frequency of a pair must lie in (0, pi/dt); got {angle / dt_s} rad/s"
             )
-        real = np.exp(-np.array(list(decay_per_s), dtype=np.float64) * dt_s)
-        return cls(real, np.exp(-damping * omega * dt_s + 1j * angle))
+        decay = np.array(list(decay_per_s), dtype=np.float64)
+        real = np.exp(-decay * dt_s)
+        pairs = np.exp(-damping * omega * dt_s + 1j * angle)
+        return cls(real, pairs)
 
     @property
     def order(self) -> int:
@@ -75,23 +107,24 @@ class Poles:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Numbers of real poles and of pairs."""
+        """Numbers (R, P) of real poles and of pairs."""
         return self.real.size, self.pairs.size
 
     @property
     def values(self) -> ComplexArray:
-        """All poles (B,): the real ones, then p, conj(p) for each pair."""
-        both = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
-        return np.concatenate([self.real.astype(np.complex128), both])
+        """Poles (B,), both of each pair: the real ones, then p, conj(p) for each pair."""
+        pair_poles = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
+        return np.concatenate([self.real.astype(np.complex128), pair_poles])
 
     def writable(self) -> tuple[RealArray, ComplexArray]:
         """Copies of real and pairs as compiled code takes them (`ident.data.arrays.kernel_array`)."""
         return self.real.copy(), self.pairs.copy()
 
     def blocks(self) -> tuple[Poles, ...]:
-        """Each real pole and each pair by itself, in order."""
-        real = (Poles(real=self.real[i : i + 1]) for i in range(self.real.size))
-        return (*real, *(Poles(pairs=self.pairs[i : i + 1]) for i in range(self.pairs.size)))
+        """Each real pole and each pair by itself, R + P `Poles`, in order."""
+        reals = [Poles(real=self.real[i : i + 1]) for i in range(self.real.size)]
+        pairs = [Poles(pairs=self.pairs[i : i + 1]) for i in range(self.pairs.size)]
+        return (*reals, *pairs)
 
     def without_real(self, index: int | slice) -> Poles:
         """These poles but the real one (or those) at `index`."""
@@ -102,53 +135,66 @@ class Poles:
         return Poles(self.real, np.delete(self.pairs, index))
 
     def doubled(self, n_fixed: tuple[int, int] = (0, 0)) -> Poles:
-        """Every pole twice, neighbours equal: those of Phi2; the first of each type, fixed,
-        once."""
-        kept = zip((self.real, self.pairs), n_fixed, strict=True)
-        return Poles(*(np.concatenate([part[:n], np.repeat(part[n:], 2)]) for part, n in kept))
+        """Every pole twice, neighbours equal, but the first of each type, fixed, once.
+
+        The basis of these poles, Phi2, spans the derivatives of the basis functions by their poles. n_fixed:
+        numbers of fixed real poles and of fixed pairs.
+        """
+        n_fixed_real, n_fixed_pairs = n_fixed
+        real = np.concatenate([self.real[:n_fixed_real], np.repeat(self.real[n_fixed_real:], 2)])
+        pairs = np.concatenate([self.pairs[:n_fixed_pairs], np.repeat(self.pairs[n_fixed_pairs:], 2)])
+        return Poles(real, pairs)
 
     def without(self, others: Poles) -> Poles:
-        """These poles, each of the others taken away once. Raises ValueError if one is not among them."""
-        kept = []
-        for own, theirs in ((self.real, others.real), (self.pairs, others.pairs)):
-            left = own.tolist()
-            for pole in theirs.tolist():
-                if pole not in left:
+        """These poles, each of the others taken away once. Raises ValueError if one is not among them.
+
+        Equal means bit by bit; of equal ones the first is taken away.
+        """
+        remaining_of_type = []
+        for poles, taken_away in ((self.real, others.real), (self.pairs, others.pairs)):
+            remaining = poles.tolist()
+            for pole in taken_away.tolist():
+                if pole not in remaining:
                     raise ValueError(f"{pole:.6g} is not among the poles")
-                left.remove(pole)
-            kept.append(left)
-        return Poles(*kept)
+                remaining.remove(pole)
+            remaining_of_type.append(remaining)
+        return Poles(*remaining_of_type)
 
     def moved(self, changes: RealArray) -> Poles:
-        """These poles after changes (order,): of each real pole, then of real and imaginary part of each
-        pair. Raises ValueError if one leaves the circle, or a pair the upper half."""
-        n = self.real.size
-        return Poles(self.real + changes[:n], self.pairs + changes[n:].reshape(-1, 2) @ (1, 1j))
+        """These poles after changes (B,): of each real pole, then of real and imaginary part of each pair.
+
+        Raises ValueError if a pole leaves the circle, or a pair the upper half plane.
+        """
+        n_real = self.real.size
+        by_pair = changes[n_real:].reshape(-1, 2)
+        return Poles(self.real + changes[:n_real], self.pairs + by_pair @ (1, 1j))
 
     def appended(self, other: Poles) -> Poles:
         """These poles and then the other's, real before pairs."""
         return Poles(np.concatenate([self.real, other.real]), np.concatenate([self.pairs, other.pairs]))
 
     def omega_rad_s(self, dt_s: float) -> RealArray:
-        """Undamped natural frequency |log p|/dt of each pair, (P,)."""
+        """Undamped natural frequency |log p|/dt of each pair, (P,), rad/s."""
         return np.asarray(np.abs(np.log(self.pairs)) / dt_s, dtype=np.float64)
 
     def zeta(self) -> RealArray:
-        """Damping ratio of each pair, (P,), in (0, 1); it does not depend on the sampling time."""
+        """Damping ratio -Re log p / |log p| of each pair, (P,), in (0, 1), of any sampling time."""
         log = np.log(self.pairs)
         return np.asarray(-log.real / np.abs(log), dtype=np.float64)
 
     def decay_per_s(self, dt_s: float) -> RealArray:
-        """Decay rate -log(a)/dt of each real pole, (R,).
+        """Decay rate -log(a)/dt of each real pole, (R,), 1/s.
 
         A pole a <= 0 has no real continuous-time counterpart: its rate is -log|a|/dt, infinite at a = 0.
         """
         with np.errstate(divide="ignore"):
-            return np.asarray(-np.log(np.abs(self.real)) / dt_s, dtype=np.float64)
+            rate = -np.log(np.abs(self.real)) / dt_s
+        return np.asarray(rate, dtype=np.float64)
 
 
+# A basis without functions; also "no unstable poles" and "no fixed poles".
 NO_POLES = Poles()
 
+# Modulus below which a pole stands for a sample of delay, or part of one: it falls to a fifth within a
+# sample. Chosen below .37, the pole of a lag as long as the sampling time, which is a lag and no delay.
 DEADBEAT = 0.2
-"""Modulus below which a pole stands for a sample of delay, or part of one: it falls to a fifth within a
-sample."""

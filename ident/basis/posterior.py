@@ -1,4 +1,11 @@
-"""What identification knows about a response, as a Gaussian over coefficients: evaluable at any frequency."""
+"""What identification knows about a response, as a Gaussian over coefficients: evaluable at any frequency.
+
+The response of a model is linear in its coefficients, so a Gaussian over them is, at each frequency, a
+Gaussian over a complex number: an ellipse. The coefficients are those of the basis, of a direct term and of
+the taps of a kernel for what the poles do not explain (Pillonetto et al., Automatica 50(3), 2014); poles that
+are not certain are linearised (the tangent method, whose basis has every pole twice). `ResponsePosterior`
+gives ellipses, draws and their responses; how it came about is its `EmbeddingReport`.
+"""
 
 from __future__ import annotations
 
@@ -24,12 +31,28 @@ from ident.data.shown import Shown
 class EmbeddingReport:
     """How a posterior came about.
 
-    noise_std: of the (whitened, if ar_coefficients is not empty) noise, output units; alpha, lam: scale of
-    the kernel (in noise variances) and decay per sample at the largest weight; probability_no_remainder: that
-    the poles explain everything; log_evidence: of the best kernel over none; n_rows: samples after nuisance
-    columns; ar_coefficients: a_1 .. a_n of 1 / (1 + a_1 q^-1 + ...). probability_missed_mode: that the poles
-    lack a lightly damped mode, most probably at missed_mode_rad_s (0: nowhere); n_added_modes: beyond the
-    model's poles, too plain to be left to a probability.
+    Attributes
+    ----------
+    method : str
+        Name of the method, as reports show it.
+    noise_std : float
+        Of the noise, output units; whitened, if ar_coefficients is not empty.
+    alpha, lam : float
+        Kernel of the taps at the largest weight: scale in noise variances, decay per sample.
+    probability_no_remainder : float
+        Probability that the poles explain everything.
+    log_evidence : float
+        Of the best kernel over none.
+    n_rows, n_regressors : int
+        Samples after nuisance columns; columns of the regression.
+    ar_coefficients : tuple of float
+        a_1 .. a_n of the noise 1 / (1 + a_1 q^-1 + ...); empty: white.
+    probability_missed_mode : float
+        Probability that the poles lack a lightly damped mode.
+    missed_mode_rad_s : float
+        Where that is most probably, rad/s; 0: nowhere.
+    n_added_modes : int
+        Modes beyond the model's poles, too plain to be left to a probability.
     """
 
     method: str
@@ -51,24 +74,42 @@ class EmbeddingReport:
         return AutoregressiveNoise(np.array([1.0, *self.ar_coefficients]))
 
 
-# Checks at other levels, and stages after one another, ask for the same frequencies again.
-@lru_cache(maxsize=16)
+# Posteriors and frequency grids whose ellipses are remembered: checks at other levels, and stages after one
+# another, ask for the same ones again, a handful at a time. Chosen; it costs
+# hits.
+_REMEMBERED = 16
+# How far above pi / dt, as a share of it, a frequency may lie: the rounding of tables with ten digits.
+_NYQUIST_ROUNDING = 1e-9
+
+
+@lru_cache(maxsize=_REMEMBERED)
 def _centre_and_covariance(
     posterior: ResponsePosterior, omega: bytes, shape: tuple[int, ...]
 ) -> tuple[ComplexArray, RealArray]:
-    rows = posterior.frequency_rows(np.frombuffer(omega).reshape(shape))
+    """Centre (F,) and covariances (F, 2, 2) of real and imaginary part at frequencies, rad/s.
+
+    They are given as the bytes and the shape of an array, which a cache can compare.
+    """
+    omega_rad_s = np.frombuffer(omega).reshape(shape)
+    rows = posterior.frequency_rows(omega_rad_s)
     return rows @ posterior.mean, spread_covariance(rows, posterior.square_factor)
 
 
 def _delays(z: ComplexArray, most: int) -> ComplexArray:
-    """z^-1 .. z^-most (F, most), by doubling: an exponential of each takes many times as long."""
+    """z^-1 .. z^-most at points z (F,) of the unit circle, (F, most).
+
+    By doubling: an exponential of each takes many times as long.
+    """
     powers = np.empty((z.size, most), dtype=np.complex128)
-    powers[:, :1] = z.conj()[:, None]  # on the unit circle
-    known = 1
-    while known < most:
-        more = min(known, most - known)
-        np.multiply(powers[:, :more], powers[:, known - 1 : known], out=powers[:, known : known + more])
-        known += more
+    # On the unit circle 1/z is the conjugate.
+    powers[:, :1] = z.conj()[:, None]
+    n_known = 1
+    while n_known < most:
+        n_new = min(n_known, most - n_known)
+        known_powers = powers[:, :n_new]
+        highest_power = powers[:, n_known - 1 : n_known]
+        np.multiply(known_powers, highest_power, out=powers[:, n_known : n_known + n_new])
+        n_known += n_new
     return powers
 
 
@@ -76,10 +117,31 @@ def _delays(z: ComplexArray, most: int) -> ComplexArray:
 class ResponsePosterior(Shown):
     """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
 
-    poles: of the L_i (doubled ones for the tangent method); has_feedthrough: whether d is among the
-    coefficients; fir_length L. mean (P,), covariance S S^T of covariance_factor S (P,P'), P = poles.order +
-    has_feedthrough + L, in the order a, d, h_1 .. h_L. unstable: as in `GobfModel`; how far each image is off
-    (real; real and imaginary part of a pair) are further coefficients, to first order.
+    Raises ValueError if shapes do not fit, or a number is not finite or negative.
+
+    Attributes
+    ----------
+    poles : Poles
+        Of the L_i, B of them (doubled ones for the tangent method).
+    mean : ndarray, shape (P,)
+        In the order a (B,), d if has_feedthrough, h_1 .. h_L, and how far each mirror image of an unstable
+        pole is off, to first order (real; real and imaginary part of a pair).
+    covariance_factor : ndarray, shape (P, P')
+        S, where the covariance is S S^T.
+    dt_s : float
+        Sampling time, s.
+    fir_length : int
+        L, number of taps.
+    has_feedthrough : bool
+        Whether d is among the coefficients.
+    integrators, input_delay_samples : int
+        The known factor.
+    input_name, output_name : str
+        Names of the channel.
+    report : EmbeddingReport or None
+        How it came about.
+    unstable : Poles
+        Mirror images of the unstable poles, as in `GobfModel`.
     """
 
     poles: Poles
@@ -96,9 +158,12 @@ class ResponsePosterior(Shown):
     unstable: Poles = field(default=NO_POLES, metadata={"since": 2})
 
     def __post_init__(self) -> None:
+        """Lock the arrays and check all fields. Raises ValueError as the class says."""
         lock(self, "mean", "covariance_factor")
-        mean, factor = self.mean, self.covariance_factor
-        size = self.poles.order + int(self.has_feedthrough) + self.fir_length + self.unstable.order
+        mean = self.mean
+        factor = self.covariance_factor
+        n_direct = int(self.has_feedthrough)
+        size = self.poles.order + n_direct + self.fir_length + self.unstable.order
         if mean.shape != (size,) or factor.ndim != 2 or factor.shape[0] != size:
             raise ValueError(
                 f"need mean ({size},) and covariance_factor ({size}, P'); got {mean.shape}, {factor.shape}"
@@ -111,16 +176,37 @@ class ResponsePosterior(Shown):
             raise ValueError("fir_length, integrators and input_delay_samples must not be negative")
 
     def frequency_rows(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
-        """(F,P) matrix that maps coefficients to the response at omega (F,) [rad/s], 0 <= omega <= pi / dt_s.
+        """Matrix that maps coefficients (P,) to the response.
 
-        Raises ValueError outside that range, and at omega = 0 when there are integrators.
+        Parameters
+        ----------
+        omega_rad_s : array-like, shape (F,)
+            Frequencies, rad/s, 0 <= omega <= pi / dt_s.
+
+        Returns
+        -------
+        ndarray of complex, shape (F, P)
+
+        Raises
+        ------
+        ValueError
+            A frequency outside that range, or omega = 0 when there are integrators.
+
+        Notes
+        -----
+        With unstable poles G = N / B, and a change of a mirror image p moves G by -G d log B / dp: these are
+        the last columns, with G at the mean.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         nyquist = np.pi / self.dt_s
-        if omega.ndim != 1 or not np.all((omega >= 0) & (omega <= nyquist * (1 + 1e-9))):
+        is_below = omega <= nyquist * (1 + _NYQUIST_ROUNDING)
+        is_positive = omega >= 0
+        if omega.ndim != 1 or not np.all(is_positive & is_below):
             raise ValueError(f"omega (F,) is in rad/s, from 0 to pi / dt_s = {nyquist:.6g}")
         if self.integrators and not np.all(omega > 0):
             raise ValueError("the response of an integrator has no value at omega = 0")
+
+        # Basis, direct term and taps, side by side; then the factor that they share.
         z = np.exp(1j * omega * self.dt_s)
         parts = [basis_response(self.poles, z)]
         if self.has_feedthrough:
@@ -132,11 +218,12 @@ class ResponsePosterior(Shown):
         if not self.unstable.order:
             return rows
         response = rows @ self.mean[: rows.shape[1]]
-        return np.hstack([rows, -response[:, None] * log_all_pass_slopes(self.unstable, z)])
+        by_unstable = -response[:, None] * log_all_pass_slopes(self.unstable, z)
+        return np.hstack([rows, by_unstable])
 
     @cached_property
     def square_factor(self) -> RealArray:
-        """(P,P) lower triangle L of the covariance L L^T, column-major."""
+        """Lower triangle L (P, P) of the covariance L L^T, column-major, as BLAS takes it."""
         # P' may be larger than P, and half of a triangle is zero.
         triangle = np.asarray(np.linalg.qr(self.covariance_factor.T, mode="r"))
         square = np.zeros((self.mean.size, self.mean.size), order="F")
@@ -144,18 +231,31 @@ class ResponsePosterior(Shown):
         return square
 
     def at(self, omega_rad_s: npt.ArrayLike, level: float = 0.95) -> FrequencyUncertainty:
-        """Centre and 2x2 covariances at any strictly increasing omega (F,) [rad/s]."""
+        """Ellipses of the response at given frequencies.
+
+        Parameters
+        ----------
+        omega_rad_s : array-like, shape (F,)
+            Strictly increasing frequencies, rad/s; limits as in `frequency_rows`.
+        level : float
+            Probability that an ellipse holds the response at its frequency.
+
+        Returns
+        -------
+        FrequencyUncertainty
+            Centre (F,) and covariances (F, 2, 2) of real and imaginary part.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         centre, covariance = _centre_and_covariance(self, omega.tobytes(), omega.shape)
         method = self.report.method if self.report is not None else "coefficient posterior"
         return FrequencyUncertainty(omega, centre, covariance, self.dt_s, level, method)
 
     def centre(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
-        """Posterior mean response (F,) alone."""
+        """Posterior mean response (F,) at omega (F,), rad/s, without its uncertainty."""
         return np.asarray(self.frequency_rows(omega_rad_s) @ self.mean)
 
     def sample(self, rng: np.random.Generator, n_draws: int) -> RealArray:
-        """(n_draws, P) coefficient draws."""
+        """Draws (n_draws, P) of the coefficients."""
         noise = rng.standard_normal((n_draws, self.covariance_factor.shape[1]))
         return np.asarray(self.mean + noise @ self.covariance_factor.T)
 
@@ -164,25 +264,31 @@ class ResponsePosterior(Shown):
         return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
 
     def simulate(self, u: RealArray, coefficients: RealArray | None = None) -> RealArray:
-        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,). Raises
-        ValueError for an unstable plant."""
+        """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,).
+
+        Raises ValueError for an unstable plant, and for another number of coefficients.
+        """
         refuse_unstable(self.unstable)
         values = self.mean if coefficients is None else np.asarray(coefficients, dtype=np.float64)
         if values.shape != self.mean.shape:
             raise ValueError(f"need coefficients {self.mean.shape}; got {values.shape}")
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
-        n_poles, n_direct = self.poles.order, int(self.has_feedthrough)
-        taps = np.concatenate([np.zeros(1), values[n_poles + n_direct :]])
+        # The direct term is the tap of the present sample.
+        n_poles = self.poles.order
+        n_before_taps = n_poles + int(self.has_feedthrough)
+        taps = np.concatenate([np.zeros(1), values[n_before_taps:]])
         if self.has_feedthrough:
             taps[0] = values[n_poles]
-        return np.asarray(
-            regressor(self.poles, filtered) @ values[:n_poles] + lfilter(taps, np.ones(1), filtered)
-        )
+        through_basis = regressor(self.poles, filtered) @ values[:n_poles]
+        return np.asarray(through_basis + lfilter(taps, np.ones(1), filtered))
 
     @property
     def stable_part(self) -> ResponsePosterior:
-        """B G, without the unstable poles."""
-        kept = slice(self.mean.size - self.unstable.order)
+        """Posterior of the stable part B G: without the unstable poles and their coefficients."""
+        of_stable = slice(self.mean.size - self.unstable.order)
         return replace(
-            self, mean=self.mean[kept], covariance_factor=self.covariance_factor[kept], unstable=NO_POLES
+            self,
+            mean=self.mean[of_stable],
+            covariance_factor=self.covariance_factor[of_stable],
+            unstable=NO_POLES,
         )

@@ -1,4 +1,10 @@
-"""What is known or assumed around the basis: integrators, delay, direct term, and nuisance columns."""
+"""What is known or assumed around the basis: integrators, delay, direct term, and nuisance columns.
+
+A fit finds the coefficients of a basis for given poles; everything else it needs to know about the plant is a
+`Structure`. Integrators and delay are applied to signals before the fit, exactly and from rest
+(`driving_input`), and to frequency responses as a factor (`front_response`); the output of an unstable plant
+goes through an all-pass first (`stabilised`).
+"""
 
 from __future__ import annotations
 
@@ -14,10 +20,26 @@ from ident.data.arrays import ComplexArray, RealArray, one_signal
 class Structure:
     """Fixed structure of y = [sum_i c_i L_i(q) + feedthrough] (1 - q^-1)^-integrators q^-delay u + nuisance.
 
-    Nuisance of each record: a constant (`estimate_offset`), and with `estimate_initial_state` the free
-    responses of all poles and the polynomials that integrators leave free (1, k, ... k^(integrators - 1)).
-    `relative_degree`: of the continuous plant behind the hold (1: no direct term). `unstable`: mirrored, see
-    `stabilised`.
+    Raises ValueError for negative numbers, and for a relative degree above 1 with a direct term or unstable
+    poles.
+
+    Attributes
+    ----------
+    integrators : int
+        Number of poles at z = 1.
+    input_delay_samples : int
+        Delay of the input, samples.
+    feedthrough : bool
+        There is a direct term from the input to the output of the same sample.
+    estimate_offset : bool
+        Each record has a constant on its output.
+    estimate_initial_state : bool
+        Each record has the free responses of all poles and the polynomials that integrators leave free
+        (1, k, ... k^(integrators - 1)).
+    relative_degree : int
+        Of the continuous plant behind the hold (1: no direct term).
+    unstable : Poles
+        Mirror images of the unstable poles, see `stabilised`.
     """
 
     integrators: int = 0
@@ -29,13 +51,14 @@ class Structure:
     unstable: Poles = NO_POLES
 
     def __post_init__(self) -> None:
+        """Check the numbers. Raises ValueError as the class says."""
         if not (self.integrators >= 0 and self.input_delay_samples >= 0):
             raise ValueError(
                 "integrators and input_delay_samples must not be negative; "
                 f"got {self.integrators} and {self.input_delay_samples}"
             )
-        more = self.feedthrough or self.unstable.order
-        if not self.relative_degree >= 1 or (more and self.relative_degree > 1):
+        needs_degree_one = self.feedthrough or self.unstable.order
+        if not self.relative_degree >= 1 or (needs_degree_one and self.relative_degree > 1):
             raise ValueError(
                 "relative_degree must be at least 1, and 1 with a direct term or unstable poles; got "
                 f"{self.relative_degree}, feedthrough = {self.feedthrough}, {self.unstable.order} unstable"
@@ -44,11 +67,16 @@ class Structure:
     @property
     def n_polynomials(self) -> int:
         """Number of polynomial nuisance columns per record, degrees 0, 1, ..."""
-        return max(int(self.estimate_offset), self.integrators if self.estimate_initial_state else 0)
+        of_offset = 1 if self.estimate_offset else 0
+        of_integrators = self.integrators if self.estimate_initial_state else 0
+        return max(of_offset, of_integrators)
 
 
 def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
-    """(1 - q^-1)^-integrators q^-delay u (T,) or (T, 1), from rest: delayed by samples, summed, exact."""
+    """Input (1 - q^-1)^-integrators q^-delay u behind integrators and delay, from rest, (T,).
+
+    u (T,) or (T, 1): delayed by whole samples, then summed, the present sample included; both are exact.
+    """
     u = one_signal(u)
     delayed = np.zeros_like(u)
     delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]
@@ -58,41 +86,70 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
 
 
 def answered(signal: RealArray, delay_samples: int) -> RealArray:
-    """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its recorded input. Raises
-    ValueError where none is left."""
+    """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its recorded input.
+
+    The first `delay_samples` rows answer to what was before the record. Raises ValueError where none is left.
+    """
     if not len(signal) > delay_samples:
         raise ValueError(f"{len(signal)} samples, not more than the input delay {delay_samples}")
     return signal[delay_samples:]
 
 
 def stabilised(y: RealArray, unstable: Poles) -> RealArray:
-    """B(q) y (T,), from rest, B the all-pass whose zeros are the unstable poles and whose poles are their
-    mirror images 1 / conj(p). B G is stable, B v white if v is, and in a loop independent of past inputs
-    (Forssell and Ljung, Automatica 36(1), 2000)."""
+    """Output B(q) y of a plant without its unstable poles, (T,), from rest.
+
+    Parameters
+    ----------
+    y : ndarray, shape (T,)
+        Output of one record.
+    unstable : Poles
+        Mirror images 1 / conj(p) of the unstable poles p; none: y itself is returned.
+
+    Notes
+    -----
+    B is the all-pass whose zeros are the unstable poles and whose poles are their mirror images. B G is
+    stable, B v white if v is, and in a loop independent of past inputs.
+
+    References
+    ----------
+    U. Forssell, L. Ljung, "Identification of unstable systems using output error and Box-Jenkins model
+    structures", Automatica 36(1), 2000.
+    """
     if not unstable.order:
         return y
-    from ident.basis.functions import all_pass_signal  # its compiled code is slow to load; options are not
+    # Here and not above: its compiled code is slow to load, and settings need this file, but no signals.
+    from ident.basis.functions import all_pass_signal
 
     return all_pass_signal(unstable, y)
 
 
 def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
-    """(1 - q^-1)^-integrators q^-delay u in the rows that answer to u (T,): (T - delay,), from rest."""
+    """Input behind integrators and delay in the rows that answer to u (T,), (T - delay,), from rest.
+
+    Raises ValueError where the record is not longer than the delay.
+    """
     return answered(filter_input(u, integrators, delay_samples), delay_samples)
 
 
 def level_before(u: RealArray) -> float:
-    """Input before a record (T,) whose offset and initial state are unknown: zero, unless the input never
-    comes near it; then its first value. Basis functions hold the difference in their free responses, taps do
-    not."""
-    return 0.0 if np.min(u) <= 0 <= np.max(u) else float(u[0])
+    """Input before a record u (T,) whose offset and initial state are unknown, in units of the input.
+
+    Zero, unless the input never comes near it; then its first value. Basis functions hold the difference in
+    their free responses, taps do not.
+    """
+    passes_zero = np.min(u) <= 0 <= np.max(u)
+    return 0.0 if passes_zero else float(u[0])
 
 
 def front_response(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
-    """(z/(z - 1))^integrators z^-delay at omega (F,) in rad/s (not 0 with integrators), (F,)."""
+    """Response (z/(z - 1))^integrators z^-delay of integrators and delay, (F,).
+
+    omega_rad_s (F,): rad/s, not 0 with integrators, where it is infinite. dt_s: sampling time, s.
+    """
     response = np.exp(-1j * omega_rad_s * dt_s * delay_samples)
     if integrators:
         # 1 - z^-1 written with sin keeps its digits near omega = 0 where the difference would lose them.
-        half = 0.5 * omega_rad_s * dt_s
-        response = response / (2j * np.sin(half) * np.exp(-1j * half)) ** integrators
+        half_angle = 0.5 * omega_rad_s * dt_s
+        difference = 2j * np.sin(half_angle) * np.exp(-1j * half_angle)
+        response = response / difference**integrators
     return np.asarray(response, dtype=np.complex128)
