@@ -21,54 +21,69 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.json_text import json_value
 from ident.data.mat_files import mat_bytes, mat_variables
 
-# The state matrices are computed anew on reading; another machine may round differently.
+# Largest difference of a stated and a computed entry of a state matrix, over 1 plus the largest entry. They
+# are computed anew on reading, and another machine may round differently, by about 1e-14; a pole that was
+# changed by hand in one place shows from its ninth digit on. Ten times more or less would do.
 _STATE_TOLERANCE = 1e-9
+# Characters of a wrong `format` that a message shows: enough to tell what the file is.
+_SHOWN_CHARACTERS = 60
 
 
 @dataclass(frozen=True, eq=False)
 class ModelFile:
-    """A model and, optionally, the ellipses of its response, as they are written to and read from a file."""
+    """A model and, optionally, the ellipses of its response, as they are written to and read from a file.
+
+    Raises ValueError where the sampling times of the two differ.
+    """
 
     model: GobfModel
     ellipses: FrequencyUncertainty | None = None
 
     def __post_init__(self) -> None:
+        """Check that the ellipses are of the model's sampling time."""
         if self.ellipses is not None and self.ellipses.dt_s != self.model.dt_s:
             raise ValueError(
                 f"the ellipses' dt_s = {self.ellipses.dt_s} is not the model's, {self.model.dt_s}"
             )
 
     def _document(self) -> dict[str, Any]:
-        """The fields of the file, in its order."""
+        """Fields of the file, in its order: text, numbers, arrays, and fields of the ellipses."""
         model = self.model
         document: dict[str, Any] = {"format": FORMAT, "format_version": FORMAT_VERSION}
         names = ("input_name", "output_name", "dt_s", "integrators", "input_delay_samples", "feedthrough")
-        document |= {name: getattr(model, name) for name in names}
-        document |= {"poles_real": model.poles.real, "poles_pairs": model.poles.pairs}
+        for name in names:
+            document[name] = getattr(model, name)
+        document["poles_real"] = model.poles.real
+        document["poles_pairs"] = model.poles.pairs
+        # Only where there are any: files of stable models are read by earlier versions, too.
         if model.unstable.order:
-            document |= {"unstable_real": model.unstable.real, "unstable_pairs": model.unstable.pairs}
-        document |= {"coefficients": model.coefficients}
+            document["unstable_real"] = model.unstable.real
+            document["unstable_pairs"] = model.unstable.pairs
+        document["coefficients"] = model.coefficients
         document |= zip("ABCD", model.state_space(), strict=True)
         if self.ellipses is not None:
-            own = ("level", "method", "omega_rad_s", "centre", "covariance")
-            document["ellipses"] = {name: getattr(self.ellipses, name) for name in own}
+            of_ellipses = ("level", "method", "omega_rad_s", "centre", "covariance")
+            document["ellipses"] = {name: getattr(self.ellipses, name) for name in of_ellipses}
         return document
 
     def to_json(self) -> str:
         """JSON text; floats with as many digits as they have, so that reading gives the same bits."""
-        text = json.dumps(
-            self._document(),
-            # A complex array as rows [real part, imaginary part].
-            default=lambda a: (np.column_stack([a.real, a.imag]) if np.iscomplexobj(a) else a).tolist(),
-            indent=1,
-            allow_nan=False,
-            ensure_ascii=False,
-        )
+
+        def as_lists(array: Any) -> Any:
+            """Lists of an array, of a complex one as rows [real part, imaginary part]."""
+            if np.iscomplexobj(array):
+                array = np.column_stack([array.real, array.imag])
+            return array.tolist()
+
+        text = json.dumps(self._document(), default=as_lists, indent=1, allow_nan=False, ensure_ascii=False)
         return text + "\n"
 
     @classmethod
     def from_json(cls, text: str, source: str = "model file") -> ModelFile:
-        """Inverse of `to_json`. ValueError: one line that begins with `source`."""
+        """Model file of the text that `to_json` made.
+
+        Raises ValueError, one line that begins with `source`, where it is no such text.
+        """
         try:
             document = json_value(text)
         except ValueError as error:
@@ -85,7 +100,10 @@ class ModelFile:
 
     @classmethod
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:
-        """Inverse of `to_mat`. ValueError: one line that begins with `source`."""
+        """Model file of the bytes that `to_mat` made.
+
+        Raises ValueError, one line that begins with `source`, where they are no such file.
+        """
         document: dict[str, Any] = _plain(mat_variables(content, source))
         return _read(document, source)
 
@@ -98,8 +116,13 @@ def _plain(value: Any) -> Any:
 
 
 def _read(document: Mapping[str, Any], source: str) -> ModelFile:
+    """Model file of the fields that were read from `source`.
+
+    Raises ValueError, one line that begins with `source`: another format or version, a field that is missing
+    or of another kind, or state matrices that are not those of the poles and coefficients.
+    """
     if document.get("format") != FORMAT:
-        shown = repr(document["format"])[:60] if "format" in document else "missing"
+        shown = repr(document["format"])[:_SHOWN_CHARACTERS] if "format" in document else "missing"
         raise ValueError(f"{source}: not a model file: 'format' is {shown}, expected '{FORMAT}'")
     version = document.get("format_version")
     if version != FORMAT_VERSION:
@@ -116,46 +139,58 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
         for name, computed in zip("ABCD", model.state_space(), strict=True):
             stated = np.asarray(_array(document, name), dtype=np.float64)
             scale = 1.0 + np.abs(computed).max(initial=0.0)
-            same_size = stated.size == computed.size  # of an empty matrix neither format keeps the shape
-            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is not the same either
-                off = np.abs(stated.reshape(computed.shape) - computed) if same_size else np.inf
-            if not np.all(off <= _STATE_TOLERANCE * scale):
+            # By size and not by shape: of an empty matrix neither format keeps the shape.
+            difference: Any = np.inf
+            if stated.size == computed.size:
+                # What is not finite is not the same either; it needs no warning.
+                with np.errstate(over="ignore", invalid="ignore"):
+                    difference = np.abs(stated.reshape(computed.shape) - computed)
+            if not np.all(difference <= _STATE_TOLERANCE * scale):
                 raise ValueError(
                     f"'{name}' is not the state matrix of these poles and coefficients; change the poles and "
                     "coefficients, and write the file again"
                 )
-        ellipses = document.get("ellipses")
-        return ModelFile(model, None if ellipses is None else _read_ellipses(ellipses, model.dt_s))
+        ellipse_fields = document.get("ellipses")
+        if ellipse_fields is None:
+            return ModelFile(model)
+        return ModelFile(model, _read_ellipses(ellipse_fields, model.dt_s))
     except ValueError as error:
         raise ValueError(f"{source}: {' '.join(str(error).split())}") from None
 
 
 def _read_ellipses(document: Any, dt_s: float) -> FrequencyUncertainty:
+    """Ellipses of their fields in a file; dt_s, s, is the model's. Raises ValueError for wrong fields."""
     if not isinstance(document, Mapping):
         raise ValueError("'ellipses' must hold fields; expected the ones that were written")
     fields = {name: read(document, name) for name, read in _ELLIPSES.items()}
-    fields["covariance"] = np.asarray(fields["covariance"], dtype=np.float64).reshape(-1, 2, 2)
+    # (F, 2, 2), whichever shape the format has kept of it.
+    covariance = np.asarray(fields["covariance"], dtype=np.float64)
+    fields["covariance"] = covariance.reshape(-1, 2, 2)
     return FrequencyUncertainty(**fields, dt_s=dt_s)
 
 
 def _field(document: Mapping[str, Any], name: str) -> Any:
+    """Value of a field. Raises ValueError where it is missing."""
     if name not in document:
         raise ValueError(f"the field '{name}' is missing")
     return document[name]
 
 
 def _array(document: Mapping[str, Any], name: str) -> Any:
+    """Array of numbers of a field, of any shape. Raises ValueError where it is none."""
     value = _field(document, name)
     try:
         array = np.asarray(value)
         if array.dtype.kind in "fiuc" or array.size == 0:
             return array
     except ValueError:
-        pass  # rows of unequal length
+        # Rows of unequal length: said below.
+        pass
     raise ValueError(f"the field '{name}' must be an array of numbers")
 
 
 def _vector(document: Mapping[str, Any], name: str) -> Any:
+    """Real numbers of a field, (n,). Raises ValueError where they are complex or no numbers."""
     array = _array(document, name)
     if array.dtype.kind == "c":
         raise ValueError(f"the field '{name}' must be real")
@@ -163,7 +198,10 @@ def _vector(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _complex_vector(document: Mapping[str, Any], name: str) -> Any:
-    """Complex numbers from MATLAB, or rows [real part, imaginary part] from JSON."""
+    """Complex numbers of a field, (n,): from MATLAB as they are, from JSON rows [real part, imaginary part].
+
+    Raises ValueError for other rows.
+    """
     array = _array(document, name)
     if array.size == 0:
         return np.zeros(0, dtype=np.complex128)
@@ -176,6 +214,7 @@ def _complex_vector(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _number(document: Mapping[str, Any], name: str) -> float:
+    """Number of a field, as a float. Raises ValueError for anything else, true and false included."""
     value = _field(document, name)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"the field '{name}' must be a number")
@@ -183,6 +222,7 @@ def _number(document: Mapping[str, Any], name: str) -> float:
 
 
 def _count(document: Mapping[str, Any], name: str) -> int:
+    """Whole number of a field, at least 0. Raises ValueError for anything else."""
     value = _number(document, name)
     if not (value >= 0 and value == int(value)):
         raise ValueError(f"the field '{name}' must be a whole number, at least 0; got {value}")
@@ -190,12 +230,14 @@ def _count(document: Mapping[str, Any], name: str) -> int:
 
 
 def _text(document: Mapping[str, Any], name: str) -> str:
+    """Text of a field. Raises ValueError for anything else."""
     value = _field(document, name)
     if not isinstance(value, str):
         raise ValueError(f"the field '{name}' must be text")
     return value
 
 
+# Fields of a model, and what reads each.
 _MODEL = {
     "poles_real": _vector,
     "poles_pairs": _complex_vector,
@@ -207,6 +249,7 @@ _MODEL = {
     "input_name": _text,
     "output_name": _text,
 }
+# Fields of ellipses, and what reads each.
 _ELLIPSES = {
     "omega_rad_s": _vector,
     "centre": _complex_vector,

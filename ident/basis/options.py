@@ -1,4 +1,11 @@
-"""Settings of an identification and of its uncertainty, checked when they are read."""
+"""Settings of an identification and of its uncertainty, checked when they are read.
+
+`IdentOptions` holds what a user knows or limits (numbers of poles, fixed poles, delay, integrators, bounds)
+and how the search works; `EmbeddingOptions` holds those of the uncertainty estimate. pydantic checks each
+value, the validators here what concerns several of them. A setting that was stated is kept apart from one at
+its default, because the data decide about the latter: see `is_stated` and `states`. Ranges of the fields
+(`ge`, `le`) keep out typing errors; what they bound is said in the description that the user reads.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +20,8 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.settings import Settings
 
+# Algorithms of NLopt by its own names: DIRECT and its locally biased variant DIRECT-L, with or without
+# scaling of the box, randomised, and Gablonsky's original code.
 Algorithm = Literal[
     "GN_DIRECT_L",
     "GN_DIRECT",
@@ -117,37 +126,53 @@ class IdentOptions(Settings):
     @field_validator("fixed_poles", "unstable_poles", mode="before")
     @classmethod
     def _numbers(cls, given: Any) -> Any:
-        """`Poles` and complex numbers as parts; of a conjugate pair, the upper one."""
+        """Poles as pairs (real part, imaginary part), before pydantic checks them.
+
+        `given` may be `Poles`, or a list of numbers and of such pairs: of a conjugate pair of complex numbers
+        the upper one remains. What is neither stays as it is, for pydantic to refuse. Raises ValueError where
+        it is no list.
+        """
         poles = list(given.values) if isinstance(given, Poles) else given
         if not isinstance(poles, (list, tuple, np.ndarray)):
             raise ValueError(
                 "expected a list, with a number for a real pole and [real part, imaginary part] for a pair: "
                 "[0.9, [0.95, 0.2]]"
             )
-        values = [complex(p) if isinstance(p, Complex) else p for p in poles]
-        upper = [p for p in values if not isinstance(p, complex) or p.imag >= 0 or np.conj(p) not in values]
-        return tuple(
-            (p.real, p.imag) if isinstance(p, complex) else tuple(p) if isinstance(p, list) else p
-            for p in upper
-        )
+        values = [complex(pole) if isinstance(pole, Complex) else pole for pole in poles]
+        parts: list[Any] = []
+        for value in values:
+            if isinstance(value, complex):
+                is_lower_of_pair = value.imag < 0 and np.conj(value) in values
+                if not is_lower_of_pair:
+                    parts.append((value.real, value.imag))
+            elif isinstance(value, list):
+                parts.append(tuple(value))
+            else:
+                parts.append(value)
+        return tuple(parts)
 
     @model_validator(mode="after")
     def _consistent(self) -> IdentOptions:
+        """These settings, which do not contradict one another. Raises ValueError where two do."""
         for low, high in (
             ("omega_min_rad_s", "omega_max_rad_s"),
             ("zeta_min", "zeta_max"),
             ("decay_min_per_s", "decay_max_per_s"),
         ):
-            lowest, highest = getattr(self, low), getattr(self, high)
+            lowest = getattr(self, low)
+            highest = getattr(self, high)
             if lowest is not None and highest is not None and not lowest < highest:
                 raise ValueError(f"{low} must be below {high}; got {lowest} and {highest}")
-            if self.coordinates == "raw" and not (lowest is None and highest is None):
+            is_stated = lowest is not None or highest is not None
+            if self.coordinates == "raw" and is_stated:
                 raise ValueError(f"{low} and {high} need coordinates = 'log'")
+        # Raises ValueError where a known pole is on the wrong side of the unit circle.
         self.fixed()
         self._refuse_impossible_relative_degree()
         return self
 
     def _refuse_impossible_relative_degree(self) -> None:
+        """Raise ValueError where the stated relative degree and another setting exclude each other."""
         if self.relative_degree is None:
             return
         if self.feedthrough:
@@ -158,8 +183,11 @@ class IdentOptions(Settings):
                     "relative_degree needs poles with a continuous-time counterpart; fixed_poles has "
                     f"[{re:.6g}, 0], expected a positive real part"
                 )
-        if isinstance(self.relative_degree, int) and None not in (self.n_real, self.n_pairs):
-            order = self.fixed().order + (self.n_real or 0) + 2 * (self.n_pairs or 0)
+        # Where the data choose a number of poles, they choose one that is large enough.
+        n_real = self.n_real
+        n_pairs = self.n_pairs
+        if isinstance(self.relative_degree, int) and n_real is not None and n_pairs is not None:
+            order = self.fixed().order + n_real + 2 * n_pairs
             if order < self.relative_degree:
                 raise ValueError(
                     f"relative_degree = {self.relative_degree} needs at least that many poles, integrators "
@@ -170,33 +198,41 @@ class IdentOptions(Settings):
     _stated: frozenset[str] = PrivateAttr(default=frozenset())
 
     def model_post_init(self, context: Any) -> None:
+        """Remember which settings were stated."""
         self._stated = frozenset(self.model_fields_set)
 
     def is_stated(self, key: str) -> bool:
-        """Whether somebody set this key; what the program chose for a copy, from the data, nobody did."""
+        """Whether somebody set this key; not what the program chose from the data, for a copy."""
         return key in self._stated
 
     def fixed(self) -> Poles:
-        """The fixed poles, mirror images of unstable ones last; ValueError if one is not inside the circle.
+        """Fixed poles of the basis: zeros of the integrators, known poles, mirror images of unstable ones.
+
+        In that order within each type. Raises ValueError if one is not inside the circle.
 
         Each integrator adds a pole at z = 0. Its filter z/(z - 1) puts a zero there; with the pole the
         numerator is as free as with the integrator among the poles.
         """
-        real = [0.0] * self.integrators + [re for re, im in self.fixed_poles if im == 0]
+        of_integrators = [0.0] * self.integrators
+        known_real = [re for re, im in self.fixed_poles if im == 0]
+        real = of_integrators + known_real
         pairs = [complex(re, im) for re, im in self.fixed_poles if im != 0]
         return Poles(real, pairs).appended(self.unstable())  # type: ignore[arg-type]
 
     def unstable(self) -> Poles:
-        """Mirror images of the unstable poles; ValueError if one is not outside the circle."""
+        """Mirror images 1 / conj(p) of the unstable poles p. Raises ValueError if |p| is not above 1."""
         real = [1 / re for re, im in self.unstable_poles if im == 0]
         pairs = [1 / complex(re, -im) for re, im in self.unstable_poles if im != 0]
         return Poles(real, pairs)  # type: ignore[arg-type]
 
     def with_unstable(self, mirrored: Poles) -> IdentOptions:
-        """The same with these unstable poles, given by their mirror images."""
-        poles = [*mirrored.real, *mirrored.pairs]
-        outside = tuple((float((1 / p).real), -float((1 / p).imag)) for p in poles)
-        return self.model_copy(update={"unstable_poles": outside})
+        """Copy of these settings with the unstable poles whose mirror images are `mirrored`."""
+        outside = []
+        for image in (*mirrored.real, *mirrored.pairs):
+            inverse = 1 / image
+            # The pole is 1 / conj(image), above the axis as its image is.
+            outside.append((float(inverse.real), -float(inverse.imag)))
+        return self.model_copy(update={"unstable_poles": tuple(outside)})
 
     def states(self, *names: str) -> bool:
         """Whether at least one of these settings was stated, be it at its default.
@@ -210,15 +246,18 @@ class IdentOptions(Settings):
 
     @property
     def delay_left_to_data(self) -> bool:
-        """Nobody stated a delay, not even that there is none."""
+        """Whether nobody stated a delay, not even that there is none."""
         return not self.states("input_delay_samples")
 
     def with_delay_stated(self) -> IdentOptions:
-        """The same, the delay no longer sought: what is no record of one input and one output has none."""
+        """Copy of these settings whose delay counts as stated, and is no longer sought.
+
+        For data that are no records of one input and one output: nothing seeks a delay there.
+        """
         return self.model_copy(update={"input_delay_samples": self.input_delay_samples})
 
     def structure(self) -> Structure:
-        """The structure these settings describe, before the data were asked: offset on, start from rest."""
+        """Structure that these settings describe before the data were asked: offset on, start from rest."""
         return Structure(
             integrators=self.integrators,
             input_delay_samples=self.input_delay_samples,
@@ -267,13 +306,18 @@ class EmbeddingOptions(Settings):
     @model_validator(mode="before")
     @classmethod
     def _order_asked_for(cls, stated: Any) -> Any:
+        """Stated settings, with coloured noise where a largest order of it was stated, and it was not."""
         if isinstance(stated, Mapping) and "max_ar_order" in stated:
             return {"coloured_noise": True, **stated}
         return stated
 
     @property
     def no_remainder(self) -> float:
-        """Prior probability that the poles explain everything."""
+        """Prior probability that the poles explain everything.
+
+        0 where the order was given: nothing in the data then says that it is enough. Where the data chose it,
+        both cases count alike before the data are asked.
+        """
         return 0.0 if self.order_given else 0.5
 
     feedthrough: bool | None = Field(default=None, description="direct term; default: as in the model")

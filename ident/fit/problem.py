@@ -1,5 +1,11 @@
-"""What search, order selection and local refinement ask of the data: the cost at given poles, coefficients
-and nuisances re-fitted, and its change; and how much a residual is worth."""
+"""What search, order selection and refinement ask of data, whatever kind of data it is.
+
+A pole search needs the cost at given poles, coefficients and nuisances re-fitted (`CandidateCost`); a local
+refinement needs how it changes with the poles (`Linearisation`); an order selection needs how much a residual
+is worth (`ResidualColour`, `criterion`). `PoleProblem` lists these questions; records of one or several
+outputs and measured frequency responses answer them (`ident.fit.least_squares.Regression`,
+`ident.fit.several_outputs.OutputRegressions`, `ident.fit.frf_regression.FrfRegression`).
+"""
 
 from __future__ import annotations
 
@@ -18,16 +24,30 @@ from ident.basis.poles import Poles
 from ident.data.arrays import ComplexArray, IntArray, RealArray, kernel_array
 from ident.data.finding import TEST_LEVEL, WHITE_LAGS
 
-# Below this share of |y|^2 products of columns know nothing; a refinement sees the true residual.
+# Share of |y|^2 below which products of columns, rounded to 1e-15 of it and summed, know nothing of a
+# residual: the logarithm that DIRECT sees ends here. A refinement sees the true residual.
 _FLOOR = 1e-13
+# Most lags whose autocorrelation says how much a residual is worth, and how many samples of the shortest
+# record there must be per lag: an autocorrelation is known to one over the root of the number of its
+# products.
+_MOST_LAGS = 200
+_SAMPLES_PER_LAG = 10
 
 
 class Linearisation(NamedTuple):
     """How the residual sum of squares rss changes with the poles, coefficients re-fitted all the time.
 
-    Directions S: the states of each block driven by the fitted output (one per real pole, two per pair),
-    projected off the regression. normal (B, B) = S^T S, the Gauss-Newton (Kaufman) Hessian; gradient (B,) =
-    S^T r.
+    Directions S (N, B): the states of each block driven by the fitted output (one per real pole, two per
+    pair), projected off the regression; r (N,): the residual.
+
+    Attributes
+    ----------
+    rss : float
+        J = |r|^2.
+    normal : ndarray, shape (B, B)
+        S^T S, the Gauss-Newton (Kaufman) Hessian.
+    gradient : ndarray, shape (B,)
+        S^T r.
     """
 
     rss: float
@@ -36,9 +56,9 @@ class Linearisation(NamedTuple):
 
 
 class CandidateCost:
-    """Residual sum of squares over the unit cube of a search space, with other poles frozen.
+    """Residual sum of squares J over the unit cube of a search space, with other poles frozen.
 
-    `one` gives it at a point (D,), `many` (E,) at points (E, D); `power` is |y|^2.
+    It counts how often it was asked (`evaluations`).
     """
 
     def __init__(
@@ -48,62 +68,80 @@ class CandidateCost:
         one: Callable[[RealArray], float],
         many: Callable[[RealArray], RealArray] | None = None,
     ) -> None:
+        """Cost over `space`.
+
+        Parameters
+        ----------
+        space : SearchSpace
+            What a point of the cube stands for.
+        power : float
+            |y|^2.
+        one : callable
+            J at a point (D,).
+        many : callable, optional
+            J (E,) at points (E, D), where that is faster than one by one.
+        """
         self.space = space
         self.evaluations = 0
-        self._one, self._many = one, many
+        self._one = one
+        self._many = many
         self._floor = _FLOOR * power
 
     def rss(self, units: RealArray) -> RealArray:
-        """Residual sums of squares (E,) at points (E, D)."""
+        """Residual sums of squares (E,) at points (E, D) of the unit cube."""
         self.evaluations += len(units)
         if self._many is not None:
             return self._many(units)
         return np.array([self._one(unit) for unit in kernel_array(units)])
 
     def at(self, unit: RealArray) -> float:
-        """Residual sum of squares at a point (D,)."""
+        """Residual sum of squares at a point (D,) of the unit cube."""
         self.evaluations += 1
         return self._one(unit)
 
     def log(self, unit: RealArray) -> float:
-        """log J at a point (D,), as DIRECT sees it."""
+        """Logarithm of J at a point (D,), as DIRECT sees it: never below that of rounding."""
         return math.log(max(self.at(unit), self._floor))
 
 
 class Linearised(Protocol):
-    """The part of a `PoleProblem` that a local refinement needs."""
+    """Cost of poles and its change: what a local refinement needs of a `PoleProblem`."""
 
     @property
     def power(self) -> float:
-        """|y|^2 without the part of constants and the like."""
+        """Square sum |y|^2 of the data without the part of constants and the like."""
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
-        """Cost and linearisation at these poles; only the cost counts where it is not under `below`."""
+        """Cost and linearisation at real poles (R,) and pairs (P,), the poles above the axis.
+
+        Only the cost counts where it is not under `below`: the caller then drops the rest.
+        """
 
 
 class PoleProblem(Linearised, Protocol):
     """A least-squares problem, linear in everything but the poles."""
 
     @property
-    def dt_s(self) -> float: ...
+    def dt_s(self) -> float:
+        """Sampling time, s."""
 
     @property
     def omega_max_rad_s(self) -> float | None:
-        """Largest frequency at which the data could show a pair; None: up to the Nyquist frequency."""
+        """Largest frequency at which the data could show a pair, rad/s; None: up to the Nyquist frequency."""
 
     @property
     def longest(self) -> int:
-        """Samples of the longest record: what is slower cannot be told from a pole on the circle."""
+        """Number of samples of the longest record: slower poles cannot be told from one on the circle."""
 
     @property
     def n_samples(self) -> int:
-        """How many real numbers were measured."""
+        """Number of real numbers that were measured."""
 
     def n_parameters(self, order: int) -> int:
         """Free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
 
     def residual(self, poles: Poles) -> RealArray:
-        """What the fit leaves of the data, (N,)."""
+        """Residual (N,) that the fit with these poles leaves of the data."""
 
     def colour(self, residual: RealArray) -> ResidualColour:
         """Whiteness of a residual, and how many independent numbers it is worth."""
@@ -112,17 +150,25 @@ class PoleProblem(Linearised, Protocol):
         """Cost of candidates on top of frozen poles: `shared` behind the input, `local` in free responses."""
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """Criterion (J, order) -> number, lower is better, read from a model with this J and order whose
-        residual is worth so many independent numbers."""
+        """Criterion (J, order) -> number, lower is better.
+
+        It is read from a model with this J = rss and order whose residual is worth so many independent
+        numbers.
+        """
 
 
 @dataclass(frozen=True)
 class ResidualColour:
     """What the autocorrelation of a residual says.
 
-    effective_samples: independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth
-    (Bartlett): by that factor colour widens the scatter of J. white: autocorrelations at lags 1 .. 25 are no
-    larger, all together, than those of white noise 99 times in 100 (Box and Pierce).
+    Attributes
+    ----------
+    effective_samples : float
+        Independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth of the shortest
+        record (Bartlett): by that factor colour widens the scatter of J.
+    white : bool
+        Autocorrelations at lags 1 .. 25 are no larger, all together, than those of white noise 99 times in
+        100 (Box and Pierce); never so in records of less than 250 samples.
     """
 
     effective_samples: float
@@ -130,20 +176,43 @@ class ResidualColour:
 
 
 def residual_colour(residual: RealArray, starts: IntArray) -> ResidualColour:
-    """Colour of a residual (N,) of records that begin at `starts` (K + 1,)."""
+    """Colour of a residual.
+
+    Parameters
+    ----------
+    residual : ndarray, shape (N,)
+        Residuals of all records, one after the other.
+    starts : ndarray of int, shape (K + 1,)
+        Where the records begin, and N.
+
+    Returns
+    -------
+    ResidualColour
+        Of a residual of zeros: N samples, not white.
+    """
     n = residual.size
-    lags = min(200, int(np.min(np.diff(starts))) // 10)
+    shortest = int(np.min(np.diff(starts)))
+    lags = min(_MOST_LAGS, shortest // _SAMPLES_PER_LAG)
+
+    # Autocovariances of all records, summed, by the squared spectrum of each.
     covariance = np.zeros(lags + 1)
     for lo, hi in pairwise(starts):
         part = residual[lo:hi]
-        size = next_fast_len(part.size + lags, real=True)  # no lag up to there wraps around
-        covariance += np.fft.irfft(np.abs(np.fft.rfft(part, size)) ** 2, size)[: lags + 1]
+        # So long that no lag up to there wraps around.
+        size = next_fast_len(part.size + lags, real=True)
+        spectrum = np.fft.rfft(part, size)
+        covariance += np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1]
     if not covariance[0] > 0:
         return ResidualColour(float(n), False)
+
+    # What white noise shows by chance, 1/N per lag, is no colour.
     squares = (covariance[1:] / covariance[0]) ** 2
-    few = squares[:WHITE_LAGS]
-    return ResidualColour(
-        # What white noise shows by chance, 1/N per lag, is no colour.
-        effective_samples=float(n / (1 + 2 * np.sum(np.maximum(squares - 1 / n, 0.0)))),
-        white=few.size == WHITE_LAGS and bool(n * np.sum(few) < chdtri(few.size, 1 - TEST_LEVEL)),
-    )
+    colour = np.sum(np.maximum(squares - 1 / n, 0.0))
+    effective_samples = float(n / (1 + 2 * colour))
+
+    first_squares = squares[:WHITE_LAGS]
+    white = False
+    if first_squares.size == WHITE_LAGS:
+        statistic = n * np.sum(first_squares)
+        white = bool(statistic < chdtri(first_squares.size, 1 - TEST_LEVEL))
+    return ResidualColour(effective_samples, white)
