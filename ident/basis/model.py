@@ -104,7 +104,7 @@ class GobfModel(Shown):
 
     @property
     def stable_part(self) -> GobfModel:
-        """The stable model B G: G times the all-pass of its unstable poles; G itself where it has none."""
+        """Stable model B G: G times the all-pass of its unstable poles; G itself where it has none."""
         return replace(self, unstable=NO_POLES)
 
     @property
@@ -289,7 +289,7 @@ class MisoModel:
         return self.poles.order
 
     def channel(self, index: int) -> GobfModel:
-        """The model from input `index` (0 .. U - 1) to the output. Raises ValueError for another index."""
+        """Model from input `index` (0 .. U - 1) to the output. Raises ValueError for another index."""
         if not 0 <= index < self.n_inputs:
             raise ValueError(f"there are inputs 0 to {self.n_inputs - 1}; got {index}")
         return GobfModel(

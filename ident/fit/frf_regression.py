@@ -97,7 +97,8 @@ class FrfRegression:
 
         Coefficients, the direct term if there is one, and the poles that are not known.
         """
-        return int(2 * order - n_fixed + self.feedthrough)
+        n_direct = 1 if self.feedthrough else 0
+        return int(2 * order - n_fixed + n_direct)
 
     def whiten(self, response: ComplexArray) -> RealArray:
         """Real rows of unit variance (..., 2 F, K) of complex columns (..., F, K)."""
@@ -148,7 +149,7 @@ class FrfRegression:
         return Linearisation(fit.rss, directions.T @ directions, directions.T @ fit.residual)
 
     def residual(self, poles: Poles) -> RealArray:
-        """The whitened residual (2 F,)."""
+        """Whitened residual (2 F,) that the fit with these poles leaves."""
         return fit_response(self, poles).residual
 
     def colour(self, residual: RealArray) -> ResidualColour:
@@ -189,6 +190,7 @@ class FrfRegression:
         price = float(np.log(worth))
 
         def value(rss: float, order: int) -> float:
+            """Criterion of a fit with J = rss and this order."""
             return share * rss / scale + self.n_parameters(order) * price
 
         return value
