@@ -142,7 +142,9 @@ class SearchSpace:
         with np.errstate(divide="ignore"):
             log = np.log(np.where(pairs == 0, _DEADBEAT_MODULUS, pairs))
         modulus = np.abs(log)
-        is_proper = (im > 0) & (-log.real < _MOVED_ZETA * modulus)
+        is_complex = im > 0
+        is_below_limit = -log.real < _MOVED_ZETA * modulus
+        is_proper = is_complex & is_below_limit
         omega = np.minimum(modulus, _HIGHEST_MOVED_SHARE * np.pi)
         zeta = np.clip(-log.real / omega, _LEAST_MOVED_ZETA, _MOVED_ZETA)
         return Poles(blocks[: self.n_real, 0], np.where(is_proper, pairs, _pairs(omega, zeta)))

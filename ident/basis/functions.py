@@ -117,6 +117,7 @@ def basis_state_space(poles: Poles) -> LosslessCascade:
             block_b = np.array([[sg], [0.0]])
             block_c = np.array([[-beta * sg, sb * sg]])
             block_d = gamma
+        # Driven by what the blocks before make of the input and of their states.
         states = slice(at, at + block_a.shape[0])
         A[states, :] = block_b @ C
         A[states, states] = block_a
@@ -163,6 +164,7 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
     blocks = block_parameters(poles)
     n_real = poles.real.size
     for i, a in enumerate(poles.real):
+        # Behind the all-pass of the poles before this one, so that the functions are orthogonal.
         columns[:, i] = blocks[i, 1] / (z - a) * all_pass
         all_pass *= (1 - a * z) / (z - a)
     for i, p in enumerate(poles.pairs):
@@ -201,6 +203,7 @@ def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
 
     Columns as in `log_all_pass_slopes`: by each real pole, then by real and imaginary part of each pair.
     """
+    # One all-pass after the other is as good as all at once, and no polynomial of high degree is formed.
     blocks = poles.blocks()
     columns: list[RealArray] = []
     for i, block in enumerate(blocks):

@@ -153,8 +153,8 @@ class MimoModel:
         is_listed = values.imag >= 0
         if self.integrators:
             # z/(z - 1) L(z): at p the factor p/(p - 1), at 1 the value of L there.
-            one = np.ones(1, complex)
-            static_gains = np.real(basis_response(self.poles, one)[0])
+            at_unity = basis_response(self.poles, np.ones(1, complex))
+            static_gains = np.real(at_unity[0])
             at_one = np.einsum("yub,b->yu", self.coefficients, static_gains) + self.feedthrough
             residue = residue * (values / (values - 1))[:, None, None]
             is_listed &= np.abs(values) > 0

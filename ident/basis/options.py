@@ -138,6 +138,7 @@ class IdentOptions(Settings):
                 "expected a list, with a number for a real pole and [real part, imaginary part] for a pair: "
                 "[0.9, [0.95, 0.2]]"
             )
+        # Numbers first, so that the partner of a pair is found whichever type it came in.
         values = [complex(pole) if isinstance(pole, Complex) else pole for pole in poles]
         parts: list[Any] = []
         for value in values:
@@ -163,6 +164,7 @@ class IdentOptions(Settings):
             highest = getattr(self, high)
             if lowest is not None and highest is not None and not lowest < highest:
                 raise ValueError(f"{low} must be below {high}; got {lowest} and {highest}")
+            # The box of the raw coordinates is the whole circle: it has no side for a frequency or a decay.
             is_stated = lowest is not None or highest is not None
             if self.coordinates == "raw" and is_stated:
                 raise ValueError(f"{low} and {high} need coordinates = 'log'")
@@ -173,6 +175,7 @@ class IdentOptions(Settings):
 
     def _refuse_impossible_relative_degree(self) -> None:
         """Raise ValueError where the stated relative degree and another setting exclude each other."""
+        # Nobody asked for conditions.
         if self.relative_degree is None:
             return
         if self.feedthrough:

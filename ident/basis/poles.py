@@ -88,6 +88,7 @@ class Poles:
             )
         if not (np.all(damping > 0) and np.all(damping < 1)):
             raise ValueError(f"a pair needs 0 < zeta < 1; got {damping}")
+        # Damped angle per sample. From pi on a pole would look like one of a lower frequency.
         angle = omega * np.sqrt(1 - damping**2) * dt_s
         is_positive = angle > 0
         is_below_nyquist = angle < np.pi
@@ -113,6 +114,7 @@ class Poles:
     @property
     def values(self) -> ComplexArray:
         """Poles (B,), both of each pair: the real ones, then p, conj(p) for each pair."""
+        # Row by row, so that the two poles of a pair stand side by side as its two basis functions do.
         pair_poles = np.column_stack([self.pairs, self.pairs.conj()]).ravel()
         return np.concatenate([self.real.astype(np.complex128), pair_poles])
 
@@ -166,6 +168,7 @@ class Poles:
         Raises ValueError if a pole leaves the circle, or a pair the upper half plane.
         """
         n_real = self.real.size
+        # A row (real, imaginary) for each pair, then as complex numbers.
         by_pair = changes[n_real:].reshape(-1, 2)
         return Poles(self.real + changes[:n_real], self.pairs + by_pair @ (1, 1j))
 
@@ -187,6 +190,7 @@ class Poles:
 
         A pole a <= 0 has no real continuous-time counterpart: its rate is -log|a|/dt, infinite at a = 0.
         """
+        # A pole at zero is a sample of delay: infinitely fast, and no reason for a warning.
         with np.errstate(divide="ignore"):
             rate = -np.log(np.abs(self.real)) / dt_s
         return np.asarray(rate, dtype=np.float64)

@@ -211,11 +211,13 @@ class ResponsePosterior(Shown):
         if self.has_feedthrough:
             parts.append(np.ones((omega.size, 1), dtype=np.complex128))
         parts.append(_delays(z, self.fir_length))
+        # The factor of all columns: integrators, delay, and one over the all-pass of unstable poles.
         common = front_response(omega, self.dt_s, self.integrators, self.input_delay_samples)
         rows: ComplexArray = np.hstack(parts)
         rows *= (common / all_pass_response(self.unstable, z))[:, None]
         if not self.unstable.order:
             return rows
+        # How the response moves with each mirror image, at the mean.
         response = rows @ self.mean[: rows.shape[1]]
         by_unstable = -response[:, None] * log_all_pass_slopes(self.unstable, z)
         return np.hstack([rows, by_unstable])
@@ -224,6 +226,7 @@ class ResponsePosterior(Shown):
     def square_factor(self) -> RealArray:
         """Lower triangle L (P, P) of the covariance L L^T, column-major, as BLAS takes it."""
         # P' may be larger than P, and half of a triangle is zero.
+        # S^T = Q R, so that S S^T = R^T R.
         triangle = np.asarray(np.linalg.qr(self.covariance_factor.T, mode="r"))
         square = np.zeros((self.mean.size, self.mean.size), order="F")
         square[:, : len(triangle)] = triangle.T

@@ -57,6 +57,7 @@ class Structure:
                 "integrators and input_delay_samples must not be negative; "
                 f"got {self.integrators} and {self.input_delay_samples}"
             )
+        # Conditions on the coefficients do not hold a direct term, and were not written for mirrored poles.
         needs_degree_one = self.feedthrough or self.unstable.order
         if not self.relative_degree >= 1 or (needs_degree_one and self.relative_degree > 1):
             raise ValueError(
@@ -67,6 +68,7 @@ class Structure:
     @property
     def n_polynomials(self) -> int:
         """Number of polynomial nuisance columns per record, degrees 0, 1, ..."""
+        # Degree 0 is the offset; the initial states of k integrators make all degrees up to k - 1.
         of_offset = 1 if self.estimate_offset else 0
         of_integrators = self.integrators if self.estimate_initial_state else 0
         return max(of_offset, of_integrators)
@@ -78,6 +80,8 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
     u (T,) or (T, 1): delayed by whole samples, then summed, the present sample included; both are exact.
     """
     u = one_signal(u)
+    # At rest before the record: what the delay brings in from there is zero, all of it if the delay is
+    # longer.
     delayed = np.zeros_like(u)
     delayed[delay_samples:] = u[: max(u.size - delay_samples, 0)]
     for _ in range(integrators):
@@ -112,8 +116,7 @@ def stabilised(y: RealArray, unstable: Poles) -> RealArray:
 
     References
     ----------
-    U. Forssell, L. Ljung, "Identification of unstable systems using output error and Box-Jenkins model
-    structures", Automatica 36(1), 2000.
+    U. Forssell, L. Ljung, Automatica 36(1), 2000.
     """
     if not unstable.order:
         return y
@@ -137,6 +140,7 @@ def level_before(u: RealArray) -> float:
     Zero, unless the input never comes near it; then its first value. Basis functions hold the difference in
     their free responses, taps do not.
     """
+    # An input that passes zero was most likely switched on from there.
     passes_zero = np.min(u) <= 0 <= np.max(u)
     return 0.0 if passes_zero else float(u[0])
 

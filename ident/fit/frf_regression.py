@@ -83,7 +83,8 @@ class FrfRegression:
     def longest(self) -> int:
         """Samples of a record that shows two periods of the lowest measured frequency above 0."""
         angle_rad = np.angle(self.z)
-        lowest_rad = angle_rad[angle_rad > 0].min()
+        is_moving = angle_rad > 0
+        lowest_rad = angle_rad[is_moving].min()
         return int(np.ceil(4 * np.pi / lowest_rad))
 
     @cached_property
@@ -138,6 +139,7 @@ class FrfRegression:
         Linearisation
             rss, normal (B, B) and gradient (B,), B = R + 2 P.
         """
+        # By orthogonal factorisation: a response has hundreds of rows, which cost no more than products do.
         poles = Poles(real, pairs)
         fit = fit_response(self, poles)
         if not fit.rss < below:
@@ -184,6 +186,8 @@ class FrfRegression:
         pair: 4 ln Ne). J is a chi-square because the covariances are known; where it is larger than they
         explain, they are multiplied by its excess, the scale.
         """
+        # Chi-square over its degrees of freedom; below 1 the covariances are wide, which is no reason for
+        # more poles.
         n_free = self.n_samples - self.n_parameters(order)
         scale = max(1.0, rss / max(n_free, 1))
         share = worth / self.n_samples
@@ -365,6 +369,7 @@ def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
     q, triangle = np.linalg.qr(data.whiten(responses))
     projected = q.T @ data.y
     residual = data.y - q @ projected
+    # Directions that are not shown get no share: a plain solution would blow up rounding there.
     theta = np.linalg.lstsq(triangle, projected, rcond=RANK_TOLERANCE)[0]
     return FrfFit(
         coefficients=np.asarray(theta[: poles.order], dtype=np.float64),

@@ -121,6 +121,7 @@ class Regression:
         n_free_responses = order if self.structure.estimate_initial_state else 0
         per_record = self.polynomials.shape[0] + n_free_responses
         n_records = self.starts.size - 1
+        # Poles count once, coefficients per input, nuisances per record.
         n_direct = 1 if self.structure.feedthrough else 0
         per_input = order + n_direct
         return int(order + self.n_inputs * per_input + n_records * per_record)
@@ -223,6 +224,7 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
 
     def value(rss: float, order: int) -> float:
         """Criterion of a fit with J = rss and this order."""
+        # Of N numbers Ne are independent, so the likelihood counts each Ne/N times.
         fall = worth * np.log(max(rss, floor) / data.n_samples)
         return float(fall + data.n_parameters(order) * np.log(worth))
 
@@ -331,6 +333,7 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
             q, _ = np.linalg.qr(columns)
             local_q[: q.shape[1], segment] = q.T
         data.take_out_local(local_q, residual[np.newaxis])
+    # No poles and no direct term: nothing is shared, and a factorisation of nothing is refused.
     if len(rows) == 0:
         return Projection(local_q, rows, rows, np.zeros((0, 0)), residual)
 

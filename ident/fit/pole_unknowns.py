@@ -260,6 +260,7 @@ def scaled_system(
     promised : float
         Fall of J that the linearisation promises.
     """
+    # From block states to unknowns, and which of these are free to move.
     chain = chain_rule(real, pairs, n_fixed_real, n_fixed_pairs)
     full_system, full_slope = _by_unknowns(chain, normal, gradient)
     held = blocked(x, full_slope, real.size - n_fixed_real, bounds)
@@ -269,6 +270,8 @@ def scaled_system(
         if not held[i]:
             free[m] = i
             m += 1
+
+    # Of unit length, so that one damping is right for all: a slow pole moves the output by decades more.
     system = np.empty((m, m))
     scale = np.empty(m)
     slope = np.empty(m)
@@ -313,6 +316,7 @@ def damped_step(
     The promise, 2 slope^T step - step^T system step, is of the step before the bounds cut it.
     """
     m = free.size
+    # (system + damping) step = slope.
     factor = system.copy()
     for i in range(m):
         factor[i, i] += damping

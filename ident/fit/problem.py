@@ -92,6 +92,7 @@ class CandidateCost:
         self.evaluations += len(units)
         if self._many is not None:
             return self._many(units)
+        # One by one: compiled code takes a contiguous, writable point.
         return np.array([self._one(unit) for unit in kernel_array(units)])
 
     def at(self, unit: RealArray) -> float:

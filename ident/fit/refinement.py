@@ -92,7 +92,7 @@ class Bounds:
 
         def distance(decay_per_s: float | None, default: float) -> float:
             """1 - a of a stated decay, 1/s."""
-            return default if decay_per_s is None else float(-np.expm1(-decay_per_s * dt_s))
+            return default if decay_per_s is None else -float(np.expm1(-decay_per_s * dt_s))
 
         def angle(omega_rad_s: float | None, default: float) -> float:
             """Angle per sample of a stated frequency, rad/s."""

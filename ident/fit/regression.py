@@ -118,6 +118,7 @@ def restructured(records: Sequence[Record], data: Regression, structure: Structu
 
     Where only nuisances differ, their signals are not filtered anew.
     """
+    # Feed-through and free responses are columns that a fit makes itself; only polynomials are stored.
     before = data.structure
     same_filters = (
         structure.integrators == before.integrators
@@ -164,6 +165,7 @@ def thinned(records: Sequence[Record], limit: int) -> tuple[list[Record], bool]:
     total = sum(record.n_samples for record in records)
     if total <= limit:
         return list(records), False
+    # Evenly over the campaign: neighbours are alike.
     count = max(1, int(len(records) * limit / total))
     positions = np.linspace(0, len(records), count, endpoint=False).astype(int)
     chosen = [records[i] for i in positions]

@@ -89,6 +89,7 @@ class OutputRegressions:
         real (R,), pairs (P,): poles above the axis. `below` is not used: which output alone stays below says
         nothing of the sum.
         """
+        # Each output has columns and coefficients of its own; only the poles are shared, so all three add up.
         parts = [output.linearise(real, pairs) for output in self.each]
         return Linearisation(
             sum(part.rss for part in parts),
@@ -106,6 +107,7 @@ class OutputRegressions:
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
         """Criterion (J, order) -> number, lower is better: see `information_criterion`."""
+        # With its constants: what counts as rounding depends on the numbers as they were logged.
         power = sum(float(output.y @ output.y) for output in self.each)
         return information_criterion(power, self, worth)
 
@@ -143,6 +145,7 @@ def prepare_outputs(records: Sequence[Record], structure: Structure) -> OutputRe
     ValueError
         Names of outputs differ between records; also as `prepare_inputs`.
     """
+    # Without records there is one nameless output, so that `prepare_inputs` says what is missing.
     names = records[0].output_names if records else ("",)
     for record in records:
         if record.output_names != names:

@@ -63,10 +63,10 @@ def everything_else():
         ([known], IdentOptions(n_real=2, n_pairs=1, algorithm="GN_DIRECT_L", coordinates="raw")),
         ([p1_friction(1).record], IdentOptions(input_delay_samples=1)),
     ):
-        found = identify(records, options)
-        assert found.model.order > 0
-        assert isinstance(found.warnings, tuple)
-    tangent(records, found.model)
+        result = identify(records, options)
+        assert result.model.order > 0
+        assert isinstance(result.warnings, tuple)
+    tangent(records, result.model)
     identify_mimo([known], FOURTH_ORDER)
 
 
@@ -115,7 +115,7 @@ def test_fits_do_not_depend_on_who_compiled(fresh, tmp_path):
 
 def compiled():
     """Compilations in this process: [module.kernel, how many, how many of them for locked arrays]."""
-    found = []
+    counts = []
     for module in pkgutil.walk_packages(ident.__path__, "ident."):
         for name, kernel in vars(importlib.import_module(module.name)).items():
             if isinstance(kernel, numba.core.dispatcher.Dispatcher):
@@ -123,16 +123,16 @@ def compiled():
                     any(isinstance(kind, numba.core.types.Array) and not kind.mutable for kind in signature)
                     for signature in kernel.signatures
                 ]
-                found.append((f"{module.name.rpartition('.')[2]}.{name}", len(locked), sum(locked)))
-    return found
+                counts.append((f"{module.name.rpartition('.')[2]}.{name}", len(locked), sum(locked)))
+    return counts
 
 
 @pytest.mark.slow
 def test_kernels_are_compiled_once_for_one_kind_of_array(fresh):
     """No locked array reaches compiled code: it would be another type there, and another compilation."""
-    found = fresh[1]
-    assert [name for name, _, locked in found if locked] == []
-    count = {name: number for name, number, _ in found}
+    compilations = fresh[1]
+    assert [name for name, _, locked in compilations if locked] == []
+    count = {name: number for name, number, _ in compilations}
     for entry in (
         "functions.blocks_of_poles",
         "kernels.cost_of_point",

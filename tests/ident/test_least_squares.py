@@ -161,14 +161,14 @@ def test_integrators_filter_the_input_exactly():
 
 def test_records_must_fit_together():
     a, b = records()
-    with pytest.raises(ValueError, match=r"dt_s = 0.01, but the first record has 0.005"):
+    with pytest.raises(ValueError, match=r"0\.01.*0\.005"):
         prepare([a, replace(b, dt_s=0.01)], Structure())
-    with pytest.raises(ValueError, match="at least one record"):
+    with pytest.raises(ValueError, match="record"):
         prepare([], Structure())
-    with pytest.raises(ValueError, match="not more than the input delay"):
+    with pytest.raises(ValueError, match=r"150.*delay 150"):
         prepare([a], Structure(input_delay_samples=150))
     wide = replace(a, input=np.ones((150, 2)), input_names=("a", "b"))
-    with pytest.raises(ValueError, match=r"choose with Record\.siso"):
+    with pytest.raises(ValueError, match=r"Record\.siso"):
         prepare([wide], Structure())
 
 
@@ -184,5 +184,5 @@ def test_thinning_keeps_whole_records_or_the_most_exciting_stretch():
 
 def test_too_few_samples_are_refused():
     data = prepare([as_record(np.arange(8.0), np.arange(8.0))], Structure())
-    with pytest.raises(ValueError, match="too few samples: 8 for 8 unknowns with 4 poles"):
+    with pytest.raises(ValueError, match=r"8 for 8 .* 4 poles"):
         fit(data, POLES)

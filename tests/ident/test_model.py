@@ -50,9 +50,9 @@ def test_bad_models_are_refused(change, message):
 
 
 def test_frequencies_must_make_sense():
-    with pytest.raises(ValueError, match="stop at pi/dt"):
+    with pytest.raises(ValueError, match="pi/dt"):
         MODEL.frequency_response(np.array([400.0]))
-    with pytest.raises(ValueError, match="stop at pi/dt"):
+    with pytest.raises(ValueError, match="pi/dt"):
         MODEL.frequency_response(np.array([np.nan]))
     with pytest.raises(ValueError, match="omega = 0"):
         MODEL.frequency_response(np.array([0.0]))

@@ -135,11 +135,11 @@ def test_relative_degree_one_asks_for_nothing():
 @pytest.mark.parametrize(
     ("poles", "integrators", "relative_degree", "message"),
     [
-        (Poles([0.5, -0.2]), 0, 2, r"real pole -0.2 in the z plane has none \(expected 0 < pole < 1\)"),
-        (Poles([0.0, 0.5]), 0, 2, "real pole 0 in the z plane has none"),
-        (Poles([0.5, 0.3]), 1, 2, "the first real poles must be the zeros"),
-        (Poles([0.5, 0.4]), 0, 3, "needs at least that many poles, integrators counted; got 2"),
-        (Poles([0.5, 0.4]), 0, 0, "must be at least 1; got 0"),
+        (Poles([0.5, -0.2]), 0, 2, r"real pole -0\.2"),
+        (Poles([0.0, 0.5]), 0, 2, "real pole 0 "),
+        (Poles([0.5, 0.3]), 1, 2, "first real poles"),
+        (Poles([0.5, 0.4]), 0, 3, "relative_degree = 3 .* got 2"),
+        (Poles([0.5, 0.4]), 0, 0, "at least 1; got 0"),
     ],
 )
 def test_impossible_conditions_are_refused(poles, integrators, relative_degree, message):

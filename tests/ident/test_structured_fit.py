@@ -145,10 +145,10 @@ def test_descent_keeps_its_bounds_and_fixed_poles():
 
 def test_what_cannot_be_fitted_is_refused():
     record = p1(0, 8).record
-    with pytest.raises(ValueError, match="too few samples: 8 for 9 unknowns"):
+    with pytest.raises(ValueError, match="8 for 9"):
         structured_fit(
             prepare([record], Structure(estimate_offset=True)), Poles([0.9, 0.8, 0.7, 0.6, 0.5]), 3
         )
     data = prepare([p1(0).record], Structure(feedthrough=True))
-    with pytest.raises(ValueError, match="excludes a direct term"):
+    with pytest.raises(ValueError, match="feedthrough = false"):
         structured_fit(data, Poles([0.9, 0.8]), 2)
