@@ -25,10 +25,12 @@ from ident.data.arrays import COMPILED, ComplexArray, RealArray, one_signal
 # Least 1 - gamma of a pair: |p| < 1 can round to 1 - gamma = 0, and a block without input would be no basis
 # function. Half the distance of 1 to the double below it, so that it stands for "less than one digit".
 _LEAST_ONE_MINUS_GAMMA = 5e-17
-# Size of a state below which a free response is zero from there on: it keeps away denormal numbers, which are
-# slow. In units of the unit impulse; 1e-15 already is rounding, 1e-300 would be as slow as nothing.
+# Size of a state below which a free response is zero from there on, in units of the unit impulse: far below
+# its rounding, 1e-16, and far above the denormal numbers from 1e-308 on, which are slow. 1e-20 or 1e-100
+# would do.
 _DEAD = 1e-30
-# Samples between two looks at whether a free response is dead: the look then costs nothing.
+# Samples between two looks at whether a free response is dead, so that the inner loop has no condition.
+# Chosen.
 _LOOK_EVERY = 32
 
 
