@@ -22,9 +22,11 @@ from ident.fit.problem import Linearisation
 from ident.fit.refinement import Bounds, Refined, free_optimality, refine
 
 # Fastest real pole, as its value a: decayed to this part within a sample. One at 0 or below has no continuous
-# counterpart, and its logarithm would grow without end. Chosen.
+# counterpart, and its logarithm would grow without end. Chosen; doubled or halved, no test of these fits
+# fails.
 _FASTEST = 0.01
-# Most steps of a refinement. Chosen, above the 60 of a refinement without conditions.
+# Most steps of a refinement. Chosen, above the 60 of a refinement without conditions; with 50 no test of
+# these fits fails.
 _MOST_STEPS = 100
 
 
