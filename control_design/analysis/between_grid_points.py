@@ -69,6 +69,8 @@ _SMALLEST_SHAPE = 1e-12
 _TINY = 1e-300
 # Keeps squares of squares of lengths, and a multiplier of ellipses, away from zero.
 _TINY_LENGTH = 1e-100
+
+# Keeps a multiplier of ellipses away from zero; multipliers that decide are of the size of gamma squared.
 _TINY_MULTIPLIER = 1e-30
 
 

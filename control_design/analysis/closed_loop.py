@@ -30,6 +30,8 @@ from ident.data.shown import Shown
 _SAME_PERIOD = 1e-9
 # Levels, as shares of a step, between which its rise time is taken: the usual 10 % and 90 %.
 _RISE_FROM = 0.1
+
+# The upper one of the two levels.
 _RISE_TO = 0.9
 # Band around the final value, as a share of a step, in which it counts as settled: the usual 2 %.
 _SETTLING_BAND = 0.02

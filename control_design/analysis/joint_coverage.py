@@ -39,9 +39,13 @@ _FEWEST_DRAWS = 100
 # Radius of the ellipses, in standard deviations, between which the calibrated one is sought: from a point to
 # a level of 1 - 1e-14, where the levels of doubles end. With a largest one of 4 or 16 no test moves.
 _SMALLEST_RADIUS = 1e-3
+
+# The largest of them: 8 standard deviations are a level of 1 - 1e-14.
 _LARGEST_RADIUS = 8.0
 # Relative accuracy of that radius, and the most halvings of the way between, which reach it anywhere.
 _RADIUS_ACCURACY = 1e-6
+
+# Most halvings of the way between: more than a double has digits.
 _MOST_HALVINGS = 60
 # Largest level: a double below 1 with which the radius is still finite.
 _LARGEST_LEVEL = 1 - 1e-15
@@ -49,6 +53,8 @@ _LARGEST_LEVEL = 1 - 1e-15
 # Grid of a sampled loop: logarithmic points, and points per mode. A thousand frequencies in all, since every
 # draw has them. The worst case that the draws are compared with is taken on the same grid.
 _LOG_POINTS = 500
+
+# Points per mode of that grid, two in each half width over 20 of them.
 _POINTS_PER_MODE = 80
 # Damping ratio that the grid takes at least for a mode.
 _LEAST_DAMPING = 1e-3
@@ -56,6 +62,8 @@ _LEAST_DAMPING = 1e-3
 _PARTS_OF_A_STEP = 10
 # Grid of a guard: fine enough to count the winding of a response whose modes have moved.
 _GUARD_LOG_POINTS = 1200
+
+# Points per mode of a guard's grid: five times as many, since its modes are not where the grid expects them.
 _GUARD_POINTS_PER_MODE = 400
 
 # Ratio of axes below which an ellipse counts as a line, whose short axis says nothing about a distance: the

@@ -38,14 +38,20 @@ _MISSED = 1e-6
 
 # Loop values handed to `crossing_margins` lie on the axis or on the circle: these tell which.
 _ON_AXIS = 1e-7
+
+# Distance from modulus 1 within which a loop value lies on the circle.
 _ON_CIRCLE = 1e-6
 # Relative imaginary part up to which a loop is real at Nyquist but for rounding: of one loop, whose response
 # has the error of its state space, and of the centre of an ellipse, computed from a product of responses.
 _REAL_LOOP = 1e-9
+
+# The same share for the centre of an ellipse, which is a product of computed responses.
 _REAL_CENTRE = 1e-6
 
 # Tolerances of `brentq`, relative to the frequency: a few roundings of doubles.
 _FREQUENCY_TOLERANCE = 1e-13
+
+# Relative tolerance of `brentq`, which takes none below 4 roundings of doubles, 9e-16.
 _LEAST_BRENTQ_TOLERANCE = 1e-14
 
 # Ellipses with a major axis below this have no boundary to speak of; their centre's crossings are sought.

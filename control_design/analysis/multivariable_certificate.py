@@ -53,7 +53,11 @@ _INTEGRATOR_DISTANCE = 1e-7
 # How far ahead of what is proved, in grid points, the next piece is centred: at first, at least and at most.
 # They set how many pieces are computed, never what they prove.
 _FIRST_STRIDE = 16
+
+# Least stride: shorter ones would compute a piece for every grid point.
 _LEAST_STRIDE = 4
+
+# Largest stride: a piece that fails after a longer one has to be computed anew.
 _LARGEST_STRIDE = 256
 # Where no piece centred on a grid point reaches back to what is proved: centres on the way to the next grid
 # point, as shares of that way.

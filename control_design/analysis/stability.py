@@ -52,12 +52,20 @@ _FINE_STEP_RAD = np.pi / 8
 # Sine of the angle between 1 + L at the lowest frequency and its limit direction at which the grid begins low
 # enough, and the decades by which it is lowered at most, with points per decade.
 _NEAR_LIMIT_DIRECTION = 0.1
+
+# Decades by which it is lowered at most: from 1e-4 to 1e-12 rad/s at 200 Hz, below which all is rounding.
 _MOST_DECADES = 8
+
+# Points in each of these decades, where the response is a power of frequency.
 _POINTS_PER_DECADE = 20
 # Rounds in which wide steps are halved, and the most points: a limit of work for a loop that passes through
 # -1. Steps narrower than this share of their frequency are rounding.
 _MOST_ROUNDS = 30
+
+# Most points of a refined count: 30 MB of complex values.
 _MOST_POINTS = 200_000
+
+# Steps narrower than this share of their frequency are rounding.
 _NARROWEST_STEP = 1e-12
 
 

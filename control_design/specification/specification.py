@@ -63,11 +63,17 @@ _OUTSIDE_CIRCLE = 1.0 + 1e-9
 _HALVINGS = 60
 # Frequencies at which tracking and effort are compared, and those at which an open-loop peak is sought.
 _POINTS_OF_CONFLICT = 4000
+
+# Frequencies, on a logarithmic scale, at which an open-loop peak is sought before the modes get their own.
 _POINTS_OF_PEAK = 2000
 # Points around each mode where that peak is sought, in 10 half widths of the mode (sinh 3) either side, and
 # the damping ratio that they take at least.
 _POINTS_OF_MODE = 121
+
+# Reach of these points: sinh 3 = 10 half widths either side.
 _REACH_OF_MODE = 3
+
+# Damping ratio that they take at least, so that they are different numbers.
 _LEAST_DAMPING = 1e-9
 # Keeps a quotient and a bandwidth above zero.
 _TINY = 1e-300

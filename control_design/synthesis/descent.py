@@ -45,6 +45,8 @@ _CORRECTED_BELOW = 0.25
 # corner or a damping term, e^b a corner squared. Their negatives are the largest. So corners stay within
 # e^12 or e^10 of the scale, four to five decades, and exp() never overflows in a wild step.
 _LEAST_LOG = -12.0
+
+# Least logarithm of a corner squared: e^-20 is a corner of e^-10.
 _LEAST_LOG_OF_SQUARE = -20.0
 # Least gain of a section in its natural units: one whose numerator vanishes can still move.
 _LEAST_GAIN_OF_SECTION = 1e-9

@@ -35,8 +35,14 @@ ACCEPTED_SHARE = 0.02
 # Shares of the predicted gain above which the box doubles, and below which it shrinks: those of the algorithm
 # named above are 3/4 and 1/4.
 _ENLARGED_ABOVE = 0.7
+
+# Share of the predicted gain below which the box shrinks.
 _SHRUNK_BELOW = 0.25
+
+# Factor by which it grows, that of the algorithm named above.
 _ENLARGEMENT = 2.0
+
+# Factor by which it shrinks; the algorithm named above takes 1/4. Chosen.
 _SHRINKAGE = 0.35
 
 # Iterations of the interior point; 8 to 15 are usual.

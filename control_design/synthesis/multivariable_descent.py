@@ -74,6 +74,8 @@ _NO_SLOPE = 1e-12
 _SECTIONS = 14
 # Ends of the overlapping sections, over the interval.
 _LEFT_SECTION = 0.45
+
+# The right end. They overlap by a tenth, so that a minimum on the border is in both sections.
 _RIGHT_SECTION = 0.55
 
 

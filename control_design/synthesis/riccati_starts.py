@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _CLOSE = 1.02
 # Where the smallest norm is looked for. Weights are about one where they matter, so norms are, too.
 _LOWEST_GAMMA = 1e-2
+
+# The upper end: a norm of a thousand is a specification that nothing meets, and no start.
 _HIGHEST_GAMMA = 1e3
 # Weight where none is asked: on an output, and on an actuator over the plant's smallest gain at the scale.
 # The theorem needs every actuator in z; this one is too cheap to decide anything.

@@ -47,6 +47,8 @@ _EMBEDDINGS = 3
 _EMBEDDED_DAMPING = 0.8
 # Lowest order of the ladder up to the asked one; with tracking, as two states rarely track and damp.
 _LOWEST_ORDER = 2
+
+# The lowest order with tracking.
 _LOWEST_TRACKING_ORDER = 3
 # Worst case over the Youla bound that the order "auto" may leave.
 _WITHIN = 1.02
@@ -54,6 +56,8 @@ _WITHIN = 1.02
 _GAINS = 0.99
 # Orders that "auto" tries: the first, and the highest.
 _FIRST_AUTO_ORDER = 5
+
+# The highest order that "auto" tries: a bound on time. Chosen.
 _HIGHEST_AUTO_ORDER = 12
 # Frequencies of each plant that are named where an ellipse lies over -1.
 _MOST_PLACES = 5

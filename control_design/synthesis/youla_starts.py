@@ -46,6 +46,8 @@ _ACCURACY = 3e-3
 _RELOCATIONS = 12
 # First poles, in units of the scale: real, over two decades around it.
 _SLOWEST_POLE = 0.1
+
+# The fastest of the first poles.
 _FASTEST_POLE = 10.0
 # Standard deviation of the logarithms of random weights: factors of 4.5 up and down are usual.
 _SPREAD = 1.5

@@ -39,6 +39,8 @@ _LEAST_PERIODS = 2
 # Highest frequency of the box, as a share of the Nyquist frequency: a mode there is hard to tell from one
 # that is folded back. A stated bound may go up to the second number.
 _HIGHEST_SHARE = 0.9
+
+# Share of the Nyquist frequency up to which a stated bound may go.
 _HIGHEST_STATED_SHARE = 0.99
 # Largest damping ratio of the box; a refinement may go on to ZETA_LIMIT. Chosen: more rings no more.
 _LARGEST_ZETA = 0.63
@@ -46,6 +48,8 @@ _LARGEST_ZETA = 0.63
 _MOVED_ZETA = 0.95
 # Least damping ratio and highest frequency (over pi) of a pair that is moved: it has to be a pole of `Poles`.
 _LEAST_MOVED_ZETA = 1e-6
+
+# Highest frequency of such a pair, over pi.
 _HIGHEST_MOVED_SHARE = 0.9
 # Modulus in place of a pole at z = 0, which has no logarithm. Any small one: its frequency, 6.9 rad/sample,
 # is above the limit and is cut.

@@ -33,6 +33,8 @@ _N_NODES = 8
 _gauss_nodes, _gauss_weights = np.polynomial.legendre.leggauss(_N_NODES)
 # From -1 .. 1, where numpy has them, to 0 .. 1.
 _NODES = (_gauss_nodes + 1) / 2
+
+# Weights for the same interval: half as long, so half of each.
 _WEIGHTS = _gauss_weights / 2
 # Least length of a column, in place of zero, so that a division by it is none by zero.
 _TINY = 1e-300

@@ -116,7 +116,7 @@ def stabilised(y: RealArray, unstable: Poles) -> RealArray:
 
     References
     ----------
-    U. Forssell, L. Ljung, Automatica 36(1), 2000.
+    U. Forssell, L. Ljung, IEEE Transactions on Automatic Control 45(1), 2000.
     """
     if not unstable.order:
         return y

@@ -37,6 +37,8 @@ SAMPLES_PER_UNKNOWN = 20
 SAME_RESPONSE = 1e-10
 # Quantiles between which an honest ratio of standard deviations lies in 95 % of experiments.
 LOW_QUANTILE = 0.025
+
+# The upper one of the two.
 HIGH_QUANTILE = 0.975
 
 

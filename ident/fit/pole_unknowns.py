@@ -26,11 +26,23 @@ from ident.fit.kernels import backward, factorise, forward, schur_drop
 
 # Order of the numbers in an array of bounds (see `ident.fit.refinement.Bounds`).
 _DISTANCE_MIN = 0
+
+# Largest 1 - a of a real pole a.
 _DISTANCE_MAX = 1
+
+# Lowest frequency of a pair [rad/sample].
 _OMEGA_MIN = 2
+
+# Highest frequency of a pair [rad/sample].
 _OMEGA_MAX = 3
+
+# Least damping ratio of a pair.
 _ZETA_MIN = 4
+
+# Largest damping ratio of a pair.
 _ZETA_MAX = 5
+
+# Least decay s = zeta omega of a pair [rad/sample]: below it a record shows no decay.
 _S_MIN = 6
 # Whatever follows these seven are measured bands [rad/sample], low and high in turn; `narrowest` reads them.
 _FIRST_BAND = 7

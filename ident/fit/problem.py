@@ -31,6 +31,8 @@ _FLOOR = 1e-13
 # record there must be per lag: an autocorrelation is known to one over the root of the number of its
 # products.
 _MOST_LAGS = 200
+
+# Samples of the shortest record per lag.
 _SAMPLES_PER_LAG = 10
 
 

@@ -25,14 +25,24 @@ from ident.fit.regression import prepare
 # Default window, for a picture that holds the pair's own valley and its neighbours. Frequency: two octaves
 # each way, below the Nyquist frequency by this share.
 OMEGA_FACTOR = 4
+
+# Share of the Nyquist frequency at which the window ends: at Nyquist itself a pair is two real poles.
 BELOW_NYQUIST = 0.99
 # Damping ratio, and width 1 - gamma: a factor of 30 each way, the damping ratio within these ends.
 DAMPING_FACTOR = 30
+
+# Least damping ratio of the window: a lighter pair rings for more than ten thousand periods.
 LEAST_ZETA = 1e-5
+
+# Largest damping ratio of the window: at 1 the pair becomes two real poles.
 LARGEST_ZETA = 0.95
 # beta: ten damping widths each way, at least this much, and inside -1..1 by a rounding error.
 BETA_WIDTHS = 10
+
+# Least width of beta each way, for a pair so light that ten damping widths show as a line.
 LEAST_BETA_WIDTH = 0.02
+
+# Largest |beta|: at 1 the pair is two real poles at the end of its range, less a rounding error.
 INSIDE_BETA = 1 - 1e-9
 # Sides (low, high) of the cube that candidates are given in: [real pole (none here), first, second]
 # coordinate. Any box that holds the grid serves. raw: beta, gamma.

@@ -34,6 +34,8 @@ Criterion = Callable[[float, int], float]
 # then pair by pair. A joint search of several has never found the best: of problems with three and five modes
 # 0 of 32, pair by pair 32 of 32.
 FIRST_REAL = 2
+
+# Pairs of that search: one.
 FIRST_PAIRS = 1
 # Rounds of growing and pruning at most: after a pole was pruned another one may be worth adding. Chosen.
 MOST_ROUNDS = 3

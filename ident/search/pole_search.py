@@ -49,6 +49,8 @@ FINE = 1e-9
 MOST_ROUNDS = 6
 # Points of a rescan of real poles, and of a pair, from which a descent starts.
 STARTS_OF_REAL = 2
+
+# Points of a rescan of a pair from which one starts: a descent of two unknowns takes longer.
 STARTS_OF_PAIR = 1
 
 # Starts that end in one place and make further ones and a rescan superfluous.
@@ -73,6 +75,8 @@ REAL_LEVELS = 9
 # Frequencies and damping ratios of a pair in a grid. A grid of 60 x 3 led to the same models on the benchmark
 # plants.
 PAIR_OMEGAS = 40
+
+# Damping ratios of a pair in a grid: light and well damped.
 PAIR_ZETAS = 2
 # Samples below which a record counts as so long for the slowest pole of a search (`search_space` does so,
 # too).
