@@ -2,7 +2,8 @@
 
 An effect is a function Machine -> Machine (see `plant.effects`). The description is physical, not
 numerical: matrices are made from it in `plant.modal`, arrays for the stepper in `plant.plan`. Every default
-means "as nominal".
+means "as nominal". `Machine` has a rig and three paths: from commanded to acting voltage, from voltage to
+link root (the joint), and from tip to reading (the sensor).
 """
 
 from __future__ import annotations
@@ -16,7 +17,18 @@ import numpy.typing as npt
 
 from plant.rig import Rig
 
-SINE, CUBIC, STRIBECK, GRAVITY, QUADRATIC = 0, 1, 2, 3, 4  # smooth forces of `plant.kernel`
+# Labels of the laws of smooth forces, computed in `plant.kernel`, of a position y and parameters p.
+# Ripple p0 sin(p1 y + p2): y the shaft angle, rad, p0 in N m.
+SINE = 0
+# Cubic spring -p0 y^3: y an angle, rad, p0 in N m/rad^3.
+CUBIC = 1
+# What dry friction has above its Coulomb level while it slips, p0 exp(-|y| / p1): y a speed, rad/s, p0 in N
+# m.
+STRIBECK = 2
+# Gravity on link and tip mass: p0 in m/s^2, p1 the static moment, kg m, p2 the hub angle of hanging, rad.
+GRAVITY = 3
+# Drag -p0 y |y|: y a speed, rad/s, p0 in N m s^2/rad^2.
+QUADRATIC = 4
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
@@ -34,9 +46,21 @@ class VoltagePath:
     lag_s: float = 0.0
 
     def static(self, voltage_V: Signal) -> Signal:
-        """The memoryless part: gain, dead zone, saturation."""
+        """Voltage behind gain, dead zone and saturation, the memoryless part of the path.
+
+        Parameters
+        ----------
+        voltage_V : float or (T,)
+            As commanded.
+
+        Returns
+        -------
+        float or (T,)
+            Like the argument, V; delay and lag are not in it.
+        """
         value = self.gain * voltage_V
-        if isinstance(value, float):  # sample by sample: numpy's functions take five times as long
+        # One sample: numpy's functions would take five times as long.
+        if isinstance(value, float):
             acting = min(max(abs(value) - self.dead_zone_V, 0.0), self.limit_V)
             return math.copysign(acting, value)
         size = np.minimum(np.maximum(np.abs(value) - self.dead_zone_V, 0.0), self.limit_V)
@@ -45,16 +69,24 @@ class VoltagePath:
 
 @dataclass(frozen=True)
 class DryFriction:
-    """Dry friction of the level Tc + (Ts - Tc) exp(-|omega| / vs) with elastic pre-sliding."""
+    """Dry friction of the level Tc + (Ts - Tc) exp(-|omega| / vs) with elastic pre-sliding.
+
+    static_torque_Nm : float. Ts, held at rest.
+    coulomb_torque_Nm : float. Tc, left at high speed.
+    stribeck_velocity_rad_s : float. vs, over which the excess falls.
+    """
 
     static_torque_Nm: float
     coulomb_torque_Nm: float
     stribeck_velocity_rad_s: float
 
+    # Deflection of the stuck joint at break-away, rad: a hundredth of the encoder noise of the paper's link,
+    # so that rest looks like rest. Smaller is stiffer, and needs shorter steps (`plant.plan`).
     PRE_SLIDING_RAD = 1e-5
 
     @property
     def stiffness_Nm_rad(self) -> float:
+        """Stiffness of the stuck joint, N m/rad."""
         return self.static_torque_Nm / self.PRE_SLIDING_RAD
 
 
@@ -62,9 +94,15 @@ class DryFriction:
 class SmoothTorque:
     """A torque (hub side of the gear) that is a smooth function of one angle, or of one speed.
 
-    law: how, one of the smooth forces of `plant.kernel`. values: its parameters, the size first; 0 is no
-    torque. at: what it acts on and depends on: "shaft", from housing to shaft, or "motor", from ground on the
-    motor side of the hub.
+    law : int
+        Label of the function: SINE, CUBIC or QUADRATIC above.
+    values : tuple of float
+        Its one to three parameters p0, p1, p2; p0 is the size, and 0 is no torque.
+    at : str
+        What it acts on and depends on: "shaft", from housing to shaft, or "motor", from ground on the motor
+        side of the hub.
+    of : str
+        Whether it depends on the angle or on the speed there.
     """
 
     law: int
@@ -93,7 +131,17 @@ class TorsionSpring:
 
 @dataclass(frozen=True)
 class JointPath:
-    """What acts between voltage and link root."""
+    """What acts between voltage and link root.
+
+    friction : dry friction from housing to shaft.
+    torques : smooth nonlinear torques.
+    disturbance : sinusoidal torques from ground on the hub.
+    ground_spring_Nm_rad : stiffness of a linear spring from ground to the motor side of the hub.
+    compliance : spring between hub and link root, or None where the link is clamped rigidly.
+    base : spring between ground and motor housing, which carries the base, or None where it stands firmly.
+    attached : spring between hub and a body about its axis, or None where there is no such body.
+    backlash_gap_rad : total gap between motor side and hub, or None without a gap.
+    """
 
     friction: tuple[DryFriction, ...] = ()
     torques: tuple[SmoothTorque, ...] = ()
@@ -117,7 +165,11 @@ class SensorPath:
 
 @dataclass(frozen=True)
 class Machine:
-    """The rig (its parameters already changed by parametric effects) and the paths around it."""
+    """The rig (its parameters already changed by parametric effects) and the paths around it.
+
+    gravity_m_s2 : float. Component of gravity in the plane of motion.
+    gravity_direction_rad : float. Hub angle at which the link hangs.
+    """
 
     rig: Rig
     voltage: VoltagePath = field(default_factory=VoltagePath)
@@ -129,7 +181,11 @@ class Machine:
     @property
     def linear(self) -> bool:
         """Whether the outputs, noise aside, are linear in voltage and forces from outside."""
-        voltage, joint, sensor = self.voltage, self.joint, self.sensor
-        bent = voltage.dead_zone_V > 0 or voltage.limit_V < float("inf") or sensor.step_m > 0
-        bent = bent or bool(joint.friction or joint.torques or joint.backlash_gap_rad)
-        return not (bent or joint.disturbance or sensor.drift_m_s or self.gravity_m_s2)
+        voltage = self.voltage
+        joint = self.joint
+        sensor = self.sensor
+        bent_path = voltage.dead_zone_V > 0 or voltage.limit_V < float("inf") or sensor.step_m > 0
+        bent_joint = bool(joint.friction or joint.torques or joint.backlash_gap_rad)
+        # Affine, not linear: they move the outputs without any voltage.
+        from_outside = joint.disturbance or sensor.drift_m_s or self.gravity_m_s2
+        return not (bent_path or bent_joint or from_outside)
