@@ -10,6 +10,10 @@ friction) enter as a parabola through their values at start, middle and end of t
 of the state matrix. A delay splits every sample at the instant where the held voltage changes; where a
 sample is no longer than a basic step it is one step all the same, with this change inside it, unless an
 element does not hold its mode in it. Without switching or smooth forces there is one exact step a sample.
+
+`make_plan` gathers all this for `plant.simulation`. `_Builder` holds the layout of the state and the matrices
+over it; `_transitions` and `_change_inside` make the tables of steps. Letters of the shapes: N states, n
+coordinates, M modes, E switching elements, J smooth forces, H = 4 + E held inputs, L step sizes.
 """
 
 from __future__ import annotations
@@ -21,30 +25,67 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.linalg import eigh, expm
 
-from plant.kernel import CONTACT, FRICTION, run
+from plant.kernel import (
+    CONTACT,
+    CONTACT_DAMPING,
+    CONTACT_STIFFNESS,
+    FRICTION,
+    FRICTION_STIFFNESS,
+    HELD_INPUTS,
+    KIND,
+    STRIBECK_EXCESS,
+    STRIBECK_SPEED,
+    run,
+)
 from plant.machine import GRAVITY, SINE, STRIBECK, Integer, Machine, Real
 from plant.modal import MOTOR_SIDE_SHARE, Equations, default_n_modes, equations_of_motion, static_moment_kg_m
 
-# Basic step where something switches: 8 a sample at 5 ms. Twice that where forces are smooth.
+# The errors below are those of a 5 s record of the paper's link under a multisine of 3 V, against steps of
+# 20 us, as a share of the sensor noise (root mean squares).
+
+# Basic step where something switches, s: 8 a sample at 5 ms. Twice that where forces are smooth. Errors are
+# 3e-6 (Coulomb friction), 5e-5 (backlash) and 3e-3 (steep Stribeck friction); doubled 2e-5, 2e-4 and 3e-3.
 SUBSTEP_S = 6.25e-4
 # A ripple of N cycles advances by at most this phase in one step at the speed of a brisk slew. That is so at
-# the basic step above, and in proportion at others, up to the last.
-_RIPPLE_PHASE_RAD, _SLEW_RAD_S, _LARGEST_PHASE_RAD = 0.25, 5.0, 0.5
+# the basic step above, and in proportion at others, up to the last. A contact has the same bound on the phase
+# of its oscillation; doubled, the error of backlash is 2e-4 in place of 5e-5.
+_RIPPLE_PHASE_RAD = 0.25
+# Speed of a brisk slew, rad/s: half a turn in 0.6 s. Doubled, the error of a ripple of 40 cycles is 1e-7 in
+# place of 2e-6.
+_SLEW_RAD_S = 5.0
+# Largest phase of a ripple in one step, however coarse the basic step is: a parabola follows a sine no
+# further. With it the error of that ripple stays at 3e-5 for a basic step four times as long.
+_LARGEST_PHASE_RAD = 0.5
 # A basic step is halved this many times to place a switching instant (to 1.2 us at the basic step above).
+# One fewer makes the errors of Coulomb friction and backlash four to five times as large.
 _HALVINGS = 9
 # A stuck friction element or a closed contact oscillates; its phase may advance by this much in one basic
 # step; by no more than that of a ripple for contacts: the bounces that follow amplify what a step misses.
-# That is so at the basic step above, and in proportion at others, up to as much as for friction.
+# That is so at the basic step above, and in proportion at others, up to as much as for friction. Doubled, no
+# error above moves: on the paper's link the basic step is the shorter bound. It acts for stiffer friction.
 _PHASE_PER_STEP_RAD = 0.8
-# Falling Stribeck friction is a negative damper; a step may cover this much of its growth time.
+# Falling Stribeck friction is a negative damper; a step may cover this much of its growth time. By that the
+# sweeps of `plant.kernel` contract by as much each. Doubled, the error of steep friction above stays.
 _GROWTH_PER_STEP = 0.3
-# A fraction of a sample below this is no separate part of it.
+# A fraction of a sample below this is no separate part of it: rounding of a delay that is meant as whole.
 _SMALLEST_PART = 1e-9
-
-
-# Corner and damping ratio of the accelerometer: far above any mode, and its delay of 0.1 ms is none here.
-_ACCELEROMETER_RAD_S, _ACCELEROMETER_DAMPING = 2 * np.pi * 2000.0, float(np.sqrt(0.5))
-# The last arguments of `plant.kernel.run`, from `signals` on, for a record.
+# Rounding of a part that is a whole number of longest steps, relative: it is not divided once more.
+_ROUNDING = 1e-12
+# Frequency at which the two sides of a closed backlash bounce against each other, Hz. Above the modes of the
+# link that matter, so that a contact looks rigid, and low enough for the steps above. Chosen.
+_CONTACT_HZ = 180.0
+# Damping of the contact over sqrt(motor-side inertia times stiffness); of critical damping with the inertia
+# reduced between both sides that is 0.48: a bounce keeps little of its speed. Chosen.
+_CONTACT_DAMPING_SHARE = 0.8
+# Corner frequency of the accelerometer, rad/s: far above any mode, and its delay of 0.1 ms is none here.
+_ACCELEROMETER_RAD_S = 2 * np.pi * 2000.0
+# Damping ratio of the accelerometer: the flattest gain below its corner (Butterworth).
+_ACCELEROMETER_DAMPING = float(np.sqrt(0.5))
+# Parameters of a smooth force in the table of `plant.kernel`; a law with fewer leaves the last ones zero.
+_CHANNEL_PARAMETERS = 3
+# Columns in a table of `plant.kernel` come in fours, which it adds together.
+_COLUMNS_TOGETHER = 4
+# The last arguments of `plant.kernel.run`, from `signals` on, for a record: no loop around the arm.
 _NO_LOOP = (
     np.zeros((0, 8)),
     np.zeros((1, 2)),
@@ -67,16 +108,59 @@ class PlanState(NamedTuple):
     mode: Integer
 
 
+class Oscillator(NamedTuple):
+    """A sinusoidal disturbance: index of its sine in the state, before its cosine, and angular frequency."""
+
+    sine: int
+    omega_rad_s: float
+
+
+class _Elements(NamedTuple):
+    """Switching elements: parameters (E, 6), columns of `plant.kernel`; rows (E, 2, N) of angle and speed."""
+
+    parameters: Real
+    rows: Real
+
+
+class _Channel(NamedTuple):
+    """One smooth force: law, up to three parameters, row (N,) of its position, column (N,) of its force."""
+
+    law: int
+    values: tuple[float, ...]
+    row: Real
+    column: Real
+
+
+class _Channels(NamedTuple):
+    """Smooth forces: laws (J,), parameters (J, 3), position rows (J, N), force columns (N, J)."""
+
+    laws: Integer
+    parameters: Real
+    rows: Real
+    columns: Real
+
+
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The arguments of `plant.kernel.run` that are the machine's, from `substeps` on, and what is needed
-    beside them.
+    """The machine's arguments of `plant.kernel.run`, and what is needed beside them.
 
-    parts: of a sample, two with a fractional delay. delay_samples: whole ones. output_rows: (6, N).
-    start_columns: (N, 3 + 2M). State per unit of hub angle, hub speed, voltage, modal deflections and rates.
-    slider_rows: (E, N). Angle of every switching element.
-    oscillators: of every disturbance, where its sine stands in the state, its cosine behind it, and its
-        angular frequency.
+    arguments : tuple
+        From `substeps` to `geometric_stiffness`.
+    output_rows : (6, N)
+        Hub angle as the encoder sees it, tip, tip behind the sensor's lag, tip acceleration, hub speed and
+        tip deflection of the state; rad, m and s.
+    initial_state : (N,)
+        At rest at zero: only disturbances are not zero.
+    start_columns : (N, 3 + 2M)
+        State per unit of hub angle, hub speed, voltage, modal deflections and rates.
+    slider_rows : (E, N)
+        Angle of every switching element, rad.
+    parts : int
+        Of a sample, two with a fractional delay.
+    delay_samples : int
+        Whole samples of the voltage's delay.
+    oscillators : tuple of Oscillator
+        One per disturbance.
     """
 
     arguments: tuple[Any, ...]
@@ -86,28 +170,48 @@ class Plan:
     slider_rows: Real
     parts: int
     delay_samples: int
-    oscillators: tuple[tuple[int, float], ...]
+    oscillators: tuple[Oscillator, ...]
 
     def advance(self, inputs: Real, state: PlanState) -> Real:
-        """(T, N) states at the start of every sample of inputs (T, 4); changes the state."""
+        """States (T, N) at the start of every sample under inputs (T, 4); changes the state to the end.
+
+        Columns of the inputs: acting voltage in the first and in the second part of the sample, V, outside
+        torque on the hub, N m, outside force at the tip, N.
+        """
         states = np.empty((len(inputs), state.x.size))
         run(inputs, states, *state, *self.arguments, *_NO_LOOP)
         return states
 
     def at(self, start: Real | None = None, time_s: float = 0.0) -> PlanState:
-        """The state at the start: every friction element stuck without a load, every contact open.
+        """State at the start of a record: every friction element stuck without a load, every contact open.
 
-        start (3 + 2m,): hub angle, hub speed, acting voltage, first m modal deflections and their rates;
-        without it at rest at zero. time_s: how long disturbances have been running.
+        Parameters
+        ----------
+        start : (3 + 2m,), optional
+            Hub angle, hub speed, acting voltage, first m modal deflections and their rates; without it at
+            rest at zero.
+        time_s : float
+            How long disturbances have been running.
+
+        Returns
+        -------
+        PlanState
+            Arrays of its own, which `advance` may change.
         """
         x = self.initial_state.copy()
-        for sine, omega_rad_s in self.oscillators if time_s else ():
-            s, c = np.sin(omega_rad_s * time_s), np.cos(omega_rad_s * time_s)
-            x[sine : sine + 2] = [[c, s], [-s, c]] @ x[sine : sine + 2]
+        if time_s != 0.0:
+            for oscillator in self.oscillators:
+                sine = np.sin(oscillator.omega_rad_s * time_s)
+                cosine = np.cos(oscillator.omega_rad_s * time_s)
+                rotation = [[cosine, sine], [-sine, cosine]]
+                pair = slice(oscillator.sine, oscillator.sine + 2)
+                x[pair] = rotation @ x[pair]
         if start is not None:
-            m, modes = (start.size - 3) // 2, (self.start_columns.shape[1] - 3) // 2
-            x += self.start_columns[:, : 3 + m] @ start[: 3 + m]
-            x += self.start_columns[:, 3 + modes : 3 + modes + m] @ start[3 + m :]
+            n_started = (start.size - 3) // 2
+            n_modes = (self.start_columns.shape[1] - 3) // 2
+            # Modes beyond the first m start at zero.
+            x += self.start_columns[:, : 3 + n_started] @ start[: 3 + n_started]
+            x += self.start_columns[:, 3 + n_modes : 3 + n_modes + n_started] @ start[3 + n_started :]
         sliders = self.slider_rows @ x
         return PlanState(x, sliders, np.zeros(sliders.size, dtype=np.int64))
 
@@ -115,369 +219,533 @@ class Plan:
 def make_plan(
     machine: Machine, dt_s: float, n_modes: int | None, substep_s: float, *, accelerometer: bool = False
 ) -> Plan:
-    """Prepare the stepper for a machine sampled at dt_s.
+    """The stepper's arrays for a machine that is sampled at dt_s.
 
-    Its outputs are the hub angle, the true tip position, the tip position behind the sensor's lag, with an
-    accelerometer the second derivative of the true tip position (else zero), hub speed and tip deflection.
+    Parameters
+    ----------
+    machine : Machine
+        Rig and paths; nothing is checked here (`plant.simulation` does).
+    dt_s : float
+        Sampling period.
+    n_modes : int or None
+        Modes of the link; None takes `plant.modal.default_n_modes`.
+    substep_s : float
+        Longest step where something switches; twice that where forces are smooth.
+    accelerometer : bool
+        The second derivative of the true tip position is an output too; else that row is zero.
+
+    Returns
+    -------
+    Plan
     """
-    equations = equations_of_motion(machine, default_n_modes(machine.rig) if n_modes is None else n_modes)
-    builder = _Builder(machine, equations, accelerometer=accelerometer)
-    element, element_rows = builder.elements()
-    kinds, channel, channel_rows, force_columns = builder.channels()
-    n, n_elements, n_channels = builder.n, element.shape[0], kinds.size
+    if n_modes is None:
+        n_modes = default_n_modes(machine.rig)
+    builder = _Builder(machine, equations_of_motion(machine, n_modes), accelerometer=accelerometer)
+    elements = builder.elements()
+    channels = builder.channels()
     held_columns = builder.held_columns()
-    switching = n_elements + n_channels > 0
-    halvings = _HALVINGS if n_elements else 0
-    state_matrices = [builder.state_matrix(q, element, element_rows) for q in range(2**n_elements)]
-    longest = builder.longest_step_s(element, element_rows, held_columns, substep_s)
+    n_states = builder.n_states
+    n_held = held_columns.shape[1]
+    n_elements = len(elements.parameters)
+    n_channels = channels.laws.size
+    # Every element is a spring or none: a matrix for each combination.
+    state_matrices = [builder.state_matrix(q, elements) for q in range(2**n_elements)]
 
+    # A fractional delay splits a sample where the voltage changes; each part is divided into equal steps.
+    longest_s = builder.longest_step_s(elements, held_columns, substep_s)
     delay_samples, fraction = _split_delay(machine.voltage.delay_s, dt_s)
-    lengths = (dt_s,) if fraction == 0.0 else (fraction * dt_s, (1 - fraction) * dt_s)
-    substeps = [int(np.ceil(length / longest * (1 - 1e-12))) if switching else 1 for length in lengths]
-    parts = len(lengths)
-    whole = parts == 2 and (dt_s <= longest or not switching)
-    if whole:
-        # Only where an element may switch are its parts ever taken.
-        lengths, substeps = ((dt_s, *lengths), [1, *substeps]) if n_elements else ((dt_s,), [1])
-    tables = len(lengths), len(state_matrices), halvings + 1, n + held_columns.shape[1] + 3 * n_channels
-    step, reach = (np.zeros((*tables, -(-columns // 4) * 4)) for columns in (n, 2 * n_channels))
-    for part, (length, count) in enumerate(zip(lengths, substeps, strict=True)):
+    lengths_s = [dt_s]
+    if fraction != 0.0:
+        lengths_s = [fraction * dt_s, (1 - fraction) * dt_s]
+    parts = len(lengths_s)
+    is_linear = n_elements + n_channels == 0
+    substeps = [1] * parts
+    if not is_linear:
+        substeps = [int(np.ceil(length_s / longest_s * (1 - _ROUNDING))) for length_s in lengths_s]
+
+    # Where it is no longer than a step, a split sample is one step with the change of voltage inside it.
+    as_one_step = parts == 2 and (dt_s <= longest_s or is_linear)
+    if as_one_step and n_elements > 0:
+        # Its parts follow for the samples in which an element switches.
+        lengths_s = [dt_s, *lengths_s]
+        substeps = [1, *substeps]
+    elif as_one_step:
+        lengths_s = [dt_s]
+        substeps = [1]
+
+    # Only a switching instant needs steps smaller than the basic one.
+    n_levels = 1
+    if n_elements > 0:
+        n_levels = _HALVINGS + 1
+    n_rows = n_states + n_held + 3 * n_channels
+    table_shape = (len(lengths_s), len(state_matrices), n_levels, n_rows)
+    step = np.zeros((*table_shape, _filled_up(n_states)))
+    reach = np.zeros((*table_shape, _filled_up(2 * n_channels)))
+    for part, (length_s, count) in enumerate(zip(lengths_s, substeps, strict=True)):
+        is_whole_sample = as_one_step and part == 0
         for q, a in enumerate(state_matrices):
-            into = step[part, q, ..., :n], reach[part, q, ..., : 2 * n_channels]
-            if part < whole:
-                into = into[0][-1:], into[1][-1:]
-            _transitions(a, held_columns, force_columns, channel_rows, length / count, *into)
-            if part < whole:
-                _change_inside(a, held_columns[:, 1], channel_rows, dt_s, fraction, into[0][0], into[1][0])
-    rate = np.zeros((len(state_matrices), n_elements, n + held_columns.shape[1] + n_channels))
+            step_levels = step[part, q, ..., :n_states]
+            reach_levels = reach[part, q, ..., : 2 * n_channels]
+            if is_whole_sample:
+                # This step is never halved: its parts are taken instead.
+                step_levels = step_levels[-1:]
+                reach_levels = reach_levels[-1:]
+            _transitions(a, held_columns, channels, length_s / count, step_levels, reach_levels)
+            if is_whole_sample:
+                voltage = held_columns[:, 1]
+                _change_inside(a, voltage, channels.rows, dt_s, fraction, step_levels[0], reach_levels[0])
+
+    # Acceleration of every element's angle, by which `plant.kernel` sees how friction that slips softens.
+    element_rate = np.zeros((len(state_matrices), n_elements, n_states + n_held + n_channels))
     for q, a in enumerate(state_matrices):
         for e in range(n_elements):
-            rate[q, e] = element_rows[e, 1] @ np.hstack([a, held_columns, force_columns])
+            derivative = np.hstack([a, held_columns, channels.columns])
+            element_rate[q, e] = elements.rows[e, 1] @ derivative
+    # A table without columns has no rows either, which `reshape` cannot know.
+    reach_table = np.zeros((0, 0))
+    if n_channels > 0:
+        reach_table = reach.reshape(-1, reach.shape[-1])
     arguments = (
         np.array(substeps, dtype=np.int64),
-        int(whole),
+        int(as_one_step),
         step.reshape(-1, step.shape[-1]),
-        reach.reshape(-1, reach.shape[-1]) if n_channels else np.zeros((0, 0)),
-        element,
-        element_rows.reshape(-1, n),
-        rate.reshape(-1, rate.shape[2]),
-        kinds,
-        channel,
-        channel_rows,
+        reach_table,
+        elements.parameters,
+        elements.rows.reshape(-1, n_states),
+        element_rate.reshape(-1, element_rate.shape[2]),
+        channels.laws,
+        channels.parameters,
+        channels.rows,
         *builder.gravity(),
     )
     return Plan(
-        arguments,
-        builder.outputs(),
-        builder.initial_state(),
-        builder.start_columns(state_matrices[0]),
-        element_rows[:, 0],
-        parts,
-        delay_samples,
-        builder.disturbances(),
+        arguments=arguments,
+        output_rows=builder.outputs(),
+        initial_state=builder.initial_state(),
+        start_columns=builder.start_columns(state_matrices[0]),
+        slider_rows=elements.rows[:, 0],
+        parts=parts,
+        delay_samples=delay_samples,
+        oscillators=builder.oscillators,
     )
 
 
+def _filled_up(columns: int) -> int:
+    """Number of columns of a table that holds so many and is a multiple of those that are added together."""
+    return -(-columns // _COLUMNS_TOGETHER) * _COLUMNS_TOGETHER
+
+
 def _split_delay(delay_s: float, dt_s: float) -> tuple[int, float]:
-    """Whole samples and the remaining fraction of one."""
+    """Whole samples of a delay, and the remaining fraction of one, 0 where rounding alone made one."""
     samples = delay_s / dt_s
     whole = int(np.floor(samples))
     fraction = samples - whole
     if fraction < _SMALLEST_PART:
         return whole, 0.0
-    return (whole + 1, 0.0) if fraction > 1 - _SMALLEST_PART else (whole, fraction)
+    if fraction > 1 - _SMALLEST_PART:
+        return whole + 1, 0.0
+    return whole, fraction
 
 
 class _Builder:
-    """State layout: coordinates, speeds, voltage lag, tip sensor lag, accelerometer (position, speed over its
-    corner frequency), a sine and cosine per disturbance."""
+    """Matrices, rows and columns of a machine over one layout of the state (N,).
+
+    Layout: n coordinates of `plant.modal`, their n speeds; then, where the machine has them, the voltage
+    behind its lag, V, the tip behind its sensor's lag, m, the accelerometer's mass (position, m, and speed
+    over the corner frequency, m); then a sine and a cosine per disturbance. An index is None where the
+    machine has no such state.
+    """
 
     def __init__(self, machine: Machine, equations: Equations, *, accelerometer: bool = False) -> None:
-        self.machine, self.equations = machine, equations
-        size = 2 * equations.mass.shape[0]
-        self.mechanical = size
-        self.voltage_state = size if machine.voltage.lag_s > 0 else -1
-        size += self.voltage_state >= 0
-        self.sensor_state = size if machine.sensor.lag_s > 0 else -1
-        size += self.sensor_state >= 0
-        self.accelerometer = size if accelerometer else -1
-        size += 2 * accelerometer
-        self.oscillators = size
-        self.n = size + 2 * len(machine.joint.disturbance)
+        self.machine = machine
+        self.equations = equations
+        self.n_coordinates = equations.mass.shape[0]
+        self.voltage_state: int | None = None
+        self.sensor_state: int | None = None
+        self.accelerometer_state: int | None = None
+        size = 2 * self.n_coordinates
+        if machine.voltage.lag_s > 0:
+            self.voltage_state = size
+            size += 1
+        if machine.sensor.lag_s > 0:
+            self.sensor_state = size
+            size += 1
+        if accelerometer:
+            self.accelerometer_state = size
+            size += 2
+        oscillators = []
+        for disturbance in machine.joint.disturbance:
+            oscillators.append(Oscillator(size, 2 * np.pi * disturbance.frequency_Hz))
+            size += 2
+        self.oscillators = tuple(oscillators)
+        self.n_states = size
+        # Friction without a level is none, and has no stiffness either.
+        self.frictions = [friction for friction in machine.joint.friction if friction.static_torque_Nm > 0]
 
     def _column(self, direction: Real) -> Real:
-        return np.pad(self.equations.input_column(direction), (0, self.n - self.mechanical))
+        """State derivative (N,) by a unit generalised force along a direction (n,) of `plant.modal`."""
+        mechanical = self.equations.input_column(direction)
+        return np.pad(mechanical, (0, self.n_states - mechanical.size))
 
     def _position(self, direction: Real) -> Real:
-        return np.pad(direction, (0, self.n - direction.size))
+        """Row (N,) that gives the displacement along a direction (n,) from the state."""
+        return np.pad(direction, (0, self.n_states - direction.size))
 
     def _speed(self, direction: Real) -> Real:
-        return np.pad(direction, (direction.size, self.n - self.mechanical))
+        """Row (N,) that gives the speed along a direction (n,) from the state."""
+        return np.pad(direction, (direction.size, self.n_states - 2 * direction.size))
 
     def _motor_column(self) -> Real:
+        """State derivative (N,) by one volt at the motor."""
         return self.machine.rig.motor.torque_per_volt_Nm_V * self._column(self.equations.shaft)
 
-    def state_matrix(self, q: int, element: Real, element_rows: Real) -> Real:
-        """A with the springs of the elements whose bit is set in q: stuck friction, closed contact."""
-        machine, eq = self.machine, self.equations
-        a = np.zeros((self.n, self.n))
-        a[: self.mechanical, : self.mechanical] = eq.state_matrix()
-        if self.voltage_state >= 0:
-            a[:, self.voltage_state] += self._motor_column()
-            a[self.voltage_state, self.voltage_state] = -1 / machine.voltage.lag_s
-        if self.sensor_state >= 0:
-            a[self.sensor_state] += self._position(eq.tip) / machine.sensor.lag_s
-            a[self.sensor_state, self.sensor_state] = -1 / machine.sensor.lag_s
-        if self.accelerometer >= 0:
-            at, corner = self.accelerometer, _ACCELEROMETER_RAD_S
-            a[at, at + 1] = corner
-            a[at + 1] = self._acceleration() / corner
-        for (sine, omega), disturbance in zip(self.disturbances(), machine.joint.disturbance, strict=True):
-            a[:, sine] += disturbance.amplitude_Nm * self._column(eq.hub)
-            a[sine, sine + 1], a[sine + 1, sine] = omega, -omega
+    def state_matrix(self, q: int, elements: _Elements) -> Real:
+        """A (N, N) with the springs of the elements whose bit is set in q: stuck friction, closed contact."""
+        n_mechanical = 2 * self.n_coordinates
+        a = np.zeros((self.n_states, self.n_states))
+        a[:n_mechanical, :n_mechanical] = self.equations.state_matrix()
+        voltage = self.voltage_state
+        if voltage is not None:
+            a[:, voltage] += self._motor_column()
+            a[voltage, voltage] = -1 / self.machine.voltage.lag_s
+        sensor = self.sensor_state
+        if sensor is not None:
+            sensor_lag_s = self.machine.sensor.lag_s
+            a[sensor] += self._position(self.equations.tip) / sensor_lag_s
+            a[sensor, sensor] = -1 / sensor_lag_s
+        position = self.accelerometer_state
+        if position is not None:
+            # The second state is a speed over the corner frequency: both are of one size.
+            a[position, position + 1] = _ACCELEROMETER_RAD_S
+            a[position + 1] = self._acceleration(position) / _ACCELEROMETER_RAD_S
+        for (sine, omega), disturbance in zip(self.oscillators, self.machine.joint.disturbance, strict=True):
+            a[:, sine] += disturbance.amplitude_Nm * self._column(self.equations.hub)
+            a[sine, sine + 1] = omega
+            a[sine + 1, sine] = -omega
         columns = self._element_columns()
-        for e in range(element.shape[0]):
-            if q >> e & 1:
-                if element[e, 0] == FRICTION:
-                    a -= element[e, 1] * np.outer(columns[:, e], element_rows[e, 0])
-                else:
-                    a += np.outer(
-                        columns[:, e], element[e, 2] * element_rows[e, 0] + element[e, 3] * element_rows[e, 1]
-                    )
+        for e, element in enumerate(elements.parameters):
+            is_spring = q >> e & 1
+            if not is_spring:
+                continue
+            angle_row, speed_row = elements.rows[e]
+            if element[KIND] == FRICTION:
+                a -= element[FRICTION_STIFFNESS] * np.outer(columns[:, e], angle_row)
+            else:
+                push_row = element[CONTACT_STIFFNESS] * angle_row + element[CONTACT_DAMPING] * speed_row
+                a += np.outer(columns[:, e], push_row)
         return a
 
     def held_columns(self) -> Real:
-        """Columns of what is constant over a step: voltage before and after it changes in it, hub torque, tip
-        force, one force per element. The first is filled in where it does (`_change_inside`)."""
-        eq = self.equations
-        if self.voltage_state >= 0:
-            voltage = np.eye(self.n)[self.voltage_state] / self.machine.voltage.lag_s
-        else:
+        """Columns (N, 4 + E) of what is constant over a step.
+
+        They are the voltage before and after it changes in the step, hub torque, tip force, and one force per
+        element. The first is zero here: `_change_inside` fills its transition where the voltage does change.
+        """
+        if self.voltage_state is None:
             voltage = self._motor_column()
-        before, forces = np.zeros(self.n), self._element_columns()
-        return np.column_stack([before, voltage, self._column(eq.hub), self._column(eq.tip), forces])
+        else:
+            voltage = np.eye(self.n_states)[self.voltage_state] / self.machine.voltage.lag_s
+        voltage_before = np.zeros(self.n_states)
+        hub_torque = self._column(self.equations.hub)
+        tip_force = self._column(self.equations.tip)
+        return np.column_stack([voltage_before, voltage, hub_torque, tip_force, self._element_columns()])
 
     def _element_columns(self) -> Real:
-        """One column per element: friction drives the shaft, contact the hub against the motor side."""
-        columns = [self._column(self.equations.shaft) for _ in self._friction()]
+        """Columns (N, E) of the forces of friction, on the shaft, and contact, on hub against motor side."""
+        columns = [self._column(self.equations.shaft) for _ in self.frictions]
         if self.equations.backlash is not None:
             columns.append(-self._column(self.equations.backlash))
-        return np.column_stack(columns) if columns else np.zeros((self.n, 0))
+        if not columns:
+            return np.zeros((self.n_states, 0))
+        return np.column_stack(columns)
 
-    def _friction(self) -> list[tuple[float, float, float, float]]:
-        return [
-            (
-                f.stiffness_Nm_rad,
-                f.coulomb_torque_Nm,
-                f.static_torque_Nm - f.coulomb_torque_Nm,
-                f.stribeck_velocity_rad_s,
-            )
-            for f in self.machine.joint.friction
-            if f.static_torque_Nm > 0
-        ]
-
-    def elements(self) -> tuple[Real, Real]:
-        """Parameters (E, 6) and rows of relative angle and speed (E, 2, N)."""
-        eq = self.equations
-        parameters: list[tuple[float, ...]] = [(FRICTION, *f, 0.0) for f in self._friction()]
-        directions = [eq.shaft] * len(parameters)
-        gap = self.machine.joint.backlash_gap_rad
-        if gap is not None and eq.backlash is not None:
+    def elements(self) -> _Elements:
+        """The friction elements, in the order of the machine, then the contact of a backlash."""
+        parameters: list[tuple[float, ...]] = []
+        directions = []
+        for friction in self.frictions:
+            excess_Nm = friction.static_torque_Nm - friction.coulomb_torque_Nm
+            speed_rad_s = friction.stribeck_velocity_rad_s
+            stiffness = friction.stiffness_Nm_rad
+            parameters.append((FRICTION, stiffness, friction.coulomb_torque_Nm, excess_Nm, speed_rad_s, 0.0))
+            directions.append(self.equations.shaft)
+        gap_rad = self.machine.joint.backlash_gap_rad
+        if gap_rad is not None and self.equations.backlash is not None:
+            # Two inertias of 0.3 and 0.7 J against each other move like one of 0.3 * 0.7 J = 0.21 J.
             inertia = self.machine.rig.hub.inertia_kg_m2
-            stiffness = 0.21 * inertia * (2 * np.pi * 180) ** 2
-            damping = 0.8 * np.sqrt(MOTOR_SIDE_SHARE * inertia * stiffness)
-            parameters.append((CONTACT, gap / 2, stiffness, damping, 0.0, 0.0))
-            directions.append(eq.backlash)
-        rows = np.array([[self._position(d), self._speed(d)] for d in directions])
-        return np.array(parameters).reshape(-1, 6), rows.reshape(-1, 2, self.n)
+            stiffness = 0.21 * inertia * (2 * np.pi * _CONTACT_HZ) ** 2
+            damping = _CONTACT_DAMPING_SHARE * np.sqrt(MOTOR_SIDE_SHARE * inertia * stiffness)
+            parameters.append((CONTACT, gap_rad / 2, stiffness, damping, 0.0, 0.0))
+            directions.append(self.equations.backlash)
+        rows = np.array([[self._position(direction), self._speed(direction)] for direction in directions])
+        # Without elements the shapes are those of empty tables.
+        return _Elements(np.array(parameters).reshape(-1, 6), rows.reshape(-1, 2, self.n_states))
 
-    def channels(self) -> tuple[Integer, Real, Real, Real]:
-        """Smooth forces: kinds (J,), parameters (J, 3), position rows (J, N), force columns (N, J)."""
-        machine, eq = self.machine, self.equations
-        found: list[tuple[int, tuple[float, ...], Real, Real]] = []
-        for e, (_, _, excess, velocity) in enumerate(self._friction()):
-            if excess != 0:
-                both = self._speed(eq.shaft), self._column(eq.shaft)
-                found.append((STRIBECK, (excess, velocity, e), *both))
+    def channels(self) -> _Channels:
+        """The smooth forces: what friction has above its Coulomb level, torques by law, gravity last."""
+        equations = self.equations
+        channels: list[_Channel] = []
+        for e, friction in enumerate(self.frictions):
+            excess_Nm = friction.static_torque_Nm - friction.coulomb_torque_Nm
+            if excess_Nm != 0:
+                # Its third parameter is the element whose slip gives the direction.
+                values = (excess_Nm, friction.stribeck_velocity_rad_s, float(e))
+                row = self._speed(equations.shaft)
+                channels.append(_Channel(STRIBECK, values, row, self._column(equations.shaft)))
         # By law: sums of two of them are the same to the last digit for either order of the effects.
-        for torque in sorted(machine.joint.torques, key=lambda t: t.law):
+        for torque in sorted(self.machine.joint.torques, key=lambda torque: torque.law):
             if torque.values[0] != 0:
-                place = eq.shaft if torque.at == "shaft" else eq.motor
+                place = equations.shaft if torque.at == "shaft" else equations.motor
                 row = self._position(place) if torque.of == "angle" else self._speed(place)
-                found.append((torque.law, torque.values, row, self._column(place)))
-        if machine.gravity_m_s2 != 0:
-            values = machine.gravity_m_s2, static_moment_kg_m(machine.rig), machine.gravity_direction_rad
-            for direction in (eq.root, *np.eye(eq.mass.shape[0])[eq.first_mode :]):
-                found.append((GRAVITY, values, self._position(direction), self._column(direction)))
-        return (
-            np.array([kind for kind, *_ in found], dtype=np.int64),
-            np.array([(*values, 0.0, 0.0, 0.0)[:3] for _, values, *_ in found]).reshape(-1, 3),
-            np.array([row for *_, row, _ in found]).reshape(-1, self.n),
-            np.array([column for *_, column in found]).reshape(-1, self.n).T,
+                channels.append(_Channel(torque.law, torque.values, row, self._column(place)))
+        if self.machine.gravity_m_s2 != 0:
+            static_moment = static_moment_kg_m(self.machine.rig)
+            values = (self.machine.gravity_m_s2, static_moment, self.machine.gravity_direction_rad)
+            # It acts on the root's angle and on every mode, in this order, as `plant.kernel` expects.
+            modal_directions = np.eye(self.n_coordinates)[equations.first_mode :]
+            for direction in (equations.root, *modal_directions):
+                row = self._position(direction)
+                channels.append(_Channel(GRAVITY, values, row, self._column(direction)))
+
+        parameters = [(*channel.values, 0.0, 0.0, 0.0)[:_CHANNEL_PARAMETERS] for channel in channels]
+        rows = np.array([channel.row for channel in channels])
+        columns = np.array([channel.column for channel in channels])
+        return _Channels(
+            laws=np.array([channel.law for channel in channels], dtype=np.int64),
+            parameters=np.array(parameters).reshape(-1, _CHANNEL_PARAMETERS),
+            rows=rows.reshape(-1, self.n_states),
+            columns=columns.reshape(-1, self.n_states).T,
         )
 
     def gravity(self) -> tuple[Real, Real]:
-        """First moments of the modes, int m phi_i dx + mp phi_i(L), and the stiffness of the hanging weight.
+        """First moments (M,) of the modes and stiffness (M, M) of the hanging weight, by unit of gravity.
 
-        The latter is int (mass outboard of x) phi_i' phi_j' dx, per unit of gravity.
+        The moments are int m phi_i dx + mp phi_i(L); the stiffness is int (mass outboard of x) phi_i' phi_j'
+        dx, by Gauss-Legendre quadrature. Both are empty without gravity.
         """
         if self.machine.gravity_m_s2 == 0:
             return np.zeros(0), np.zeros((0, 0))
-        rig, modes = self.machine.rig, self.equations.modes
+        link = self.machine.rig.link
+        modes = self.equations.modes
+        # A mode has at most as many half waves as its number: eight nodes for each and sixteen for the ends
+        # integrate products of two slopes to rounding.
         nodes, weights = _gauss_legendre(8 * modes.tip.size + 16)
-        x = 0.5 * rig.link.length_m * (nodes + 1)
-        outboard = rig.link.mass_per_length_kg_m * (rig.link.length_m - x) + rig.payload.mass_kg
-        slope = modes.slope(x)
-        return modes.first_moment.copy(), slope.T @ (
-            (0.5 * rig.link.length_m * weights * outboard)[:, None] * slope
-        )
+        x_m = 0.5 * link.length_m * (nodes + 1)
+        outboard_kg = link.mass_per_length_kg_m * (link.length_m - x_m) + self.machine.rig.payload.mass_kg
+        slope = modes.slope(x_m)
+        weighted_slope = (0.5 * link.length_m * weights * outboard_kg)[:, None] * slope
+        return modes.first_moment.copy(), slope.T @ weighted_slope
 
     def outputs(self) -> Real:
-        """Rows: encoder, tip, tip behind the sensor lag, tip acceleration, encoder speed, deflection."""
-        eq = self.equations
-        tip, encoder = self._position(eq.tip), self._position(eq.encoder)
-        behind = np.eye(self.n)[self.sensor_state] if self.sensor_state >= 0 else tip
-        acceleration = self._acceleration() if self.accelerometer >= 0 else np.zeros(self.n)
-        return np.array(
-            [encoder, tip, behind, acceleration, self._speed(eq.encoder), self._position(eq.bending)]
-        )
+        """Rows (6, N) of encoder, tip, tip behind its lag, tip acceleration, hub speed, deflection."""
+        encoder = self._position(self.equations.encoder)
+        tip = self._position(self.equations.tip)
+        tip_behind_lag = tip
+        if self.sensor_state is not None:
+            tip_behind_lag = np.eye(self.n_states)[self.sensor_state]
+        acceleration = np.zeros(self.n_states)
+        if self.accelerometer_state is not None:
+            acceleration = self._acceleration(self.accelerometer_state)
+        encoder_speed = self._speed(self.equations.encoder)
+        deflection = self._position(self.equations.bending)
+        return np.array([encoder, tip, tip_behind_lag, acceleration, encoder_speed, deflection])
 
-    def _acceleration(self) -> Real:
-        """The accelerometer as a spring-mass system: the force on its mass per unit of mass."""
-        row, at = self._position(self.equations.tip), self.accelerometer
-        row[at], row[at + 1] = -1.0, -2 * _ACCELEROMETER_DAMPING
+    def _acceleration(self, position: int) -> Real:
+        """Row (N,) of the acceleration, m/s^2, that the accelerometer shows.
+
+        A mass on a spring and a damper rides on the tip; shown is the force on the mass per unit of mass,
+        w^2 (tip - mass) - 2 zeta w speed of the mass. position: index of the mass's position in the state.
+        """
+        row = self._position(self.equations.tip)
+        row[position] = -1.0
+        row[position + 1] = -2 * _ACCELEROMETER_DAMPING
         return _ACCELEROMETER_RAD_S**2 * row
 
     def start_columns(self, free: Real) -> Real:
-        """See `Plan`: base at rest in its middle, motor side and link root turned with the hub; modes of the
-        link with the hub held.
+        """State (N, 3 + 2M) per unit of hub angle, hub speed, voltage, modal deflections and their rates.
 
-        free (N, N): state matrix with everything that slips slipping.
+        The base is at rest in its middle, motor side and link root are turned with the hub; modes are those
+        of the link with the hub held, one more with a compliant joint.
+
+        free (N, N): state matrix with everything that slips slipping and every contact open.
         """
-        eq, n = self.equations, self.mechanical // 2
+        equations = self.equations
+        n = self.n_coordinates
         turned = np.zeros(n)
-        turned[: eq.first_mode] = 1.0
+        turned[: equations.first_mode] = 1.0
         if self.machine.joint.base is not None:
+            # Coordinate 1 is the base where there is one (`plant.modal.equations_of_motion`).
             turned[1] = 0.0
-        stiff = self.machine.joint.compliance is None
-        modes = np.eye(n)[:, eq.first_mode :] if stiff else self._modes_with_root()
-        columns = np.zeros((self.n, 3 + 2 * modes.shape[1]))
-        columns[:n, 0] = columns[n : 2 * n, 1] = turned
-        columns[:n, 3 : 3 + modes.shape[1]] = columns[n : 2 * n, 3 + modes.shape[1] :] = modes
-        if self.voltage_state >= 0:
+        if self.machine.joint.compliance is None:
+            modes = np.eye(n)[:, equations.first_mode :]
+        else:
+            modes = self._modes_with_root()
+        n_modes = modes.shape[1]
+        columns = np.zeros((self.n_states, 3 + 2 * n_modes))
+        columns[:n, 0] = turned
+        columns[n : 2 * n, 1] = turned
+        columns[:n, 3 : 3 + n_modes] = modes
+        columns[n : 2 * n, 3 + n_modes :] = modes
+        # Lags have settled.
+        if self.voltage_state is not None:
             columns[self.voltage_state, 2] = 1.0
-        if self.sensor_state >= 0:
-            columns[self.sensor_state] = self._position(eq.tip) @ columns
-        if self.accelerometer >= 0:
-            # As if the tip had moved with this speed and acceleration for long.
-            corner, twice = _ACCELEROMETER_RAD_S, 2 * _ACCELEROMETER_DAMPING
+        if self.sensor_state is not None:
+            columns[self.sensor_state] = self._position(equations.tip) @ columns
+        position = self.accelerometer_state
+        if position is not None:
+            # As if the tip had moved with this speed and acceleration for long: the mass stays behind it by
+            # 2 zeta / w times the speed and 1 / w^2 times the acceleration.
+            corner = _ACCELEROMETER_RAD_S
+            twice_damping = 2 * _ACCELEROMETER_DAMPING
             rates = free @ columns
-            if self.voltage_state < 0:
+            if self.voltage_state is None:
                 rates[:, 2] += self._motor_column()
-            acceleration = self._speed(eq.tip) @ rates
-            speed = (self._speed(eq.tip) @ columns - twice * acceleration / corner) / corner
-            behind = twice * speed + acceleration / corner**2
-            columns[self.accelerometer] = self._position(eq.tip) @ columns - behind
-            columns[self.accelerometer + 1] = speed
+            acceleration = self._speed(equations.tip) @ rates
+            tip_speed = self._speed(equations.tip) @ columns
+            scaled_speed = (tip_speed - twice_damping * acceleration / corner) / corner
+            distance_behind = twice_damping * scaled_speed + acceleration / corner**2
+            columns[position] = self._position(equations.tip) @ columns - distance_behind
+            columns[position + 1] = scaled_speed
         return columns
 
     def _modes_with_root(self) -> Real:
-        """(n, M + 1): behind a held hub a link swings with its root, where the joint gives way."""
-        eq, free = self.equations, slice(self.equations.first_mode - 1, None)
-        shapes = eigh(eq.stiffness[free, free], eq.mass[free, free])[1]
+        """Mode shapes (n, M + 1) behind a held hub whose joint gives way: the link swings with its root."""
+        equations = self.equations
+        # The root is the coordinate before the first mode.
+        free = slice(equations.first_mode - 1, None)
+        shapes = eigh(equations.stiffness[free, free], equations.mass[free, free])[1]
         # Every one by the sign of the mode it would be with a rigid joint.
-        signs = np.sign(eq.tip[free] @ shapes)
-        signs[:-1] *= np.sign(eq.modes.tip)
-        modes = np.zeros((eq.mass.shape[0], shapes.shape[1]))
+        signs = np.sign(equations.tip[free] @ shapes)
+        signs[:-1] *= np.sign(equations.modes.tip)
+        modes = np.zeros((self.n_coordinates, shapes.shape[1]))
         modes[free] = shapes * signs
         return modes
 
     def initial_state(self) -> Real:
-        x = np.zeros(self.n)
-        for (sine, _), disturbance in zip(self.disturbances(), self.machine.joint.disturbance, strict=True):
-            x[sine], x[sine + 1] = np.sin(disturbance.phase_rad), np.cos(disturbance.phase_rad)
+        """State (N,) at rest at zero and at time zero, with the phases of the disturbances."""
+        x = np.zeros(self.n_states)
+        for oscillator, disturbance in zip(self.oscillators, self.machine.joint.disturbance, strict=True):
+            x[oscillator.sine] = np.sin(disturbance.phase_rad)
+            x[oscillator.sine + 1] = np.cos(disturbance.phase_rad)
         return x
 
-    def disturbances(self) -> tuple[tuple[int, float], ...]:
-        """Where the sine of each stands in the state, and its angular frequency."""
-        frequencies = (disturbance.frequency_Hz for disturbance in self.machine.joint.disturbance)
-        return tuple((self.oscillators + 2 * i, 2 * np.pi * f) for i, f in enumerate(frequencies))
+    def longest_step_s(self, elements: _Elements, held_columns: Real, substep_s: float) -> float:
+        """Longest step, s: the shortest of the bounds that ripple, friction and contact set.
 
-    def longest_step_s(
-        self, element: Real, element_rows: Real, held_columns: Real, substep_s: float
-    ) -> float:
-        longest, coarse = substep_s if element.shape[0] else 2 * substep_s, substep_s / SUBSTEP_S
+        held_columns (N, 4 + E): the last E are the forces of the elements. substep_s: the basic step.
+        """
+        longest_s = 2 * substep_s
+        if len(elements.parameters) > 0:
+            longest_s = substep_s
+        # Coarser than usual everywhere, if the caller wants the basic step coarser.
+        coarseness = substep_s / SUBSTEP_S
+
+        # A ripple must not turn by too much at a brisk slew.
+        ripple_phase = min(_RIPPLE_PHASE_RAD * coarseness, _LARGEST_PHASE_RAD)
         for torque in self.machine.joint.torques:
             if torque.law == SINE:
-                phase = min(_RIPPLE_PHASE_RAD * coarse, _LARGEST_PHASE_RAD)
-                longest = min(longest, phase / (_SLEW_RAD_S * max(torque.values[1], 1.0)))
-        for e in range(element.shape[0]):
-            stiffness = element[e, 1] if element[e, 0] == FRICTION else element[e, 2]  # see `run`
-            mobility = abs(element_rows[e, 1] @ held_columns[:, 4 + e])
-            if element[e, 0] == FRICTION and element[e, 3] != 0:
-                longest = min(longest, _GROWTH_PER_STEP * element[e, 4] / (element[e, 3] * mobility))
-            most = _RIPPLE_PHASE_RAD * coarse if element[e, 0] == CONTACT else np.inf
-            phase = min(_PHASE_PER_STEP_RAD, most)
-            longest = min(longest, phase / np.sqrt(stiffness * mobility))
-        return float(longest)
+                cycles = max(torque.values[1], 1.0)
+                longest_s = min(longest_s, ripple_phase / (_SLEW_RAD_S * cycles))
+
+        for e, element in enumerate(elements.parameters):
+            # Acceleration of the element's angle by a unit of its force: one over the inertia that it sees.
+            mobility = abs(elements.rows[e, 1] @ held_columns[:, HELD_INPUTS + e])
+            phase = _PHASE_PER_STEP_RAD
+            if element[KIND] == FRICTION:
+                stiffness = element[FRICTION_STIFFNESS]
+                if element[STRIBECK_EXCESS] != 0:
+                    growth = element[STRIBECK_EXCESS] * mobility
+                    longest_s = min(longest_s, _GROWTH_PER_STEP * element[STRIBECK_SPEED] / growth)
+            else:
+                stiffness = element[CONTACT_STIFFNESS]
+                phase = min(phase, _RIPPLE_PHASE_RAD * coarseness)
+            omega_rad_s = np.sqrt(stiffness * mobility)
+            longest_s = min(longest_s, phase / omega_rad_s)
+        return float(longest_s)
 
 
-def _transitions(
-    a: Real, held: Real, force: Real, rows: Real, length: float, step: Real, reach: Real
-) -> None:
-    """Fill step (L, N + H + 3J, N) and reach (L, N + H + 3J, 2J) for the lengths length * 2^(l - L + 1)."""
-    n, n_held, n_force = a.shape[0], held.shape[1], force.shape[1]
-    levels = step.shape[0]
-    size = n + n_held + 3 * n_force
+def _transitions(a: Real, held: Real, channels: _Channels, length_s: float, step: Real, reach: Real) -> None:
+    """Fill step (L, N + H + 3J, N) and reach (L, N + H + 3J, 2J) for steps of length_s * 2^(l - L + 1).
+
+    Both are transposed transitions by the matrix exponential of the system that has a (N, N), the H held
+    inputs, held (N, H), and per smooth force a chain of three integrators, for its value, slope and curvature
+    in time. step leads to the state at the end, reach to the positions of the J forces at middle and end.
+    Doubling a step squares its transition.
+    """
+    n = a.shape[0]
+    n_held = held.shape[1]
+    n_force = channels.columns.shape[1]
+    n_levels = step.shape[0]
+    first_force = n + n_held
+    size = first_force + 3 * n_force
     block = np.zeros((size, size))
-    block[:n] = np.hstack([a, held, force, np.zeros((n, 2 * n_force))])
+    block[:n] = np.hstack([a, held, channels.columns, np.zeros((n, 2 * n_force))])
     # Force, slope and curvature in time: a chain of integrators.
-    first = n + n_held
-    block[first : first + 2 * n_force, first + n_force :] = np.eye(2 * n_force)
-    shortest = length / 2 ** (levels - 1)
+    block[first_force : first_force + 2 * n_force, first_force + n_force :] = np.eye(2 * n_force)
+    shortest_s = length_s / 2 ** (n_levels - 1)
     if n_force == 0:
-        transition = expm(block * shortest)
-        for level in range(levels):
+        transition = expm(block * shortest_s)
+        for level in range(n_levels):
             step[level] = transition[:n].T
             transition = transition @ transition
         return
-    powers = [expm(block * (shortest / 2))]
-    for _ in range(levels):
+    # From half the shortest step on: the middle of a step is the end of the one of half its length.
+    powers = [expm(block * (shortest_s / 2))]
+    for _ in range(n_levels):
         powers.append(powers[-1] @ powers[-1])
     halves = np.array(powers)[:, :n]
-    h = shortest * 2.0 ** np.arange(levels)[:, None, None]
-    end = _by_nodes(halves[1:], first, n_force, h)
-    step[:] = end.swapaxes(1, 2)
-    reach[:, :, :n_force] = (rows @ _by_nodes(halves[:-1], first, n_force, h)).swapaxes(1, 2)
-    reach[:, :, n_force:] = (rows @ end).swapaxes(1, 2)
+    h = shortest_s * 2.0 ** np.arange(n_levels)[:, None, None]
+    to_middle = _by_nodes(halves[:-1], first_force, n_force, h)
+    to_end = _by_nodes(halves[1:], first_force, n_force, h)
+    step[:] = to_end.swapaxes(1, 2)
+    reach[:, :, :n_force] = (channels.rows @ to_middle).swapaxes(1, 2)
+    reach[:, :, n_force:] = (channels.rows @ to_end).swapaxes(1, 2)
 
 
 def _change_inside(
-    a: Real, voltage: Real, rows: Real, length: float, fraction: float, step: Real, reach: Real
+    a: Real, voltage: Real, rows: Real, length_s: float, fraction: float, step: Real, reach: Real
 ) -> None:
-    """Share out what a voltage held over a step does in step (N + H + 3J, N) and reach (N + H + 3J, 2J) to
-    that before and after it changes at a fraction of the step's length."""
-    n, n_force = a.shape[0], len(rows)
+    """Change step (N + H + 3J, N) and reach (N + H + 3J, 2J) for a voltage that changes inside the step.
+
+    What a voltage held over the whole step does is shared out to that before and that after the change, which
+    is at a fraction of the step's length. a (N, N), voltage (N,): state matrix and input column; rows (J, N):
+    positions of the smooth forces.
+    """
+    n = a.shape[0]
+    n_force = len(rows)
+    before = n
+    after = n + 1
     block = np.zeros((n + 1, n + 1))
     block[:n] = np.column_stack([a, voltage])
-    ends = (1.0, 0.5) if n_force else (1.0,)
-    changed = [expm(block * (max(end - fraction, 0.0) * length))[:n, n] for end in ends]
-    step[n] = step[n + 1] - changed[0]
-    step[n + 1] = changed[0]
-    for columns, after in zip((slice(n_force, None), slice(n_force)), changed, strict=False):
-        reach[n, columns] = reach[n + 1, columns] - rows @ after
-        reach[n + 1, columns] = rows @ after
+
+    def effect_of_late_voltage(instant: float) -> Real:
+        """State (N,) at an instant, as a fraction of the step, by one volt since the change."""
+        held_s = max(instant - fraction, 0.0) * length_s
+        return np.asarray(expm(block * held_s)[:n, n])
+
+    at_end = effect_of_late_voltage(1.0)
+    step[before] = step[after] - at_end
+    step[after] = at_end
+    if n_force > 0:
+        at_middle = effect_of_late_voltage(0.5)
+        # Columns of reach: positions at the end stand behind those in the middle.
+        for columns, state in ((slice(n_force, None), at_end), (slice(n_force), at_middle)):
+            position = rows @ state
+            reach[before, columns] = reach[after, columns] - position
+            reach[after, columns] = position
 
 
 def _by_nodes(transition: Real, first: int, n_force: int, h: Real) -> Real:
-    """Columns for the forces at start, middle and end, from force, slope and curvature at the start."""
-    value, slope, curve = (transition[..., first + i * n_force : first + (i + 1) * n_force] for i in range(3))
-    return np.concatenate(
-        [
-            transition[..., :first],
-            value - 3 / h * slope + 4 / h**2 * curve,
-            4 / h * slope - 8 / h**2 * curve,
-            -slope / h + 4 / h**2 * curve,
-        ],
-        axis=-1,
-    )
+    """Transitions (L, N, first + 3J) from the forces at start, middle and end of steps h (L, 1, 1), s.
+
+    transition (L, N, first + 3J) has columns for value, slope and curvature of the J forces at the start,
+    from column `first` on. A parabola through values f0, f1, f2 at 0, h / 2 and h has there the slope
+    (-3 f0 + 4 f1 - f2) / h and the curvature 4 (f0 - 2 f1 + f2) / h^2.
+    """
+    value = transition[..., first : first + n_force]
+    slope = transition[..., first + n_force : first + 2 * n_force]
+    curvature = transition[..., first + 2 * n_force : first + 3 * n_force]
+    at_start = value - 3 / h * slope + 4 / h**2 * curvature
+    at_middle = 4 / h * slope - 8 / h**2 * curvature
+    at_end = -slope / h + 4 / h**2 * curvature
+    return np.concatenate([transition[..., :first], at_start, at_middle, at_end], axis=-1)
