@@ -45,7 +45,7 @@ def test_without_losses_the_shoulder_keeps_its_angular_momentum():
 def _momentum(arm: TwoLinkArm, x) -> float:
     """Sum of m (r x v) over points of both links, elbow and payload, and of hub inertia times turn rate."""
     n = arm.coordinates
-    first, second = arm._shapes
+    first, second = arm.bending
     q, v = x[:n], x[n:]
     split = 2 + first.at_tip.size
 
