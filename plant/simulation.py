@@ -1,4 +1,12 @@
-"""Simulation of a machine: whole records, and sample by sample for a closed loop."""
+"""Simulation of a machine: whole records, and sample by sample for a closed loop.
+
+`simulate` makes one record of a rig with effects. `Simulator` prepares a machine once for many records: the
+voltage path is applied to the command, the compiled stepper (`plant.plan`, `plant.kernel`) gives the states,
+rows of the plan what sensors observe, and the sensor path their readings, to which white noise is added.
+`SampledArm` is the machine as a controller sees it, by the same stepper: `measure`, `advance`, or a whole
+loop compiled in `in_loop`. Inputs are held over a sample; sensors read at its start, before the input takes
+effect.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +27,8 @@ from plant.rig import Rig
 
 F = TypeVar("F", float, Real)
 
-# Column of what is observed (`plant.plan`) of every sensor, in the order of their noise (`_noise`).
+# Column of what is observed (`plant.plan.Plan.output_rows`) for every sensor, in the order of their noise
+# (`_noise`). Column 1, the true tip, is behind no sensor; the tip sensor reads column 2, behind its lag.
 _OBSERVED = {
     "hub_angle_rad": 0,
     "tip_m": 2,
@@ -31,7 +40,7 @@ _OBSERVED = {
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """A simulated record; all arrays (T,), read-only.
+    """A simulated record; all arrays (T,), read-only. Raises ValueError where one has another shape.
 
     time_s : t_k = k dt.
     voltage_V : Commanded voltage, held over [t_k, t_(k+1)).
@@ -64,11 +73,11 @@ class Trajectory:
 
     @property
     def output(self) -> Real:
-        """(T, 2): hub_angle_rad, tip_m as measured."""
+        """Outputs (T, 2): hub_angle_rad and tip_m as measured."""
         return self.columns(OUTPUT_NAMES)
 
     def columns(self, names: Sequence[str]) -> Real:
-        """(T, Y): the quantities of these names."""
+        """Quantities (T, Y) of these names, which are names of the class's fields."""
         return np.column_stack([getattr(self, name) for name in names])
 
 
@@ -90,7 +99,10 @@ class Start:
     time_s: float = 0.0
 
     def vector(self) -> Real:
-        """(3 + 2m,) as `plant.plan` takes it. Raises ValueError if deflections and rates differ in number."""
+        """Start (3 + 2m,) for `Plan.at`: hub angle, hub speed, voltage, deflections, rates.
+
+        Raises ValueError if deflections and rates differ in number.
+        """
         if np.shape(self.deflections) != np.shape(self.rates):
             raise ValueError(f"as many rates as deflections: {len(self.deflections)}, {len(self.rates)}")
         scalars = [self.hub_angle_rad, self.hub_speed_rad_s, self.voltage_V]
@@ -109,19 +121,36 @@ def simulate(
     n_modes: int | None = None,
     substep_s: float = SUBSTEP_S,
 ) -> Trajectory:
-    """Drive a machine from rest with a held voltage.
+    """Record of a machine that is driven from rest with a held voltage.
 
-    rig, effects : The machine.
-    voltage_V : (T,). Commanded voltage; before the first sample it is zero.
-    rng : Source of the sensor noise; without it the measurement is noise-free.
-    dt_s : Sampling period, if not the rig's.
+    Parameters
+    ----------
+    rig : Rig
+        The nominal arm.
+    effects : sequence of Effect
+        What the machine has beside it.
+    voltage_V : (T,)
+        Commanded voltage; before the first sample it is zero.
+    rng : numpy.random.Generator, optional
+        Source of the sensor noise; without it the measurement is noise-free.
+    dt_s : float, optional
+        Sampling period, if not the rig's.
     hub_torque_Nm, tip_force_N : (T,), optional
         Outside torque on the hub and transverse outside force at the tip, held over the sample.
-    n_modes : Number of modes, if not `plant.modal.default_n_modes`.
-    substep_s : Longest step where the machine is not linear; see `plant.plan`.
+    n_modes : int, optional
+        Number of modes, if not `plant.modal.default_n_modes`.
+    substep_s : float
+        Longest step where the machine is not linear; see `plant.plan`.
 
-    Raises ValueError: one line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect
-    given twice.
+    Returns
+    -------
+    Trajectory
+
+    Raises
+    ------
+    ValueError
+        In one line: a signal that is not (T,) or not finite, dt_s that is not positive, an effect given
+        twice.
     """
     simulator = Simulator(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
     return simulator.run(voltage_V, rng=rng, hub_torque_Nm=hub_torque_Nm, tip_force_N=tip_force_N)
@@ -130,7 +159,8 @@ def simulate(
 class Simulator:
     """A machine prepared once for many records; see `simulate` for arguments and errors.
 
-    accelerometer: whether the tip's acceleration is observed too.
+    accelerometer : bool
+        The tip's acceleration is observed too.
     """
 
     def __init__(
@@ -145,12 +175,13 @@ class Simulator:
     ) -> None:
         self.machine = make_machine(rig, effects)
         self.accelerometer = accelerometer
-        self.dt_s = rig.sampling.dt_s if dt_s is None else _positive("dt_s", dt_s)
+        self.dt_s = rig.sampling.dt_s
+        if dt_s is not None:
+            self.dt_s = _positive("dt_s", dt_s)
         if n_modes is not None and not n_modes >= 1:
             raise ValueError(f"n_modes must be at least 1; got {n_modes}")
-        self.plan = make_plan(
-            self.machine, self.dt_s, n_modes, _positive("substep_s", substep_s), accelerometer=accelerometer
-        )
+        longest_step_s = _positive("substep_s", substep_s)
+        self.plan = make_plan(self.machine, self.dt_s, n_modes, longest_step_s, accelerometer=accelerometer)
 
     def run(
         self,
@@ -161,17 +192,27 @@ class Simulator:
         tip_force_N: npt.ArrayLike | None = None,
         start: Start | None = None,
     ) -> Trajectory:
-        """One record, from rest at zero unless told."""
-        voltage, begun_s = _signal("voltage_V", voltage_V, None), 0.0 if start is None else start.time_s
+        """One record, from rest at zero unless a start is stated; arguments and errors as of `simulate`.
+
+        start : Start, optional
+            State and time of the first sample. The record's own time begins at zero all the same.
+        """
+        voltage = _signal("voltage_V", voltage_V, None)
         observed = self._observed(slice(None), voltage, hub_torque_Nm, tip_force_N, start)
-        time = np.arange(voltage.size, dtype=np.float64) * self.dt_s
+        time_s = np.arange(voltage.size, dtype=np.float64) * self.dt_s
+        # What drifts has drifted since time zero of the start.
+        sensor_time_s = (0.0 if start is None else start.time_s) + time_s
         noise = _noise(self.machine, rng, voltage.size, accelerometer=self.accelerometer)
-        read = {
-            name: self._reading(name, observed[:, k], begun_s + time, own)
-            for (name, k), own in zip(_OBSERVED.items(), noise.T, strict=True)
-        }
-        true = {"hub_angle_true_rad": observed[:, 0], "tip_true_m": observed[:, 1]}
-        return Trajectory(time_s=time, voltage_V=voltage, **true, **read)
+        readings = {}
+        for (name, column), sensor_noise in zip(_OBSERVED.items(), noise.T, strict=True):
+            readings[name] = self._reading(name, observed[:, column], sensor_time_s, sensor_noise)
+        return Trajectory(
+            time_s=time_s,
+            voltage_V=voltage,
+            hub_angle_true_rad=observed[:, 0],
+            tip_true_m=observed[:, 1],
+            **readings,
+        )
 
     def measured(
         self,
@@ -181,12 +222,18 @@ class Simulator:
         hub_torque_Nm: npt.ArrayLike | None = None,
         start: Start | None = None,
     ) -> Real:
-        """(T, Y): the quantities of these names of one record, without noise."""
-        voltage, begun_s = _signal("voltage_V", voltage_V, None), 0.0 if start is None else start.time_s
-        observed = self._observed([_OBSERVED[name] for name in names], voltage, hub_torque_Nm, None, start)
-        time = begun_s + np.arange(voltage.size, dtype=np.float64) * self.dt_s
-        for name, column in zip(names, observed.T, strict=True):
-            column[:] = self._reading(name, column, time, 0.0)
+        """Quantities (T, Y) of these names of one record, as sensors read them but without noise.
+
+        names : of `plant.rig.Output`; another one is a KeyError. Otherwise like `run`, and faster: only what
+        is asked for is made.
+        """
+        voltage = _signal("voltage_V", voltage_V, None)
+        columns = [_OBSERVED[name] for name in names]
+        observed = self._observed(columns, voltage, hub_torque_Nm, None, start)
+        begin_s = 0.0 if start is None else start.time_s
+        time_s = begin_s + np.arange(voltage.size, dtype=np.float64) * self.dt_s
+        for name, values in zip(names, observed.T, strict=True):
+            values[:] = self._reading(name, values, time_s, 0.0)
         return observed
 
     def _observed(
@@ -197,36 +244,59 @@ class Simulator:
         tip_force_N: npt.ArrayLike | None,
         start: Start | None,
     ) -> Real:
-        """(T, 6) as `plant.plan` orders them, or some columns of these."""
-        plan, n_samples = self.plan, voltage.size
-        before, begun_s = (0.0, 0.0) if start is None else (start.voltage_V, start.time_s)
-        acting = np.full(plan.delay_samples + 1 + n_samples, before)
+        """What sensors observe, (T, 6) in the columns of `Plan.output_rows`, or some of these columns.
+
+        voltage (T,): as commanded, V; checked already, unlike torque and force.
+        """
+        plan = self.plan
+        n_samples = voltage.size
+        before_V = 0.0
+        begin_s = 0.0
+        if start is not None:
+            before_V = start.voltage_V
+            begin_s = start.time_s
+        # Acting voltages, the first of them those of the whole samples of the delay and of one more.
+        acting = np.full(plan.delay_samples + 1 + n_samples, before_V)
         acting[plan.delay_samples + 1 :] = self.machine.voltage.static(voltage)
         inputs = np.zeros((n_samples, 4))
-        late, early = acting[:n_samples], acting[1 : n_samples + 1]
-        inputs[:, 0], inputs[:, 1] = (late if plan.parts == 2 else early), early
+        inputs[:, 1] = acting[1 : n_samples + 1]
+        # In the first part of a divided sample the voltage of the sample before still acts.
+        if plan.parts == 2:
+            inputs[:, 0] = acting[:n_samples]
+        else:
+            inputs[:, 0] = inputs[:, 1]
         if hub_torque_Nm is not None:
             inputs[:, 2] = _signal("hub_torque_Nm", hub_torque_Nm, n_samples)
         if tip_force_N is not None:
             inputs[:, 3] = _signal("tip_force_N", tip_force_N, n_samples)
-        states = plan.advance(inputs, plan.at(None if start is None else start.vector(), begun_s))
+        start_vector = None if start is None else start.vector()
+        states = plan.advance(inputs, plan.at(start_vector, begin_s))
         return np.asarray(states @ plan.output_rows[columns].T)
 
     def _reading(self, name: str, values: Real, time_s: Real, noise: Real | float) -> Real:
-        """(T,) of a sensor from what it observes (T,)."""
+        """Readings (T,) of the sensor of this name from what it observes, values (T,).
+
+        Drift and quantisation are effects of the tip's position sensor; every sensor at the tip has its gain.
+        """
         sensor = self.machine.sensor
         if name == "tip_m":
             return _tip_reading(sensor, values, time_s, noise)
-        return np.asarray((1.0 if name.startswith("hub") else sensor.gain) * values + noise)
+        gain = 1.0 if name.startswith("hub") else sensor.gain
+        return np.asarray(gain * values + noise)
 
 
 class SampledArm(Simulator):
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
-    Same compiled stepper and same numbers as `simulate`. The only object of this package with a state.
+    Same compiled stepper and same numbers as `simulate`. An object with a state.
 
-    encoder_step_rad: of the measured hub angle, 0 for none. tip_force_N (T,): acts at the tip from rest on,
-    one value for each sample, beside what `advance` is given.
+    rig, effects, dt_s, n_modes, substep_s : see `simulate`.
+    rng : numpy.random.Generator, optional
+        Source of the sensor noise; without it the measurement is noise-free.
+    encoder_step_rad : float
+        Step of the measured hub angle, 0 for none.
+    tip_force_N : (T,), optional
+        Acts at the tip from rest on, one value for each sample, beside what `advance` is given.
     """
 
     output_names = OUTPUT_NAMES
@@ -245,7 +315,8 @@ class SampledArm(Simulator):
     ) -> None:
         super().__init__(rig, effects, dt_s=dt_s, n_modes=n_modes, substep_s=substep_s)
         self._rng = rng
-        self.encoder_step_rad, self.tip_force_N = encoder_step_rad, tip_force_N
+        self.encoder_step_rad = encoder_step_rad
+        self.tip_force_N = tip_force_N
         self._inputs = np.zeros((1, 4))
         self._rows = self.plan.output_rows
         self.reset()
@@ -259,36 +330,49 @@ class SampledArm(Simulator):
 
     @property
     def true_output(self) -> Real:
-        """(2,) hub_angle_rad, tip_m at t_k before sensor effects and noise."""
+        """Outputs (2,) hub_angle_rad, tip_m at t_k before sensor effects and noise."""
         return np.asarray((self._rows @ self._state.x)[:2])
 
     def measure(self) -> Real:
-        """(2,) hub_angle_rad, tip_m at t_k as measured; asking twice at one instant gives the same sample."""
+        """Outputs (2,) hub_angle_rad, tip_m at t_k as measured; asked twice, the same sample."""
         if self._measurement is None:
             hub, _, tip, *_ = (self._rows @ self._state.x).tolist()
-            hub_noise, tip_noise = (0.0, 0.0) if self._rng is None else self._rng.standard_normal(2).tolist()
+            hub_noise = 0.0
+            tip_noise = 0.0
+            if self._rng is not None:
+                hub_noise, tip_noise = self._rng.standard_normal(2).tolist()
             sensors = self.machine.rig.sensors
-            time = self._sample * self.dt_s
-            reading = _tip_reading(self.machine.sensor, tip, time, sensors.tip_noise_m * tip_noise)
+            time_s = self._sample * self.dt_s
+            reading = _tip_reading(self.machine.sensor, tip, time_s, sensors.tip_noise_m * tip_noise)
             angle = hub + sensors.hub_angle_noise_rad * hub_noise
             self._measurement = quantised(np.array([angle, reading]), self.encoder_step_rad)
         return self._measurement.copy()
 
     def advance(self, voltage_V: float, hub_torque_Nm: float = 0.0, tip_force_N: float = 0.0) -> None:
-        """Hold voltage, outside hub torque and outside tip force until t_(k+1)."""
+        """Hold voltage, outside hub torque and outside tip force until t_(k+1).
+
+        Raises ValueError where one of them is not finite.
+        """
         if not (abs(voltage_V) < np.inf and abs(hub_torque_Nm) < np.inf and abs(tip_force_N) < np.inf):
             raise ValueError(
                 f"inputs must be finite; got {voltage_V} V, {hub_torque_Nm} N m, {tip_force_N} N"
             )
         if self._rng is not None and self._measurement is None:
             self.measure()  # every instant takes its noise, looked at or not
+        # Behind the whole samples of the delay: the voltage that acts, and the one before it, which still
+        # acts in the first part of a divided sample.
         self._pending.append(self.machine.voltage.static(float(voltage_V)))
-        late = self._pending.popleft()
+        earlier_V = self._pending.popleft()
+        acting_V = self._pending[0]
         row = self._inputs[0]
-        row[0], row[1] = late if self.plan.parts == 2 else self._pending[0], self._pending[0]
+        row[0] = acting_V
+        if self.plan.parts == 2:
+            row[0] = earlier_V
+        row[1] = acting_V
         if self.tip_force_N is not None and self._sample < self.tip_force_N.size:
             tip_force_N += float(self.tip_force_N[self._sample])
-        row[2], row[3] = hub_torque_Nm, tip_force_N
+        row[2] = hub_torque_Nm
+        row[3] = tip_force_N
         self.plan.advance(self._inputs, self._state)
         self._sample += 1
         self._measurement = None
@@ -303,23 +387,51 @@ class SampledArm(Simulator):
         measured: int,
         clip: float = np.inf,
     ) -> tuple[Real, Real, npt.NDArray[np.bool_]]:
-        """Outputs (T, 2), commands (T,) and whether they were limited (T,) of a loop, from rest: what
-        `control_design.analysis.closed_loop.simulate` does, compiled.
+        """Outputs (T, 2), commands (T,) and whether they were limited (T,) of a closed loop, from rest.
 
-        signals (T, 5) and the law's arrays as of `plant.kernel.run`; clip: of the machine's input.
-        A subclass that measures or advances otherwise sets `in_loop` to None.
+        The numbers are those of `control_design.analysis.closed_loop.simulate`, compiled. A subclass that
+        measures or advances otherwise sets `in_loop` to None.
+
+        Parameters
+        ----------
+        signals : (T, 5)
+            Set point, what joins the law's command before its limits, what joins the measurement and the
+            command that acts, hub torque, N m.
+        law : (n + 1, n + 2)
+            The controller's matrices, see `plant.kernel.run`.
+        limits : (2,)
+            Of the command and of its change in a sample, V.
+        steps : (2,)
+            Steps of measurement and command, 0 for none.
+        delay_samples : int
+            From computing a command to handing it over.
+        measured : int
+            Output in the loop: 0 for the hub angle, 1 for the tip.
+        clip : float
+            Limit of the machine's input, V.
+
+        Raises
+        ------
+        ValueError
+            A command is not finite: the loop is unstable and ran away.
         """
-        n, voltage, sensor = len(signals), self.machine.voltage, self.machine.sensor
-        force, noise = np.zeros(n), np.zeros((n, 2))
+        n_samples = len(signals)
+        voltage = self.machine.voltage
+        sensor = self.machine.sensor
+        tip_force_N = np.zeros(n_samples)
         if self.tip_force_N is not None:
-            force[: self.tip_force_N.size] = self.tip_force_N[:n]
+            tip_force_N[: self.tip_force_N.size] = self.tip_force_N[:n_samples]
+        noise = np.zeros((n_samples, 2))
         if self._rng is not None:
-            levels = self.machine.rig.sensors
-            noise = self._rng.standard_normal((n, 2)) * (levels.hub_angle_noise_rad, levels.tip_noise_m)
-        output, command, limited = np.empty((n, 2)), np.empty(n), np.empty(n, dtype=np.bool_)
-        state = self.plan.at()
-        loop: tuple[Any, ...] = (
-            np.column_stack([signals, force, noise]),
+            sensors = self.machine.rig.sensors
+            levels = (sensors.hub_angle_noise_rad, sensors.tip_noise_m)
+            noise = self._rng.standard_normal((n_samples, 2)) * levels
+        output = np.empty((n_samples, 2))
+        command = np.empty(n_samples)
+        limited = np.empty(n_samples, dtype=np.bool_)
+        # The last arguments of `plant.kernel.run`, in its order and with its names.
+        loop_arguments: tuple[Any, ...] = (
+            np.column_stack([signals, tip_force_N, noise]),
             law,
             limits,
             steps,
@@ -331,14 +443,18 @@ class SampledArm(Simulator):
             command,
             limited,
         )
-        run(np.zeros((1, 4)), np.empty((1, state.x.size)), *state, *self.plan.arguments, *loop)
+        state = self.plan.at()
+        # In a loop the stepper makes its own inputs and writes no states.
+        inputs = np.zeros((1, 4))
+        states = np.empty((1, state.x.size))
+        run(inputs, states, *state, *self.plan.arguments, *loop_arguments)
         if not np.all(np.isfinite(command)):
             raise ValueError("the loop ran away: its command is not finite")
         return output, command, limited
 
 
 def quantised(output: Real, encoder_step_rad: float) -> Real:
-    """(..., 2) measured outputs with the hub angle rounded to encoder steps (0 = no encoder)."""
+    """Measured outputs (..., 2) with the hub angle rounded to encoder steps, rad; as they are for 0."""
     if encoder_step_rad == 0:
         return output
     result = output.copy()
@@ -347,21 +463,31 @@ def quantised(output: Real, encoder_step_rad: float) -> Real:
 
 
 def _noise(machine: Machine, rng: np.random.Generator | None, n_samples: int, *, accelerometer: bool) -> Real:
-    """(T, 5) noise of hub angle, tip and, where there is one, accelerometer, drawn sample by sample; then of
-    hub speed and deflection, where they have any."""
+    """Noise (T, 5) of hub angle, tip, tip acceleration, hub speed and tip deflection; zero without rng.
+
+    Hub angle, tip and, where there is one, accelerometer are drawn sample by sample, as `SampledArm` draws
+    them; then whole columns of hub speed and deflection, where these have noise.
+    """
     noise = np.zeros((n_samples, 5))
-    if rng is not None:
-        sensors, drawn = machine.rig.sensors, 3 if accelerometer else 2
-        levels = sensors.hub_angle_noise_rad, sensors.tip_noise_m, sensors.tip_acceleration_noise_m_s2
-        noise[:, :drawn] = rng.standard_normal((n_samples, drawn)) * levels[:drawn]
-        for column, level in ((3, sensors.hub_speed_noise_rad_s), (4, sensors.tip_deflection_noise_m)):
-            if level > 0:
-                noise[:, column] = level * rng.standard_normal(n_samples)
+    if rng is None:
+        return noise
+    sensors = machine.rig.sensors
+    levels = [sensors.hub_angle_noise_rad, sensors.tip_noise_m]
+    if accelerometer:
+        levels.append(sensors.tip_acceleration_noise_m_s2)
+    n_drawn = len(levels)
+    noise[:, :n_drawn] = rng.standard_normal((n_samples, n_drawn)) * levels
+    for column, level in ((3, sensors.hub_speed_noise_rad_s), (4, sensors.tip_deflection_noise_m)):
+        if level > 0:
+            noise[:, column] = level * rng.standard_normal(n_samples)
     return noise
 
 
 def _tip_reading(sensor: SensorPath, tip: F, time_s: F, noise: F | float) -> F:
-    """Gain, drift, noise and quantisation of a tip position that is already behind the sensor lag."""
+    """Reading, m, from a tip position, m, that is already behind the sensor lag: one sample or (T,).
+
+    Gain and drift (per second of time_s) act before the noise, quantisation behind it.
+    """
     reading = sensor.gain * tip + sensor.drift_m_s * time_s + noise
     if sensor.step_m > 0:
         reading = sensor.step_m * np.rint(reading / sensor.step_m)
@@ -369,12 +495,17 @@ def _tip_reading(sensor: SensorPath, tip: F, time_s: F, noise: F | float) -> F:
 
 
 def _positive(name: str, value: float) -> float:
+    """The value as a float. Raises ValueError, naming it, where it is not positive and finite."""
     if not 0 < value < np.inf:
         raise ValueError(f"{name} must be positive and finite; got {value}")
     return float(value)
 
 
 def _signal(name: str, values: npt.ArrayLike, n_samples: int | None) -> Real:
+    """The values as an array (T,) of its own; T is n_samples, or anything above zero for None.
+
+    Raises ValueError, naming the signal, where the values are no numbers, not finite or of another shape.
+    """
     try:
         signal = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
