@@ -4,6 +4,9 @@ Realisations of the phases at every rung of a ladder of amplitudes, all on the s
 one in every group of four is left out. What differs between the periods of a record is noise; between
 realisations it is noise and nonlinear distortion; the lines without excitation show of which kind the
 distortion is (Pintelon and Schoukens, System Identification: A Frequency Domain Approach, 2nd ed., ch. 4).
+
+`ExperimentPlan.within` makes a plan from a band and a duration, `records` its voltages, `scaled` fits its
+amplitudes to the limits of the machine, `radius` says how exact its response will be.
 """
 
 from __future__ import annotations
@@ -17,9 +20,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 from plant.excitation import Integer, Real, multisine, multisine_lines
 from plant.rig import one_line
 
-# Periods as multiples of that of the lower band edge: odd, so that the edge is an excited line.
+# Periods as multiples of that of the lower band edge, longest first: odd, so that the edge is an excited
+# line. Longer than 15 of them gains lines closer together than a fifteenth of the lowest frequency. Chosen.
 _MULTIPLES = range(15, 0, -2)
-_LEVEL = 0.95  # of the ellipses, as everywhere
+# Probability of the ellipses, as everywhere in this program.
+_LEVEL = 0.95
+# Rounding of a duration that is meant to be just long enough, relative.
+_ROUNDING = 1e-9
 
 
 class ExperimentPlan(BaseModel):
@@ -45,7 +52,10 @@ class ExperimentPlan(BaseModel):
 
     @model_validator(mode="after")
     def _ladder(self) -> Self:
-        if not all(0 < rms < np.inf for rms in self.rms_V) or len(set(self.rms_V)) != len(self.rms_V):
+        """The plan itself. Raises ValueError where a rung of the ladder is not positive or stands twice."""
+        is_positive = all(0 < rms < np.inf for rms in self.rms_V)
+        is_distinct = len(set(self.rms_V)) == len(self.rms_V)
+        if not (is_positive and is_distinct):
             raise ValueError(f"rms_V must be different positive numbers; got {list(self.rms_V)}")
         return self
 
@@ -62,42 +72,72 @@ class ExperimentPlan(BaseModel):
         """The plan with the longest period that all its records together leave room for.
 
         The period is that of the lower band edge times an odd number up to 15, so that the edge is one of the
-        odd lines. settings: other fields by name; rms_V left out is a ladder of 1 and 1/2, to be `scaled`.
-        Raises ValueError where the duration is too short for the band.
+        odd lines.
+
+        Parameters
+        ----------
+        band_Hz : pair of float
+            Lowest and highest frequency.
+        dt_s : float
+            Sampling period.
+        duration_s : float
+            Of all records together, at the most.
+        lead_in_s : float
+            From rest to steady state, in each record.
+        settings
+            Other fields by name; rms_V left out is a ladder of 1 and 1/2, to be `scaled`.
+
+        Returns
+        -------
+        ExperimentPlan
+
+        Raises
+        ------
+        ValueError
+            The duration is too short for the band, the band is none below the Nyquist frequency, or a setting
+            is out of its bounds.
         """
         low, high = band_Hz
         if not 0 < low < high < 0.5 / dt_s:
             raise ValueError(
                 f"need a band 0 < low < high < {0.5 / dt_s:g} Hz (Nyquist); got {low:g}, {high:g}"
             )
-        shortest = max(2 * round(0.5 / (low * dt_s)), 8)
+        # An even number of samples, and at least as many as a plan may have.
+        shortest_period = max(2 * round(0.5 / (low * dt_s)), 8)
         values = {"rms_V": (1.0, 0.5), "lead_in_samples": round(lead_in_s / dt_s)} | settings
-        values |= {"from_Hz": 1 / (shortest * dt_s), "to_Hz": float(high)}
+        values["from_Hz"] = 1 / (shortest_period * dt_s)
+        values["to_Hz"] = float(high)
         try:
-            plans = [cls.model_validate(values | {"period_samples": m * shortest}) for m in _MULTIPLES]
+            plans = [
+                cls.model_validate(values | {"period_samples": multiple * shortest_period})
+                for multiple in _MULTIPLES
+            ]
         except ValidationError as error:
             raise ValueError(one_line(error)) from error
-        short = plans[-1].duration_s(dt_s)
-        fitting = [plan for plan in plans if plan.duration_s(dt_s) <= duration_s * (1 + 1e-9)]
-        if not fitting:
-            raise ValueError(
-                f"a band from {low:g} Hz needs periods of {shortest * dt_s:g} s: {plans[-1].n_records} "
-                f"records of {plans[-1].periods} periods and lead-in last {short:g} s, {duration_s:g} s are "
-                "allowed"
-            )
-        return fitting[0]
+        allowed_s = duration_s * (1 + _ROUNDING)
+        for plan in plans:
+            if plan.duration_s(dt_s) <= allowed_s:
+                return plan
+        shortest = plans[-1]
+        shortest_s = shortest.duration_s(dt_s)
+        raise ValueError(
+            f"a band from {low:g} Hz needs periods of {shortest_period * dt_s:g} s: {shortest.n_records} "
+            f"records of {shortest.periods} periods and lead-in last {shortest_s:g} s, {duration_s:g} s are "
+            "allowed"
+        )
 
     @property
     def n_records(self) -> int:
+        """Number of records: amplitudes times realisations."""
         return len(self.rms_V) * self.realisations
 
     @property
     def n_samples(self) -> int:
-        """Of each record."""
+        """Samples of each record, its lead-in included."""
         return self.lead_in_samples + self.periods * self.period_samples
 
     def duration_s(self, dt_s: float) -> float:
-        """Of all records together."""
+        """Duration of all records together, s, at a sampling period, s."""
         return self.n_records * self.n_samples * dt_s
 
     def lines(self, dt_s: float) -> Integer:
@@ -123,26 +163,50 @@ class ExperimentPlan(BaseModel):
         )
 
     def records(self, dt_s: float, rng: np.random.Generator) -> Real:
-        """Voltages (A, M, T) of all amplitudes and realisations; the ladder changes nothing but the size."""
-        return np.stack(
-            [np.stack([self.record(rms, dt_s, rng) for _ in range(self.realisations)]) for rms in self.rms_V]
-        )
+        """Voltages (A, M, T) of all amplitudes and realisations; the ladder changes nothing but the size.
+
+        Phases are drawn anew for every record, rung by rung.
+        """
+        rungs = []
+        for rms_V in self.rms_V:
+            realisations = [self.record(rms_V, dt_s, rng) for _ in range(self.realisations)]
+            rungs.append(np.stack(realisations))
+        return np.stack(rungs)
 
     def scaled(
         self, voltages_V: Real, *, peak_V: float, angle_rad: float, motion: Callable[[Real], Real] | None
     ) -> Self:
-        """The ladder with its top as high as the peak of the voltages (A, M, T) and of the motion allow.
+        """This plan with a ladder whose top is as high as voltage and motion allow.
 
-        motion: hub angle (T,) from rest under a voltage (T,), linear in it.
+        Parameters
+        ----------
+        voltages_V : (A, M, T)
+            The plan's `records`, with the ladder as it is.
+        peak_V : float
+            Largest voltage that is allowed.
+        angle_rad : float
+            Largest hub angle that is allowed; without a motion it is not looked at.
+        motion : callable or None
+            Hub angle (T,) from rest under a voltage (T,), linear in it.
+
+        Returns
+        -------
+        ExperimentPlan
+            With every rung multiplied by the same share.
         """
         share = min(peak_V / float(np.max(np.abs(voltages_V))), np.inf)
         if motion is not None:
-            largest = max(float(np.max(np.abs(motion(v)))) for rung in voltages_V for v in rung)
-            share = min(share, angle_rad / largest)
+            peaks_rad = []
+            for rung in voltages_V:
+                for voltage in rung:
+                    peaks_rad.append(float(np.max(np.abs(motion(voltage)))))
+            share = min(share, angle_rad / max(peaks_rad))
         # Three digits, rounded down: a plan is read by people, and stays within its limits.
         exact = np.array(self.rms_V) * share
-        unit = 10.0 ** (np.floor(np.log10(exact)) - 2)
-        return self.model_copy(update={"rms_V": tuple((np.floor(exact / unit) * unit).round(12).tolist())})
+        third_digit = 10.0 ** (np.floor(np.log10(exact)) - 2)
+        # Decimal digits that the multiplication spoils are rounded away.
+        rounded = (np.floor(exact / third_digit) * third_digit).round(12)
+        return self.model_copy(update={"rms_V": tuple(rounded.tolist())})
 
     def radius(self, rms_V: float, dt_s: float, noise_std: float) -> float:
         """Expected 95 % radius of the response at one line from white sensor noise, output units per volt.
@@ -151,6 +215,7 @@ class ExperimentPlan(BaseModel):
         over M realisations and P periods the variance is v = 2 H std^2 / (N M P rms^2), the radius
         sqrt(-v ln 0.05). Distortion and a model that joins the lines are left out.
         """
-        averaged = self.period_samples * self.realisations * self.periods
-        variance = 2 * self.lines(dt_s).size * noise_std**2 / (averaged * rms_V**2)
+        averaged_samples = self.period_samples * self.realisations * self.periods
+        n_lines = self.lines(dt_s).size
+        variance = 2 * n_lines * noise_std**2 / (averaged_samples * rms_V**2)
         return float(np.sqrt(-variance * np.log(1 - _LEVEL)))

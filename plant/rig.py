@@ -1,7 +1,9 @@
 """The nominal rig: every physical parameter of a flexible-link arm, as read from a TOML file.
 
 A straight uniform link is clamped radially to a rigid hub, which a voltage-driven gear motor turns in a
-horizontal plane; hub angle and tip position are measured with noise.
+horizontal plane; hub angle and tip position are measured with noise. `Rig` holds one section per part of the
+arm, each a class with checked fields; it is read from a file, written to one, and changed into another rig by
+dotted keys such as "link.length_m". Errors are one line that names the key.
 """
 
 from __future__ import annotations
@@ -17,8 +19,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-# Nothing in an arm is larger in SI units; beyond, powers of it overflow.
+# Largest value of a parameter, SI units. Nothing in an arm is larger (Young's modulus of diamond: 1.2e12);
+# beyond, powers of it overflow.
 _LARGEST = 1e15
+# Smallest factor of a drawn parameter: a wide tolerance cannot turn one to zero or below.
+_SMALLEST_FACTOR = 0.05
+# Likeness (`difflib`, 0 to 1) from which an unknown key is taken for a misspelt one.
+_ALIKE = 0.7
 Positive = Annotated[float, Field(gt=0, le=_LARGEST)]
 NotNegative = Annotated[float, Field(ge=0, le=_LARGEST)]
 
@@ -27,6 +34,8 @@ Output = Literal["hub_angle_rad", "tip_m", "tip_acceleration_m_s2", "hub_speed_r
 
 
 class _Checked(BaseModel):
+    """A frozen section of a rig file: every key known, every number finite and of its stated type."""
+
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
@@ -42,10 +51,12 @@ class Link(_Checked):
 
     @property
     def mass_per_length_kg_m(self) -> float:
+        """Density times the area of the cross section, kg/m."""
         return self.density_kg_m3 * self.width_m * self.thickness_m
 
     @property
     def bending_stiffness_Nm2(self) -> float:
+        """E I with I = b h^3 / 12, N m^2."""
         return self.youngs_modulus_Pa * self.width_m * self.thickness_m**3 / 12.0
 
 
@@ -125,6 +136,7 @@ class Rig(_Checked):
 
     @model_validator(mode="after")
     def _tolerances_name_parameters(self) -> Self:
+        """The rig itself. Raises ValueError for a tolerance of something that is no parameter."""
         known = parameter_keys()
         for key in self.tolerances:
             if key not in known:
@@ -133,11 +145,14 @@ class Rig(_Checked):
 
     @classmethod
     def from_toml(cls, path: str | os.PathLike[str]) -> Self:
-        """Read a rig file.
+        """The rig that a file states.
 
-        Raises ValueError: one line with the file and the dotted key (or the line of a syntax error) and what
-        was expected.
-        Raises FileNotFoundError if there is no such file.
+        Raises
+        ------
+        ValueError
+            One line with the file and the dotted key (or the line of a syntax error) and what was expected.
+        FileNotFoundError
+            There is no such file.
         """
         if Path(path).exists() and not Path(path).is_file():  # a pipe would be waited for
             raise ValueError(f"{path}: not a file")
@@ -152,7 +167,7 @@ class Rig(_Checked):
 
     @classmethod
     def from_document(cls, content: Mapping[str, Any], source: str) -> Self:
-        """The content of a rig file. Raises ValueError as `from_toml`, naming `source`."""
+        """The rig of the content of a rig file, a table of tables. Raises ValueError that names `source`."""
         try:
             return cls.model_validate(content)
         except ValidationError as error:
@@ -162,18 +177,15 @@ class Rig(_Checked):
         """The rig as the text of a rig file; reading it back gives an equal Rig."""
         lines: list[str] = ["# rig; SI units, given in the key names"]
         for section, values in self.model_dump(exclude_defaults=True).items():
+            lines.append("")
             if section == "tolerances":
-                lines += ["", "# relative standard deviations of the values above; not listed = exact"]
-                lines += ["[tolerances]", *(f'"{key}" = {float(value)!r}' for key, value in values.items())]
-            else:
-                lines += [
-                    "",
-                    f"[{section}]",
-                    *(
-                        f"{k} = " + (f'"{v}"' if isinstance(v, str) else f"{float(v)!r}")
-                        for k, v in values.items()
-                    ),
-                ]
+                lines.append("# relative standard deviations of the values above; not listed = exact")
+            lines.append(f"[{section}]")
+            for name, value in values.items():
+                # Names of tolerances have a dot in them, which is a table without quotation marks.
+                key = f'"{name}"' if section == "tolerances" else name
+                text = f'"{value}"' if isinstance(value, str) else f"{float(value)!r}"
+                lines.append(f"{key} = {text}")
         return "\n".join(lines) + "\n"
 
     def value(self, key: str) -> float:
@@ -184,7 +196,7 @@ class Rig(_Checked):
         return float(getattr(getattr(self, section), name))
 
     def perturbed(self, values: Mapping[str, float]) -> Self:
-        """The same rig with the parameters under the given dotted keys set to new values.
+        """This rig with the parameters under the given dotted keys set to new values.
 
         The result is checked like any other rig; an unknown key or a bad value raises a one-line ValueError.
         """
@@ -199,7 +211,10 @@ class Rig(_Checked):
             raise ValueError(one_line(error)) from error
 
     def scaled(self, factors: Mapping[str, float]) -> Self:
-        """The same rig with the parameters under the given dotted keys multiplied by factors."""
+        """This rig with the parameters under the given dotted keys multiplied by factors.
+
+        An unknown key or a bad value raises a one-line ValueError.
+        """
         return self.perturbed({key: self.value(key) * factor for key, factor in factors.items()})
 
     def drawn(self, rng: np.random.Generator) -> Self:
@@ -207,44 +222,55 @@ class Rig(_Checked):
 
         A factor is kept above 0.05 so that a wide tolerance cannot turn a parameter negative.
         """
-        return self.scaled(
-            {k: max(1.0 + s * rng.standard_normal(), 0.05) for k, s in self.tolerances.items()}
-        )
+        factors = {}
+        for key, tolerance in self.tolerances.items():
+            factor = 1.0 + tolerance * rng.standard_normal()
+            factors[key] = max(factor, _SMALLEST_FACTOR)
+        return self.scaled(factors)
 
 
 @cache
 def parameter_keys() -> tuple[str, ...]:
     """Dotted keys of all parameters of a Rig, in file order."""
-    return tuple(
-        f"{section}.{key}"
-        for section, field in Rig.model_fields.items()
-        for key, entry in getattr(field.annotation, "model_fields", {}).items()
-        if entry.annotation is float
-    )
+    keys = []
+    for section, field in Rig.model_fields.items():
+        # Tolerances are a dictionary, which has no fields.
+        entries = getattr(field.annotation, "model_fields", {})
+        for name, entry in entries.items():
+            if entry.annotation is float:
+                keys.append(f"{section}.{name}")
+    return tuple(keys)
 
 
 def one_line(error: ValidationError, known: Collection[str] = ()) -> str:
     """The gravest complaint of pydantic in one line: dotted key, what was expected, what came.
 
-    known: the keys, where they are not those of a rig.
+    known : collection of str
+        The keys that may be meant, where they are not those of a rig.
     """
     # An unknown key first: a misspelt key is also a missing one, and its spelling is what has to be seen.
-    first = min(error.errors(), key=lambda entry: entry["type"] != "extra_forbidden")
+    complaints = error.errors()
+    first = min(complaints, key=lambda complaint: complaint["type"] != "extra_forbidden")
     key = ".".join(str(part) for part in first["loc"])
-    kind, message = first["type"], first["msg"].removeprefix("Value error, ")
+    kind = first["type"]
+    message = first["msg"].removeprefix("Value error, ")
     if kind == "missing":
-        text = f"{key}: missing, expected a value"
-    elif kind == "extra_forbidden":
-        close = get_close_matches(key, known or (*parameter_keys(), *Rig.model_fields), n=1, cutoff=0.7)
-        hint = f"did you mean {close[0]}?" if close else f"known: {', '.join(known)}" if known else ""
-        text = f"{key}: unknown key" + (f" ({hint})" if hint else "")
-    elif kind == "value_error":
-        text = f"{key}: {message}" if key else message
-    else:
-        expected = message.removeprefix("Input should be ")
-        try:
-            given = f"{first['input']!r:.80}"
-        except ValueError:  # hexadecimal digits give integers that Python does not write in decimal ones
-            given = "a number of too many digits"
-        text = f"{key}: expected {expected}, got {given}"
-    return text
+        return f"{key}: missing, expected a value"
+    if kind == "extra_forbidden":
+        possible = known or (*parameter_keys(), *Rig.model_fields)
+        close = get_close_matches(key, possible, n=1, cutoff=_ALIKE)
+        if close:
+            return f"{key}: unknown key (did you mean {close[0]}?)"
+        # Those of a rig would fill a page.
+        if known:
+            return f"{key}: unknown key (known: {', '.join(known)})"
+        return f"{key}: unknown key"
+    if kind == "value_error":
+        return f"{key}: {message}" if key else message
+    expected = message.removeprefix("Input should be ")
+    try:
+        # The first 80 characters: somebody may have put a whole table there.
+        input_text = f"{first['input']!r:.80}"
+    except ValueError:  # hexadecimal digits give integers that Python does not write in decimal ones
+        input_text = "a number of too many digits"
+    return f"{key}: expected {expected}, got {input_text}"
