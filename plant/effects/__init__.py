@@ -34,34 +34,57 @@ __all__ = [
 
 
 def parse_effect(entry: Mapping[str, Any]) -> Effect:
-    """An effect from {"name": id, parameter: value, ...}, of the list or what looks like one of it.
+    """An effect from a table, of the list or of what looks like one of it.
 
-    Raises ValueError: one line naming the effect and the parameter, or listing the known effects.
+    Parameters
+    ----------
+    entry : mapping
+        {"name": id, parameter: value, ...}.
+
+    Returns
+    -------
+    Effect
+
+    Raises
+    ------
+    ValueError
+        One line naming the effect and the parameter, or listing the known effects.
     """
     if not isinstance(entry, Mapping):
         raise ValueError(f"an effect is a table with a name and its parameters; got {entry!r}")
     if "name" not in entry:
         raise ValueError(f"effect without a name; known effects: {', '.join(EFFECTS)}")
-    name, kinds = entry["name"], {**EFFECTS, **LOOK_ALIKES}
+    name = entry["name"]
+    kinds = {**EFFECTS, **LOOK_ALIKES}
     if not isinstance(name, str) or name not in kinds:
         raise ValueError(f"unknown effect {name!r}; known effects: {', '.join(kinds)}")
     try:
-        return kinds[name].model_validate({key: value for key, value in entry.items() if key != "name"})
+        values = {key: value for key, value in entry.items() if key != "name"}
+        return kinds[name].model_validate(values)
     except ValidationError as error:
         raise ValueError(f"effect {name}: {one_line(error, kinds[name].model_fields)}") from error
 
 
 def parse_effects(entries: Iterable[Mapping[str, Any]]) -> tuple[Effect, ...]:
-    """Several effects; see `parse_effect`."""
+    """Effects from tables, in their order; each as by `parse_effect`, with its errors."""
     return tuple(parse_effect(entry) for entry in entries)
 
 
 def in_words(name: str) -> str:
-    """An effect, "none" or "unknown" in a sentence; an effect of one's own by its id without underscores, but
-    for names of a model (elbow_cmd.delay)."""
+    """Words for an effect's id, or for the answers "none" and "unknown", that fit into a sentence.
+
+    An effect of one's own plant has its id without underscores, but for names of a model (elbow_cmd.delay).
+    """
     kind = EFFECTS.get(name) or LOOK_ALIKES.get(name)
-    answers = {"none": "no effect at all", "unknown": "none of the candidate effects"}
-    return kind.words if kind else answers.get(name, name if "." in name else name.replace("_", " "))
+    if kind:
+        return kind.words
+    if name == "none":
+        return "no effect at all"
+    if name == "unknown":
+        return "none of the candidate effects"
+    if "." in name:
+        return name
+    return name.replace("_", " ")
 
 
 def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:

@@ -1,4 +1,11 @@
-"""Effects between commanded voltage and motor, in the order delay, gain, dead zone, saturation, lag."""
+"""Effects between commanded voltage and motor, in the order delay, gain, dead zone, saturation, lag.
+
+A class per effect: its docstring states the equation, its fields the parameters, and its class variables what
+`plant.effects.base.Effect` explains. Ranges and starts (`sought`) are in multiples of the sampling period or
+of the largest voltage of the records: from what no record shows to what leaves nothing of the command. A
+`spread` (first, last, count) has the starts in equal ratios, near enough to each other for a descent to reach
+any value between.
+"""
 
 from __future__ import annotations
 

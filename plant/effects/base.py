@@ -1,4 +1,10 @@
-"""What an effect is: a small frozen object with physical parameters that changes a machine's description."""
+"""What an effect is: a small frozen object with physical parameters that changes a machine's description.
+
+A class per effect (`plant.effects.actuator`, `joint`, `link`, `sensor`) states what it is called, where it
+acts (`law`), what it may be mistaken for and where a search looks for it (`sought`); `register` puts it on
+the list. `Effect.modify` changes a machine, `Effect.candidates` makes the search spaces of a diagnosis,
+`RatioEffect` is a stated value that is wrong by a factor.
+"""
 
 from __future__ import annotations
 
@@ -29,9 +35,20 @@ from plant.rig import NotNegative as NotNegative, Positive as Positive, Rig
 Group = Literal["actuator", "joint", "link", "sensor"]
 Part = Literal["rig", "voltage", "joint", "sensor"]
 
-# A ratio closer to one than this many tolerances of the value it multiplies is not significant; nearly all
-# are within so many tolerances: who states a value to 5 % is seldom wrong by a factor of ten.
-_LEAST_TOLERANCES, USUAL_TOLERANCES = 3.0, 30.0
+# A ratio closer to one than this many tolerances of the value it multiplies is not significant: three
+# standard deviations. Doubled, a fault has to be twice as large to be looked for.
+_LEAST_TOLERANCES = 3.0
+# Nearly all ratios are within so many tolerances: who states a value to 5 % is seldom wrong by a factor of
+# ten. Doubled, the prior density of a usual fault halves.
+USUAL_TOLERANCES = 30.0
+# Distance of a ratio from one, in its logarithm, below which it is not looked for where the value has no
+# tolerance: far below what records show.
+_LEAST_RATIO = 1e-6
+# Starts of a search, distances of a ratio from one in its logarithm: 2 % to a factor of five, each in reach
+# of the next.
+_RATIO_STARTS = (0.02, 0.1, 0.3, 0.7, 1.6)
+# A search below one begins no further from it than at this ratio, however wide the tolerance is.
+_LOWEST_FIRST_RATIO = 0.2
 
 
 class Effect(BaseModel):
@@ -94,41 +111,58 @@ class Effect(BaseModel):
     grows: ClassVar[bool] = True
 
     def modify(self, machine: Machine) -> Machine:
-        """The machine with this effect, by its law or times the ratio."""
-        part, name, how = self.law or ("rig", str(self.multiplies), mul)
+        """The machine with this effect, by its law, or with its ratio times the value that it multiplies.
+
+        A law names a part of the machine, what stands there, and how it changes; see the class. Raises
+        ValueError where the rig refuses the new value.
+        """
+        part, name, change = self.law or ("rig", str(self.multiplies), mul)
         values = self.parameters()
         if part == "rig":
-            size = how(machine.rig.value(name), *values.values())
-            return replace(machine, rig=machine.rig.perturbed({name: size}))
-        whole = getattr(machine, part)
-        there = getattr(whole, name)
-        if isinstance(how, type | partial):
-            own = how(**values) if isinstance(how, type) else how(tuple(values.values()))
-            found = (*there, own) if isinstance(there, tuple) else own
+            new_value = change(machine.rig.value(name), *values.values())
+            return replace(machine, rig=machine.rig.perturbed({name: new_value}))
+        path = getattr(machine, part)
+        present = getattr(path, name)
+        new: Any
+        if isinstance(change, type):
+            new = change(**values)
+        elif isinstance(change, partial):
+            new = change(tuple(values.values()))
         else:
-            found = how(there, *values.values())
-        return replace(machine, **{part: replace(whole, **{name: found})})
+            new = change(present, *values.values())
+        # Of frictions, torques and disturbances a machine has any number, of springs one of each kind.
+        is_component = isinstance(change, type | partial)
+        if is_component and isinstance(present, tuple):
+            new = (*present, new)
+        return replace(machine, **{part: replace(path, **{name: new})})
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        """Where to look for the effect; none for one that no fit can find."""
+        """Where to look for the effect; none for one that no fit can find.
+
+        scales : Scales
+            Magnitudes of rig and records, in which `sought` states its ranges.
+        """
         if not cls.sought:
             return ()
-        return searches(cls, [p.at(scales) for p in cls.sought], signed=cls.signed, grows=cls.grows)
+        parameters = [parameter.at(scales) for parameter in cls.sought]
+        return searches(cls, parameters, signed=cls.signed, grows=cls.grows)
 
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
-        """The effect at the values of the search's axes; sign: which side of a signed size."""
-        size = next(iter(cls.model_fields))
-        return cls(**{**values, size: sign * values[size]} if cls.signed else values)
+        """The effect at the values of the search's axes, by name; sign: which side of a signed size."""
+        if not cls.signed:
+            return cls(**values)
+        size_name = next(iter(cls.model_fields))
+        return cls(**{**values, size_name: sign * values[size_name]})
 
     @property
     def as_listed(self) -> bool:
-        """Whether it is what is listed by its name, at these parameters."""
+        """Whether the effect is what is listed by its name, at these parameters."""
         return True
 
     def simpler(self) -> Effect | None:
-        """The effect that this one becomes without its further parameters."""
+        """The effect that this one becomes without its further parameters; None where there is none."""
         return None
 
     @classmethod
@@ -138,10 +172,19 @@ class Effect(BaseModel):
 
     @classmethod
     def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
-        """Search of this effect from where the one that it looks like ended, at the coordinates x (A,)."""
-        scale, axis = cls.look_alike_scale(rig), other.axes[0]
-        size = log_axis(next(iter(cls.model_fields)), axis.low * scale, axis.high * scale, axis.step)
-        return Candidate(cls, (size,), ((float(x[0] + np.log(scale)),),))
+        """Search of this effect from where that of the one that it looks like ended.
+
+        other : Candidate
+            Search of the effect that this one looks like; its first axis is the size, on a logarithmic scale.
+        x : (A,)
+            Its coordinates in the end.
+        """
+        scale = cls.look_alike_scale(rig)
+        other_axis = other.axes[0]
+        size_name = next(iter(cls.model_fields))
+        axis = log_axis(size_name, other_axis.low * scale, other_axis.high * scale, other_axis.step)
+        start = float(x[0] + np.log(scale))
+        return Candidate(cls, (axis,), ((start,),))
 
     def parameters(self) -> dict[str, float]:
         """Parameter values by name."""
@@ -160,13 +203,16 @@ class Effect(BaseModel):
         grows: bool = True,
     ) -> Candidate:
         """A search that starts from these points, given in the units of the axes' parameters."""
-        starts = tuple(
-            tuple(axis.coordinate(v) for axis, v in zip(axes, point, strict=True)) for point in points
-        )
-        return Candidate(cls, tuple(axes), starts, grows=grows)
+        starts = []
+        for point in points:
+            coordinates = [axis.coordinate(value) for axis, value in zip(axes, point, strict=True)]
+            starts.append(tuple(coordinates))
+        return Candidate(cls, tuple(axes), tuple(starts), grows=grows)
 
 
+# Classes by id, in the order of their registration: effects that a diagnosis may answer.
 EFFECTS: dict[str, type[Effect]] = {}
+# Classes by id of what is no answer, but what an effect may be mistaken for.
 LOOK_ALIKES: dict[str, type[Effect]] = {}
 
 E = TypeVar("E", bound=Effect)
@@ -180,13 +226,17 @@ def register(kind: type[E]) -> type[E]:
     Raises TypeError for a ratio without a stated value that it multiplies or a `modify` of its own, and for
     an effect without id or words: the pages need them.
     """
-    if missing := [name for name in ("id", "words") if not hasattr(kind, name)]:
+    missing = [name for name in ("id", "words") if not hasattr(kind, name)]
+    if missing:
         raise TypeError(f"effect {kind.__name__}: state its {' and '.join(missing)} in the class")
     if kind.modify is Effect.modify and not (kind.law or kind.multiplies):
         raise TypeError(f"{kind.id} neither acts on a value nor multiplies one: it needs its own modify")
     if not hasattr(kind, "group"):
         kind.group = cast(Group, kind.__module__.rpartition(".")[2])
-    (LOOK_ALIKES if kind.look_alike_of else EFFECTS)[kind.id] = kind
+    if kind.look_alike_of:
+        LOOK_ALIKES[kind.id] = kind
+    else:
+        EFFECTS[kind.id] = kind
     return kind
 
 
@@ -194,31 +244,59 @@ class RatioEffect(Effect):
     """A stated value (`multiplies`) times a ratio."""
 
     neutral = MappingProxyType({"ratio": 1.0})
+    # A search goes from one over this to this: who is wrong by more has another machine. Chosen.
     largest_ratio: ClassVar[float] = 10.0
 
     ratio: NotNegative
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """Searches above and below one, see `ratio_candidates`."""
         return ratio_candidates(cls, scales.tolerance(cls.multiplies), cls.largest_ratio)
 
 
 def ratio_candidates(kind: EffectKind, tolerance: float, largest: float) -> tuple[Candidate, ...]:
-    """Both sides of one, from where the tolerance of the stated value no longer explains the ratio."""
-    least = max(1e-6, _LEAST_TOLERANCES * tolerance)
-    points = np.array([0.02, 0.1, 0.3, 0.7, 1.6])
-    points = points[points > least] if np.any(points > least) else np.array([1.2 * least])
-    usual = 1 + USUAL_TOLERANCES * tolerance
-    above = log_axis("ratio", 1 + least, largest, usual=(1 + least, usual) if tolerance > 0 else None)
-    sides = [Candidate(kind, (above,), tuple((float(p),) for p in points))]
-    below = max(1 - least, 0.2) if least < 1 else 0.0
-    if below > 0:
-        axis = log_axis("ratio", 1 / largest, below, usual=(1 / usual, below) if tolerance > 0 else None)
-        starts = tuple((float(v),) for v in np.minimum(-points, np.log(below)))
-        sides.append(Candidate(kind, (axis,), starts, sign=-1, grows=False))
+    """Searches of a ratio on both sides of one, from where the stated value's tolerance no longer explains
+    it.
+
+    Parameters
+    ----------
+    kind : EffectKind
+        The effect, whose only parameter is named "ratio".
+    tolerance : float
+        Relative standard deviation of the stated value, 0 where it is exact.
+    largest : float
+        Ratio where the search ends; one over it on the other side.
+
+    Returns
+    -------
+    tuple of Candidate
+        Above one, then below; the second is missing for a tolerance that explains every smaller ratio.
+    """
+    least = max(_LEAST_RATIO, _LEAST_TOLERANCES * tolerance)
+    starts = np.array(_RATIO_STARTS)
+    is_significant = starts > least
+    # Where none of them is, a little beyond what the tolerance explains.
+    starts = starts[is_significant] if np.any(is_significant) else np.array([1.2 * least])
+    usual_ratio = 1 + USUAL_TOLERANCES * tolerance
+    usual_above = None
+    if tolerance > 0:
+        usual_above = (1 + least, usual_ratio)
+    axis_above = log_axis("ratio", 1 + least, largest, usual=usual_above)
+    starts_above = tuple((float(start),) for start in starts)
+    sides = [Candidate(kind, (axis_above,), starts_above)]
+    if least < 1:
+        below = max(1 - least, _LOWEST_FIRST_RATIO)
+        usual_below = None
+        if tolerance > 0:
+            usual_below = (1 / usual_ratio, below)
+        axis_below = log_axis("ratio", 1 / largest, below, usual=usual_below)
+        mirrored = np.minimum(-starts, np.log(below))
+        starts_below = tuple((float(start),) for start in mirrored)
+        sides.append(Candidate(kind, (axis_below,), starts_below, sign=-1, grows=False))
     return tuple(sides)
 
 
-def alone(there: object, own: float) -> float:
-    """Of a value that the effect brings: whatever there is without it."""
-    return own
+def alone(present: object, value: float) -> float:
+    """The value that an effect brings, whatever is present without it: a law of effects that never add up."""
+    return value

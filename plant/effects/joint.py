@@ -1,4 +1,10 @@
-"""Effects at motor, gear and hub; torques act from housing to shaft, sizes at the hub side of the gear."""
+"""Effects at motor, gear and hub; torques act from housing to shaft, sizes at the hub side of the gear.
+
+A class per effect: its docstring states the equation, its fields the parameters, and its class variables what
+`plant.effects.base.Effect` explains. A `spread` (first, last, count) has the starts of a search in equal
+ratios, in multiples of the `unit`. Ranges are three decades and more: `candidates` makes those that need
+several magnitudes of the rig.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +43,18 @@ from plant.machine import (
 from plant.modal import static_moment_kg_m
 from plant.rig import Rig
 
-# Bounds that only keep the step of the simulation reasonable: a stiffer pre-sliding, a steeper fall or a
-# finer ripple needs a shorter one (see plant.plan).
+# Largest level of dry friction, N m. It only keeps the step of the simulation reasonable: a stiffer
+# pre-sliding needs a shorter one (see `plant.plan`), as do a steeper fall and a finer ripple, whose bounds
+# stand in the fields.
 _LARGEST_LEVEL_NM = 1e4
-# Friction smaller than this many tolerances of the stated value it is added to is not significant.
+# Friction smaller than this many tolerances of the stated value it is added to is not significant: two
+# standard deviations. Doubled, additional friction has to be twice as large to be looked for.
 _VISCOUS_TOLERANCES = 2.0
+# Lowest resonance, Hz, of a body that something holds to the hub: slower ones swing once in two seconds.
+_SLOWEST_BODY_HZ = 0.5
+# Highest one, cycles a sample: an eighth, a quarter of the Nyquist frequency. Held more stiffly than that a
+# body is inertia of the hub.
+_FASTEST_BODY_CYCLES = 0.125
 
 
 @register
@@ -58,6 +71,7 @@ class CoulombFriction(Effect):
     torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
 
     def modify(self, machine: Machine) -> Machine:
+        """The machine with one more friction element, which has no excess and so no use for its speed."""
         friction = DryFriction(self.torque_Nm, self.torque_Nm, 1.0)
         joint = replace(machine.joint, friction=(*machine.joint.friction, friction))
         return replace(machine, joint=joint)
@@ -75,8 +89,9 @@ class StribeckFriction(Effect):
     friction = True
     neutral = MappingProxyType({"stribeck_velocity_rad_s": 0.1})
     dependence = "continuous"
-    # Share of the static level. A fall over less than a hundredth of the largest speed is over before it
-    # shows: dry friction of the Coulomb kind by another name.
+    # The Coulomb level is sought as a share of the static one (`from_search`). A fall over less than a
+    # hundredth of the largest speed is over before it shows: dry friction of the Coulomb kind by another
+    # name.
     sought = (
         EffectParameter("static_torque_Nm", 1e-5, 2, unit="torque_Nm", spread=(3e-4, 0.6, 8), step=2e-3),
         EffectParameter("coulomb_torque_Nm", 0.0, 0.98, (0.5, 0.8), "linear", step=2e-3),
@@ -93,6 +108,7 @@ class StribeckFriction(Effect):
 
     @model_validator(mode="after")
     def _falls_with_speed(self) -> Self:
+        """The effect itself. Raises ValueError where the static level is below the Coulomb level."""
         if not self.static_torque_Nm >= self.coulomb_torque_Nm:
             raise ValueError(
                 "static_torque_Nm must not be below coulomb_torque_Nm; "
@@ -102,7 +118,7 @@ class StribeckFriction(Effect):
 
     @classmethod
     def from_search(cls, values: Mapping[str, float], sign: int) -> Self:
-        """The Coulomb level is sought as a share of the static one."""
+        """The effect at the values of the axes, of which the Coulomb level is a share of the static one."""
         level = values["coulomb_torque_Nm"] * values["static_torque_Nm"]
         return cls(**{**values, "coulomb_torque_Nm": level})
 
@@ -126,14 +142,19 @@ class ViscousFriction(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """A search in multiples of the damping that the hub has, from what tolerances do not explain."""
         rig = scales.rig
         spread = scales.tolerance("hub.viscous_friction_Nms") * rig.hub.viscous_friction_Nms
         damping = rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms
         least = _VISCOUS_TOLERANCES * spread
-        usual = (least, USUAL_TOLERANCES * spread) if least > 0 else None
+        usual = None
+        if least > 0:
+            usual = (least, USUAL_TOLERANCES * spread)
+        # From what no record shows to a hub that hardly moves.
         axis = log_axis("coefficient_Nms", max(1e-5 * damping, least), 30 * damping, usual=usual)
-        first = max(1e-4 * damping, 1.2 * least)
-        return (cls._candidate([axis], ((v,) for v in geometric(first, 3 * damping, 8))),)
+        first_start = max(1e-4 * damping, 1.2 * least)
+        starts = [(coefficient,) for coefficient in geometric(first_start, 3 * damping, 8)]
+        return (cls._candidate([axis], starts),)
 
 
 @register
@@ -184,20 +205,35 @@ class AttachedBody(Effect):
 
     @classmethod
     def in_place_of(cls, other: Candidate, x: Real, rig: Rig) -> Candidate:
-        hub, ratio = rig.hub.inertia_kg_m2, other.axes[0].value(x[0])
-        # A hub that moves above the resonance of what it carries seems lighter, by no telling how much.
-        sizes = [(ratio - 1) * hub] if ratio > 1 else [0.3 * hub, hub, 3 * hub]
-        # Held more stiffly than that it is inertia of the hub.
-        slowest, fastest = 2 * np.pi * 0.5, 2 * np.pi * 0.125 / rig.sampling.dt_s
+        """Search of a body that explains the hub's inertia ratio which the search `other` ended at, in x
+        (1,).
+
+        Below its resonance the body adds its inertia to the hub. Starts have resonances all over the range
+        and a damping ratio of 0.1.
+        """
+        hub_inertia = rig.hub.inertia_kg_m2
+        ratio = other.axes[0].value(x[0])
+        if ratio > 1:
+            inertias = [(ratio - 1) * hub_inertia]
+        else:
+            # A hub that moves above the resonance of what it carries seems lighter, by no telling how much.
+            inertias = [0.3 * hub_inertia, hub_inertia, 3 * hub_inertia]
+        slowest_rad_s = 2 * np.pi * _SLOWEST_BODY_HZ
+        fastest_rad_s = 2 * np.pi * _FASTEST_BODY_CYCLES / rig.sampling.dt_s
+        softest = inertias[0] * slowest_rad_s**2
+        stiffest = inertias[-1] * fastest_rad_s**2
+        # Damping ratios from 0.005 of the slowest to 1 of the fastest.
+        least_damping = 0.01 * inertias[0] * slowest_rad_s
+        most_damping = 2 * inertias[-1] * fastest_rad_s
         axes = [
-            log_axis("inertia_kg_m2", 0.02 * hub, 10 * hub),
-            log_axis("stiffness_Nm_rad", sizes[0] * slowest**2, sizes[-1] * fastest**2),
-            log_axis("damping_Nms", 0.01 * sizes[0] * slowest, 2 * sizes[-1] * fastest),
+            log_axis("inertia_kg_m2", 0.02 * hub_inertia, 10 * hub_inertia),
+            log_axis("stiffness_Nm_rad", softest, stiffest),
+            log_axis("damping_Nms", least_damping, most_damping),
         ]
-        starts = [
-            (size, size * omega**2, 0.2 * size * omega)
-            for size, omega in product(sizes, geometric(3 * slowest, 0.6 * fastest, 6))
-        ]
+        resonances_rad_s = geometric(3 * slowest_rad_s, 0.6 * fastest_rad_s, 6)
+        starts = []
+        for inertia, omega in product(inertias, resonances_rad_s):
+            starts.append((inertia, inertia * omega**2, 0.2 * inertia * omega))
         return cls._candidate(axes, starts)
 
 
@@ -217,10 +253,12 @@ class TorqueRipple(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """A search without starts: amplitude and phase follow by least squares for every number of cycles."""
         # Less than a quarter of a period looks like a spring or a constant torque; once per revolution is a
         # weight, whatever its direction.
         fewest = float(np.clip(0.5 * np.pi / scales.swing_rad, 2.0, 20.0))
         amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, scales.torque_Nm)
+        # Eighty cycles a turn: the teeth of a gear, or the poles of a motor behind one. Chosen.
         cycles = Axis("cycles_per_rev", "linear", fewest, 80.0, 1e-4, edge="low")
         return (cls._candidate([amplitude, cycles, PHASE]),)
 
@@ -242,10 +280,13 @@ class PeriodicDisturbance(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
+        """A search without starts: amplitude and phase follow by least squares for every frequency."""
         # What shakes the hub may be stronger than what the motor was asked for.
         amplitude = log_axis("amplitude_Nm", 1e-6 * scales.torque_Nm, 10 * scales.torque_Nm)
-        low, high = 0.3 / scales.duration_s, 0.5 / scales.dt_s
-        frequency = Axis("frequency_Hz", "linear", low, high, 1e-5, edge="low")
+        # From a third of a period in the longest record, which is hardly one, to Nyquist.
+        lowest_Hz = 0.3 / scales.duration_s
+        highest_Hz = 0.5 / scales.dt_s
+        frequency = Axis("frequency_Hz", "linear", lowest_Hz, highest_Hz, 1e-5, edge="low")
         return (cls._candidate([amplitude, frequency, PHASE]),)
 
 
@@ -282,6 +323,7 @@ class GroundSpring(Effect):
 
     @classmethod
     def look_alike_scale(cls, rig: Rig) -> float:
+        """Stiffness, N m/rad, by unit of gravity of a hanging link: its static moment, kg m."""
         return static_moment_kg_m(rig)
 
 
@@ -304,11 +346,19 @@ class JointCompliance(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        k = scales.link_stiffness_Nm_rad
-        axes = [log_axis("stiffness_Nm_rad", 0.05 * k, 1e4 * k), log_axis("damping_Nms", 1e-6 * k, 100 * k)]
+        """A search in multiples of the link's stiffness; a softer joint is a larger effect."""
+        link_stiffness = scales.link_stiffness_Nm_rad
+        axes = [
+            log_axis("stiffness_Nm_rad", 0.05 * link_stiffness, 1e4 * link_stiffness),
+            log_axis("damping_Nms", 1e-6 * link_stiffness, 100 * link_stiffness),
+        ]
         # Damping in proportion to the stiffness: time constants, not torques.
-        points = product(geometric(0.2 * k, 1e3 * k, 12), [3e-4, 3e-3, 2e-2])
-        return (cls._candidate(axes, ((kj, time_s * kj) for kj, time_s in points), grows=False),)
+        stiffnesses = geometric(0.2 * link_stiffness, 1e3 * link_stiffness, 12)
+        time_constants_s = [3e-4, 3e-3, 2e-2]
+        starts = []
+        for stiffness, time_constant_s in product(stiffnesses, time_constants_s):
+            starts.append((stiffness, time_constant_s * stiffness))
+        return (cls._candidate(axes, starts, grows=False),)
 
 
 @register
@@ -331,18 +381,25 @@ class BaseCompliance(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        k, J = scales.link_stiffness_Nm_rad, scales.rig.hub.inertia_kg_m2
+        """A search by the base's resonance, damping ratio and inertia; a softer base is a larger effect."""
+        link_stiffness = scales.link_stiffness_Nm_rad
+        hub_inertia = scales.rig.hub.inertia_kg_m2
         axes = [
-            log_axis("stiffness_Nm_rad", 1e-3 * k, 1e5 * k),
-            log_axis("damping_Nms", 1e-6 * k, 10 * k),
-            log_axis("inertia_kg_m2", 0.02 * J, 300 * J),
+            log_axis("stiffness_Nm_rad", 1e-3 * link_stiffness, 1e5 * link_stiffness),
+            log_axis("damping_Nms", 1e-6 * link_stiffness, 10 * link_stiffness),
+            log_axis("inertia_kg_m2", 0.02 * hub_inertia, 300 * hub_inertia),
         ]
+        # Outputs oscillate with the resonance, so that a search goes astray between far starts.
+        resonances_Hz = geometric(1.0, 40.0, 14)
+        damping_ratios = [0.02, 0.15]
+        inertia_ratios = [0.5, 2.0, 8.0, 30.0]
         starts = []
-        for frequency_Hz, ratio, inertias in product(
-            geometric(1.0, 40.0, 14), [0.02, 0.15], [0.5, 2.0, 8.0, 30.0]
+        for resonance_Hz, damping_ratio, inertia_ratio in product(
+            resonances_Hz, damping_ratios, inertia_ratios
         ):
-            inertia, omega = inertias * J, 2 * np.pi * frequency_Hz
-            starts.append((omega**2 * inertia, 2 * ratio * omega * inertia, inertia))
+            inertia = inertia_ratio * hub_inertia
+            omega = 2 * np.pi * resonance_Hz
+            starts.append((omega**2 * inertia, 2 * damping_ratio * omega * inertia, inertia))
         return (cls._candidate(axes, starts, grows=False),)
 
 

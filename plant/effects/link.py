@@ -1,4 +1,8 @@
-"""Effects on the link itself."""
+"""Effects on the link itself: its payload, stiffness and damping, and gravity in a tilted plane.
+
+A class per effect: its docstring states the equation, its fields the parameters, and its class variables what
+`plant.effects.base.Effect` explains.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +16,10 @@ from plant.effects.base import Effect, NotNegative, Positive, RatioEffect, regis
 from plant.effects.search_space import Candidate, EffectParameter, Scales, searches
 from plant.machine import Machine
 
-# A tilt is the listed one up to so far from along the link.
+# A tilt is the listed one up to so far from along the link, rad: a fifth of half a turn, where 0.83 of
+# gravity is still along it. Another direction is no answer, as every machine stands a little out of level.
 _ALONG_RAD = 0.6
-# A sixth of a turn apart, a search from one of them reaches any other.
+# Starts of the direction, rad. A sixth of a turn apart, a search from one of them reaches any other.
 _DIRECTIONS_RAD = tuple(k * np.pi / 3 for k in (0, 1, 2, 3, -2, -1))
 
 
@@ -52,6 +57,7 @@ class StructuralDamping(RatioEffect):
     words = "wrong damping of the link"
     check = "clamp the hub, pluck the tip and count the swings until half of them is left"
     multiplies = "link.kelvin_voigt_s"
+    # Damping is stated worst of all: it may be wrong by more than other values.
     largest_ratio = 50.0
 
     ratio: NotNegative = Field(description="true over nominal kappa")
@@ -82,17 +88,25 @@ class Gravity(Effect):
 
     @classmethod
     def candidates(cls, scales: Scales) -> tuple[Candidate, ...]:
-        """With its direction where an output tells the zero of the angle; else that stands in for it."""
-        found = cls.sought if scales.any_direction else cls.sought[:1]
-        return searches(cls, [parameter.at(scales) for parameter in found])
+        """A search of the size, and of the direction where an output tells the zero of the hub angle.
+
+        Elsewhere the unknown zero stands in for the direction.
+        """
+        parameters = cls.sought if scales.any_direction else cls.sought[:1]
+        return searches(cls, [parameter.at(scales) for parameter in parameters])
 
     @property
     def as_listed(self) -> bool:
+        """Whether the tilt is along the link, so far that it is the listed effect."""
         return abs(self.direction_rad) <= _ALONG_RAD
 
     def parameters(self) -> dict[str, float]:
-        """Its direction where that is not along the link."""
-        return {name: v for name, v in super().parameters().items() if v or name == "acceleration_m_s2"}
+        """Parameter values by name; the direction only where it is not along the link."""
+        values = super().parameters()
+        if values["direction_rad"] == 0:
+            del values["direction_rad"]
+        return values
 
     def modify(self, machine: Machine) -> Machine:
+        """The machine in this gravity, in place of any other."""
         return replace(machine, gravity_m_s2=self.acceleration_m_s2, gravity_direction_rad=self.direction_rad)

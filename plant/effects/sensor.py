@@ -1,4 +1,9 @@
-"""Effects on the sensor of the link. They act in the order lag, gain, drift, noise, quantisation."""
+"""Effects on the sensor of the link. They act in the order lag, gain, drift, noise, quantisation.
+
+A class per effect: its docstring states the equation, its fields the parameters, and its class variables what
+`plant.effects.base.Effect` explains. Ranges and starts (`sought`) are in multiples of the sampling period, or
+of the sensor noise over a record.
+"""
 
 from __future__ import annotations
 
