@@ -10,6 +10,9 @@ clamped-free modes of `plant.beam`, the whole tip mass in their boundary conditi
 with I = int m (r + x)^2 dx + mp (r + L)^2 and b_i = int m (r + x) phi_i dx + mp (r + L) phi_i(L).
 
 Linearised; shear, rotary inertia of the section, air and motor inductance are neglected.
+
+`equations_of_motion` writes mass, damping and stiffness for a machine with its springs and extra bodies;
+`linear_arm` is the nominal arm as a state-space model, `default_n_modes` how many modes either takes.
 """
 
 from __future__ import annotations
@@ -27,17 +30,25 @@ from plant.rig import Rig
 if TYPE_CHECKING:
     import control
 
+# Inputs and outputs of `linear_arm`; the outputs are also those of a record.
 INPUT_NAMES = ("voltage_V", "hub_torque_Nm", "tip_force_N")
 OUTPUT_NAMES = ("hub_angle_rad", "tip_m")
-# Share of the hub inertia on the motor side of a gear with backlash.
+# Share of the hub inertia on the motor side of a gear with backlash: the rotor behind its gear, while clamp
+# and cabling are on the link's side. Chosen; see `plant.effects.joint.Backlash`.
 MOTOR_SIDE_SHARE = 0.3
+# Modes that a simulation has at the least: with three, the statical deflection of the others is below 0.3 %
+# of the sensor noise on the rigs of the reference records (2.5 % with two, 60 % with one).
+_FEWEST_MODES = 3
+# Modes are counted up to this; a link with more of them below Nyquist is taken with one fewer than this.
+_MODES_COUNTED = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
     """M accel + D speed + K coordinate = sum of forces, with named directions in coordinate space.
 
-    A direction d serves both ways: the displacement d . coordinate, and the generalised force d * f.
+    A direction d serves both ways: the displacement d . coordinate, and the generalised force d * f. The N
+    coordinates are angles, rad, and modal deflections, sqrt(kg) m.
 
     mass, damping, stiffness : (N, N)
     shaft : (N,)
@@ -67,7 +78,7 @@ class Equations:
     first_mode: int
 
     def state_matrix(self) -> Real:
-        """A (2N, 2N) of the state (coordinates, speeds)."""
+        """Matrix A (2N, 2N) of the state (coordinates, speeds) without inputs."""
         n = self.mass.shape[0]
         a = np.zeros((2 * n, 2 * n))
         a[:n, n:] = np.eye(n)
@@ -77,7 +88,7 @@ class Equations:
 
     @cached_property
     def _mobility(self) -> Real:
-        """(N, N) accelerations by unit generalised forces."""
+        """Accelerations (N, N) by unit generalised forces: the inverse of the mass matrix."""
         return np.asarray(np.linalg.inv(self.mass), dtype=np.float64)
 
     def input_column(self, direction: Real) -> Real:
@@ -85,25 +96,29 @@ class Equations:
         return np.concatenate([np.zeros(direction.size), self._mobility @ direction])
 
     def position_row(self, direction: Real) -> Real:
+        """Row (2N,) that gives the displacement along a direction (N,) from the state."""
         return np.pad(direction, (0, direction.size))
 
 
 def default_n_modes(rig: Rig) -> int:
-    """As many modes as lie below the Nyquist frequency of the rig's sampling, at least three.
+    """Number of modes below the Nyquist frequency of the rig's sampling, at least three and at most 39.
 
     The modes left out still deflect statically. On the rigs of the reference records that residue is below
     0.3 % of the sensor noise with three modes (2.5 % with two, 60 % with one), so no static correction is
     added.
     """
-    nyquist = np.pi / rig.sampling.dt_s
-    n = 4
-    while n < 40 and link_modes(rig, n).omega_rad_s[-1] < nyquist:
-        n += 1
-    return min(max(int(np.sum(link_modes(rig, n).omega_rad_s < nyquist)), 3), 39)
+    nyquist_rad_s = np.pi / rig.sampling.dt_s
+    # Until the last mode is above Nyquist.
+    n_counted = _FEWEST_MODES + 1
+    while n_counted < _MODES_COUNTED and link_modes(rig, n_counted).omega_rad_s[-1] < nyquist_rad_s:
+        n_counted += 1
+    is_below = link_modes(rig, n_counted).omega_rad_s < nyquist_rad_s
+    n_below = int(np.sum(is_below))
+    return min(max(n_below, _FEWEST_MODES), _MODES_COUNTED - 1)
 
 
 def link_modes(rig: Rig, n_modes: int) -> BeamModes:
-    """Modes of the rig's link with its payload."""
+    """First n_modes modes of the rig's link with its payload, root clamped at the hub's radius."""
     return clamped_free_modes(
         rig.link.bending_stiffness_Nm2,
         rig.link.mass_per_length_kg_m,
@@ -115,13 +130,28 @@ def link_modes(rig: Rig, n_modes: int) -> BeamModes:
 
 
 def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
-    """Linear equations of the machine: rig, springs at joint, base and hub, a body held to the
-    hub, the two sides of a backlash.
+    """Linear equations of a machine: rig, springs at joint, base and hub, a body, two sides of a backlash.
 
     Torques that are not linear in the state (friction, contact, ripple, cubic spring, gravity) are not in it.
+
+    Parameters
+    ----------
+    machine : Machine
+        Rig and joint; voltage and sensor paths are not looked at.
+    n_modes : int
+        Modes of the link.
+
+    Returns
+    -------
+    Equations
+        Coordinates are angles of the hub, then of base, motor side, attached body and link root where the
+        machine has them, then the modal deflections.
     """
-    rig, joint = machine.rig, machine.joint
+    rig = machine.rig
+    joint = machine.joint
     modes = link_modes(rig, n_modes)
+
+    # Coordinates, and directions along them. What a machine does not have moves with its neighbour.
     names = ["hub"]
     if joint.base is not None:
         names.append("base")
@@ -131,9 +161,9 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         names.append("attached")
     if joint.compliance is not None:
         names.append("root")
-    first = len(names)
-    n = first + n_modes
-    unit = {name: np.eye(n)[i] for i, name in enumerate(names)}
+    first_mode = len(names)
+    n = first_mode + n_modes
+    unit = dict(zip(names, np.eye(n), strict=False))
     zero = np.zeros(n)
     hub = unit["hub"]
     base = unit.get("base", zero)
@@ -142,31 +172,46 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
     root = unit.get("root", hub)
     shaft = motor - base
 
-    mass, damping, stiffness = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
-    motor_share = MOTOR_SIDE_SHARE if joint.backlash_gap_rad is not None else 0.0
-    mass += rig.hub.inertia_kg_m2 * (
-        (1 - motor_share) * np.outer(hub, hub) + motor_share * np.outer(motor, motor)
-    )
+    mass = np.zeros((n, n))
+    damping = np.zeros((n, n))
+    stiffness = np.zeros((n, n))
+
+    # The hub, in two parts where there is a gap between them.
+    motor_share = 0.0
+    if joint.backlash_gap_rad is not None:
+        motor_share = MOTOR_SIDE_SHARE
+    link_side = (1 - motor_share) * np.outer(hub, hub)
+    motor_side = motor_share * np.outer(motor, motor)
+    mass += rig.hub.inertia_kg_m2 * (link_side + motor_side)
+
+    # The link: straight with its root, and bending. Modal masses are one.
     mass += link_inertia_kg_m2(rig) * np.outer(root, root)
     deflection = np.zeros((n_modes, n))
-    deflection[:, first:] = np.eye(n_modes)
+    deflection[:, first_mode:] = np.eye(n_modes)
     coupling = modes.coupling @ deflection
     mass += np.outer(root, coupling) + np.outer(coupling, root) + deflection.T @ deflection
     elastic = deflection.T @ (modes.omega_rad_s[:, None] ** 2 * deflection)
     stiffness += elastic
     damping += rig.link.kelvin_voigt_s * elastic
-    damping += (rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms) * np.outer(shaft, shaft)
-    sprung = (
+
+    # Friction and back-EMF at the shaft; springs with what they carry, by the angle that twists them.
+    shaft_damping = rig.hub.viscous_friction_Nms + rig.motor.back_emf_damping_Nms
+    damping += shaft_damping * np.outer(shaft, shaft)
+    springs = (
         (joint.compliance, root, root - hub),
         (joint.base, base, base),
         (joint.attached, attached, attached - hub),
     )
-    for spring, carried, twist in sprung:
+    for spring, carried, twist in springs:
         if spring is not None:
             stiffness += spring.stiffness_Nm_rad * np.outer(twist, twist)
             damping += spring.damping_Nms * np.outer(twist, twist)
             mass += spring.inertia_kg_m2 * np.outer(carried, carried)
     stiffness += joint.ground_spring_Nm_rad * np.outer(motor, motor)
+
+    backlash = None
+    if joint.backlash_gap_rad is not None:
+        backlash = motor - hub
     bending = modes.tip @ deflection
     return Equations(
         mass=mass,
@@ -179,42 +224,58 @@ def equations_of_motion(machine: Machine, n_modes: int) -> Equations:
         root=root,
         tip=(rig.hub.radius_m + rig.link.length_m) * root + bending,
         bending=bending,
-        backlash=motor - hub if joint.backlash_gap_rad is not None else None,
+        backlash=backlash,
         modes=modes,
-        first_mode=first,
+        first_mode=first_mode,
     )
 
 
 def link_inertia_kg_m2(rig: Rig) -> float:
-    """Inertia of the straight link and payload about the hub axis."""
-    r, length = rig.hub.radius_m, rig.link.length_m
-    return (
-        rig.link.mass_per_length_kg_m * ((r + length) ** 3 - r**3) / 3.0
-        + rig.payload.mass_kg * (r + length) ** 2
-    )
+    """Inertia of the straight link and payload about the hub axis, kg m^2."""
+    root_m = rig.hub.radius_m
+    tip_m = root_m + rig.link.length_m
+    link = rig.link.mass_per_length_kg_m * (tip_m**3 - root_m**3) / 3.0
+    payload = rig.payload.mass_kg * tip_m**2
+    return link + payload
 
 
 def static_moment_kg_m(rig: Rig) -> float:
-    """Mass times distance from the hub axis of the straight link and payload: what gravity pulls at."""
-    r, length = rig.hub.radius_m, rig.link.length_m
-    return rig.link.mass_per_length_kg_m * length * (r + length / 2) + rig.payload.mass_kg * (r + length)
+    """Mass times distance from the hub axis of the straight link and payload, kg m: what gravity pulls at."""
+    root_m = rig.hub.radius_m
+    length_m = rig.link.length_m
+    link = rig.link.mass_per_length_kg_m * length_m * (root_m + length_m / 2)
+    payload = rig.payload.mass_kg * (root_m + length_m)
+    return link + payload
 
 
 def linear_arm(rig: Rig, n_modes: int | None = None) -> control.StateSpace:
     """The nominal arm as a continuous-time python-control model without feedthrough.
 
-    States (theta, q_1..q_M, their rates); inputs voltage_V, hub_torque_Nm (on the hub, from ground) and
-    tip_force_N (transverse); outputs hub_angle_rad and tip_m = (r + L) theta + w(L). n_modes None takes
-    `default_n_modes`.
+    Parameters
+    ----------
+    rig : Rig
+    n_modes : int, optional
+        Modes of the link; None takes `default_n_modes`.
+
+    Returns
+    -------
+    control.StateSpace
+        States (theta, q_1..q_M, their rates); inputs voltage_V, hub_torque_Nm (on the hub, from ground) and
+        tip_force_N (transverse); outputs hub_angle_rad and tip_m = (r + L) theta + w(L).
     """
     import control  # here, because it brings a plotting library with it
 
-    equations = equations_of_motion(Machine(rig), default_n_modes(rig) if n_modes is None else n_modes)
+    if n_modes is None:
+        n_modes = default_n_modes(rig)
+    equations = equations_of_motion(Machine(rig), n_modes)
     drive = rig.motor.torque_per_volt_Nm_V * equations.shaft
+    directions = (drive, equations.hub, equations.tip)
+    columns = [equations.input_column(direction) for direction in directions]
+    rows = [equations.position_row(direction) for direction in (equations.encoder, equations.tip)]
     return control.ss(
         equations.state_matrix(),
-        np.column_stack([equations.input_column(d) for d in (drive, equations.hub, equations.tip)]),
-        np.array([equations.position_row(equations.encoder), equations.position_row(equations.tip)]),
+        np.column_stack(columns),
+        np.array(rows),
         np.zeros((2, 3)),
         inputs=list(INPUT_NAMES),
         outputs=list(OUTPUT_NAMES),
