@@ -45,8 +45,8 @@ def two_link_arm(
     """Arm of two aluminium links with motors of our choosing.
 
     Link 2 is the paper's, half as long; link 1 is twice as thick, so that it bends an eighth as much. Their
-    Kelvin-Voigt constant damps the first clamped mode of link 2 (21 Hz) by 2 %. Noise and sampling are not part
-    of the arm.
+    Kelvin-Voigt constant damps the first clamped mode of link 2 (21 Hz) by 2 %. Noise and sampling are not
+    part of the arm.
 
     Parameters
     ----------

@@ -34,7 +34,7 @@ def test_the_period_is_the_longest_that_the_duration_allows():
         plan = ExperimentPlan.within(duration_s=duration_s, **ARM)
         assert plan.period_samples == multiple * 1000
         assert plan.duration_s(DT) <= duration_s
-    with pytest.raises(ValueError, match=r"needs periods of 5 s: 8 records .* last 88 s, 87 s are allowed"):
+    with pytest.raises(ValueError, match=r"\b5 s\b.*\b8 records.*\b88 s\b.*\b87 s\b"):
         ExperimentPlan.within(duration_s=87.0, **ARM)
 
 
@@ -71,11 +71,11 @@ def test_expected_radius_holds_the_response_in_95_percent():
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"rms_V": (1.0, 1.0)}, "different positive"),
-        ({"rms_V": (-1.0,)}, "different positive"),
-        ({"band_Hz": (0.2, 101.0)}, "Nyquist"),
+        ({"rms_V": (1.0, 1.0)}, r"rms_V.*1\.0, 1\.0"),
+        ({"rms_V": (-1.0,)}, r"rms_V.*-1\.0"),
+        ({"band_Hz": (0.2, 101.0)}, r"\b100 Hz.*\b101\b"),
         ({"realisations": 0}, "realisations"),
-        ({"period": 5}, "period: unknown key"),
+        ({"period": 5}, "period"),
     ],
 )
 def test_nonsense_is_refused(change, words):

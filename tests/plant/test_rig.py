@@ -35,39 +35,39 @@ DT = "dt_s = 0.005"
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "complaint"),
+    ("old", "new", "facts"),
     [
-        ("length_m = 1.0", "length_m = nan", "link.length_m: expected a finite number, got nan"),
-        ("length_m = 1.0", "length_m = inf", "link.length_m: expected a finite number, got inf"),
-        ("length_m = 1.0", "length_m = 0.0", "link.length_m: expected greater than 0, got 0.0"),
-        ("length_m = 1.0", 'length_m = "1.0"', "link.length_m: expected a valid number, got '1.0'"),
-        ("length_m = 1.0", "length_m = true", "link.length_m: expected a valid number, got True"),
-        ("length_m = 1.0", "lenght_m = 1.0", "link.lenght_m: unknown key (did you mean link.length_m?)"),
-        ("length_m = 1.0", "", "link.length_m: missing, expected a value"),
-        ("[payload]\nmass_kg = 0.0", "", "payload: missing, expected a value"),
-        ("[payload]", "[payloads]", "payloads: unknown key"),
-        ("mass_kg = 0.0", "mass_kg = -0.1", "payload.mass_kg: expected greater than or equal to 0, got -0.1"),
-        (DT, f"{DT}\n[tolerances]\n'hub.mass_kg' = 0.1", "tolerances.hub.mass_kg: unknown parameter"),
-        (DT, f"{DT}\n[tolerances]\n'hub.radius_m' = 0.0", "hub.radius_m: expected greater than 0, got 0.0"),
-        (DT, "dt_s = 5000.0", "sampling.dt_s: expected less than or equal to 10, got 5000.0"),
-        (DT, f"{DT}\ntransport_delay_s = 1e6", "transport_delay_s: expected less than or equal to 60, got"),
-        ("length_m = 1.0", "length_m = = 1.0", "not valid TOML: Invalid value (at line 4, column 12)"),
+        ("length_m = 1.0", "length_m = nan", ("link.length_m", "nan")),
+        ("length_m = 1.0", "length_m = inf", ("link.length_m", "inf")),
+        ("length_m = 1.0", "length_m = 0.0", ("link.length_m", "greater than 0", "0.0")),
+        ("length_m = 1.0", 'length_m = "1.0"', ("link.length_m", "'1.0'")),
+        ("length_m = 1.0", "length_m = true", ("link.length_m", "True")),
+        ("length_m = 1.0", "lenght_m = 1.0", ("link.lenght_m", "link.length_m")),
+        ("length_m = 1.0", "", ("link.length_m",)),
+        ("[payload]\nmass_kg = 0.0", "", ("payload",)),
+        ("[payload]", "[payloads]", ("payloads",)),
+        ("mass_kg = 0.0", "mass_kg = -0.1", ("payload.mass_kg", "0, ", "-0.1")),
+        (DT, f"{DT}\n[tolerances]\n'hub.mass_kg' = 0.1", ("tolerances.hub.mass_kg",)),
+        (DT, f"{DT}\n[tolerances]\n'hub.radius_m' = 0.0", ("hub.radius_m", "0.0")),
+        (DT, "dt_s = 5000.0", ("sampling.dt_s", "10, ", "5000.0")),
+        (DT, f"{DT}\ntransport_delay_s = 1e6", ("transport_delay_s", "60, ")),
+        ("length_m = 1.0", "length_m = = 1.0", ("TOML", "line 4, column 12")),
     ],
 )
-def test_a_bad_file_is_refused_in_one_line_that_names_file_and_key(tmp_path, old, new, complaint):
+def test_a_bad_file_is_refused_in_one_line_that_names_file_and_key(tmp_path, old, new, facts):
     path = _edited(tmp_path, old, new)
     with pytest.raises(ValueError) as caught:
         Rig.from_toml(path)
     message = str(caught.value)
     assert message.startswith(f"{path}: ")
-    assert complaint in message
+    assert all(fact in message for fact in facts)
     assert "\n" not in message
 
 
 def test_bytes_that_are_no_text_are_refused(tmp_path):
     path = tmp_path / "rig.toml"
     path.write_bytes(b"[link]\nlength_m = \xff")
-    with pytest.raises(ValueError, match="not UTF-8"):
+    with pytest.raises(ValueError, match=r"rig\.toml.*UTF-8.*\b18\b"):
         Rig.from_toml(path)
 
 
@@ -77,9 +77,9 @@ def test_perturbed_and_scaled_change_what_they_name_and_nothing_else():
     for key in parameter_keys():
         expected = {"hub.inertia_kg_m2": 0.045, "payload.mass_kg": 0.2}.get(key, rig.value(key))
         assert other.value(key) == pytest.approx(expected, rel=1e-15)
-    with pytest.raises(ValueError, match=r"hub\.mass_kg: unknown parameter"):
+    with pytest.raises(ValueError, match=r"hub\.mass_kg"):
         rig.perturbed({"hub.mass_kg": 1.0})
-    with pytest.raises(ValueError, match=r"^link\.length_m: expected greater than 0, got -1\.0$"):
+    with pytest.raises(ValueError, match=r"link\.length_m.*-1\.0"):
         rig.perturbed({"link.length_m": -1.0})
 
 

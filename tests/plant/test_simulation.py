@@ -100,7 +100,7 @@ def test_a_trajectory_is_checked_and_read_only():
     record = simulate(RIG, VOLTAGE)
     with pytest.raises(ValueError, match="read-only"):
         record.tip_m[0] = 1.0
-    with pytest.raises(ValueError, match="tip_m must be"):
+    with pytest.raises(ValueError, match="tip_m"):
         replace(record, tip_m=record.tip_m[:-1])
 
 
@@ -134,29 +134,30 @@ def test_a_late_sample_as_one_step_gives_the_same_record(name, twentieths):
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        ({"voltage_V": [0.0, np.nan]}, "^voltage_V must be finite; got nan at sample 1$"),
-        ({"voltage_V": [0.0, np.inf]}, "^voltage_V must be finite; got inf at sample 1$"),
-        ({"voltage_V": []}, "^voltage_V must have shape"),
-        ({"voltage_V": [[0.0, 1.0]]}, r"^voltage_V must have shape \(T,\), T >= 1; got \(1, 2\)$"),
-        ({"voltage_V": ["a"]}, "^voltage_V must be an array of numbers"),
-        ({"dt_s": 0.0}, r"^dt_s must be positive and finite; got 0\.0$"),
-        ({"dt_s": -0.005}, "^dt_s must be positive"),
-        ({"dt_s": np.nan}, "^dt_s must be positive"),
-        ({"hub_torque_Nm": [1.0]}, r"^hub_torque_Nm must have shape \(2,\)"),
-        ({"tip_force_N": [1.0, np.nan]}, "^tip_force_N must be finite; got nan at sample 1$"),
-        ({"n_modes": 0}, "^n_modes must be at least 1; got 0$"),
-        ({"substep_s": 0.0}, "^substep_s must be positive"),
+        ({"voltage_V": [0.0, np.nan]}, r"voltage_V.*\bnan\b.*\b1\b"),
+        ({"voltage_V": [0.0, np.inf]}, r"voltage_V.*\binf\b.*\b1\b"),
+        ({"voltage_V": []}, r"voltage_V.*\(0,\)"),
+        ({"voltage_V": [[0.0, 1.0]]}, r"voltage_V.*\(1, 2\)"),
+        ({"voltage_V": ["a"]}, "voltage_V"),
+        ({"dt_s": 0.0}, r"dt_s.*0\.0"),
+        ({"dt_s": -0.005}, r"dt_s.*-0\.005"),
+        ({"dt_s": np.nan}, "dt_s.*nan"),
+        ({"hub_torque_Nm": [1.0]}, r"hub_torque_Nm.*\(2,\).*\(1,\)"),
+        ({"tip_force_N": [1.0, np.nan]}, r"tip_force_N.*\bnan\b.*\b1\b"),
+        ({"n_modes": 0}, r"n_modes.*\b1\b.*\b0\b"),
+        ({"substep_s": 0.0}, r"substep_s.*0\.0"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(arguments, complaint):
-    with pytest.raises(ValueError, match=complaint):
+def test_bad_input_is_refused_in_one_line_with_its_name_and_value(arguments, complaint):
+    with pytest.raises(ValueError, match=complaint) as caught:
         simulate(RIG, **{"voltage_V": [0.0, 1.0], **arguments})
+    assert "\n" not in str(caught.value)
 
 
 def test_a_sampled_arm_refuses_bad_input():
-    with pytest.raises(ValueError, match="dt_s must be positive"):
+    with pytest.raises(ValueError, match="dt_s"):
         SampledArm(RIG, dt_s=0.0)
-    with pytest.raises(ValueError, match="inputs must be finite"):
+    with pytest.raises(ValueError, match="nan V"):
         SampledArm(RIG).advance(np.nan)
-    with pytest.raises(ValueError, match="inputs must be finite"):
+    with pytest.raises(ValueError, match="inf N m"):
         SampledArm(RIG).advance(0.0, np.inf)
