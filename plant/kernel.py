@@ -118,6 +118,8 @@ def _smooth_forces(
     A position is what the force of its channel depends on: an angle, rad, a speed, rad/s, or a modal
     deflection, sqrt(kg) m. Forces are in N m, or the generalised ones of a mode. mode (E,) are the slip signs
     of friction elements; the other arrays are those of `run`.
+    The parameters channel[j] of a law stand with its label in `plant.machine`; Stribeck friction has the
+    index of its element as the third.
     """
     for node in range(first, last + 1):
         k = node * channel_kind.size

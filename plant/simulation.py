@@ -68,6 +68,7 @@ class Trajectory:
             array = np.array(getattr(self, entry.name), dtype=np.float64)
             if array.ndim != 1 or array.shape != np.shape(self.time_s):
                 raise ValueError(f"{entry.name} must be (T,) like time_s; got shape {array.shape}")
+            # Set once, against the frozen class: several readers share a record.
             array.setflags(write=False)
             object.__setattr__(self, entry.name, array)
 

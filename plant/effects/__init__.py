@@ -92,6 +92,7 @@ def make_machine(rig: Rig, effects: Sequence[Effect] = ()) -> Machine:
 
     Raises ValueError if an entry is not an effect, or an effect is given twice.
     """
+    # The stated delay is part of the nominal machine; an effect adds to it.
     machine = Machine(rig, VoltagePath(delay_s=rig.sampling.transport_delay_s))
     seen: set[str] = set()
     for effect in effects:

@@ -27,6 +27,7 @@ class InputDelay(Effect):
     words = "a delay of the command"
     check = "log the voltage at the motor beside the command; the time between their steps is the delay"
     adds_to = "sampling.transport_delay_s"
+    # From far below a sample to a hundred of them; starts 1.7 times apart.
     sought = (EffectParameter("delay_s", 2e-4, 100, unit="dt_s", spread=(0.04, 30, 14)),)
 
     delay_s: float = Field(ge=0, le=60.0, description="delay of the voltage; every sample of it is stored")
@@ -54,6 +55,8 @@ class ActuatorDeadZone(Effect):
     words = "a dead zone of the actuator"
     check = "raise the command slowly from zero and note where the voltage at the motor begins to follow"
     dependence = "continuous"
+    # Up to the largest command, of which nothing is left; starts 1.8 times apart. The step is small, as
+    # outputs have a kink where a sample enters the zone.
     sought = (EffectParameter("width_V", 1e-5, 1, unit="voltage_V", spread=(1e-3, 0.5, 12), step=1e-4),)
 
     width_V: NotNegative = Field(description="half width of the zone without torque")
@@ -69,6 +72,8 @@ class ActuatorSaturation(Effect):
     check = "command the largest voltage and measure what arrives at the motor"
     neutral = MappingProxyType({"limit_V": 1e6})
     dependence = "continuous"
+    # Below a twentieth of the largest command a record is nearly a switch; at 1 nothing is clipped. Starts
+    # 1.1 times apart: the clipped share of a record changes fast.
     sought = (EffectParameter("limit_V", 0.05, 1, unit="voltage_V", spread=(0.1, 0.99, 24), step=1e-4),)
     grows = False
 
@@ -83,6 +88,7 @@ class ActuatorLag(Effect):
     law = ("voltage", "lag_s", alone)
     words = "a lag of the actuator"
     check = "step the command and look at the voltage at the motor: it should step as well"
+    # From far below a sample to 200 of them; starts 2.3 times apart, as outputs change slowly with a lag.
     sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)
 
     time_constant_s: NotNegative = Field(description="time constant T; 0 is none")

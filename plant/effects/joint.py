@@ -66,6 +66,7 @@ class CoulombFriction(Effect):
     check = "raise the voltage slowly from rest and note where the hub starts to turn, in both directions"
     friction = True
     dependence = "continuous"
+    # Up to the stall torque at the largest command, where nothing moves; starts 1.8 times apart.
     sought = (EffectParameter("torque_Nm", 1e-5, 1, unit="torque_Nm", spread=(3e-4, 0.6, 14)),)
 
     torque_Nm: float = Field(ge=0, le=_LARGEST_LEVEL_NM, description="friction level Tc")
@@ -92,6 +93,7 @@ class StribeckFriction(Effect):
     # The Coulomb level is sought as a share of the static one (`from_search`). A fall over less than a
     # hundredth of the largest speed is over before it shows: dry friction of the Coulomb kind by another
     # name.
+    # Starts are 3 times apart in level and 5 times in speed; the step averages over switching instants.
     sought = (
         EffectParameter("static_torque_Nm", 1e-5, 2, unit="torque_Nm", spread=(3e-4, 0.6, 8), step=2e-3),
         EffectParameter("coulomb_torque_Nm", 0.0, 0.98, (0.5, 0.8), "linear", step=2e-3),
@@ -299,6 +301,7 @@ class HardeningSpring(Effect):
     words = "a hardening spring (cable, hose)"
     check = "pull the hub with a spring balance at small and at large angles and look for cables and hoses"
     absolute_angle = True
+    # In stall torques at the largest angle of the records; starts 3.5 times apart.
     sought = (
         EffectParameter("cubic_Nm_rad3", 1e-7, 1e3, unit="torque_Nm/angle_rad^3", spread=(1e-5, 10, 12)),
     )
@@ -418,6 +421,8 @@ class Backlash(Effect):
     check = "hold the motor shaft and turn the hub to and fro by hand: the free play is the backlash"
     neutral = None  # without a gap the contact is still elastic
     dependence = "non-smooth"
+    # In radians, as a gap belongs to a gear and not to a record; starts 1.25 times apart: outputs jump with
+    # it.
     sought = (EffectParameter("gap_rad", 1e-5, 0.5, spread=(3e-4, 0.2, 30)),)
 
     gap_rad: Positive = Field(description="total gap")

@@ -32,6 +32,7 @@ class TipPayload(Effect):
     words = "an additional mass at the tip"
     check = "weigh the tip with everything that is fixed to it"
     adds_to = "payload.mass_kg"
+    # Up to five times the mass of the link; starts 2.1 times apart.
     sought = (EffectParameter("mass_kg", 1e-6, 5, unit="link_mass_kg", spread=(1e-4, 1.5, 14)),)
 
     mass_kg: NotNegative = Field(description="added point mass at the tip")
@@ -78,6 +79,7 @@ class Gravity(Effect):
     beside = "a linear spring from hub to ground, while motions are small; larger ones"
     environment = True
     absolute_angle = True
+    # Up to twice the gravity of the earth: the stated masses may be wrong. Starts 2.3 times apart.
     sought = (
         EffectParameter("acceleration_m_s2", 1e-4, 20, spread=(1e-3, 10, 12)),
         EffectParameter("direction_rad", -np.pi, np.pi, _DIRECTIONS_RAD, "angle", step=1e-4),

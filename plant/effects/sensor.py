@@ -36,6 +36,8 @@ class SensorDrift(Effect):
     words = "a drift of the tip sensor"
     check = "log the tip sensor for some minutes with the arm clamped"
     signed = True
+    # In sensor noises over the longest record, of either sign; starts four times apart: outputs are linear in
+    # it.
     sought = (
         EffectParameter(
             "rate_m_s", 1e-3, 1e4, unit="rig.sensors.tip_noise_m/duration_s", spread=(0.1, 100, 6)
@@ -67,6 +69,7 @@ class SensorLag(Effect):
     law = ("sensor", "lag_s", alone)
     words = "a lag of the tip sensor"
     check = "tap against the tip and compare when its sensor and the encoder answer"
+    # From far below a sample to 200 of them; starts 2.3 times apart, as outputs change slowly with a lag.
     sought = (EffectParameter("time_constant_s", 2e-4, 200, unit="dt_s", spread=(0.02, 40, 10)),)
 
     time_constant_s: NotNegative = Field(description="time constant; 0 is none")
