@@ -283,12 +283,14 @@ def docstring(name: str, thing: Any) -> str:
     described = parse(inspect.cleandoc(thing.__doc__ or ""), DocstringStyle.NUMPYDOC)
     parts = [f"```python\n{name}{signature}\n```", prose(described.short_description)]
     parts.append(prose(described.long_description))
-    parameters = [
-        (f"`{parameter.arg_name}`", parameter.type_name, parameter.description)
-        for parameter in described.params
-        if parameter.args[0] != "attribute"
-    ]
-    parts.append(cells("Parameters", ("name", "type", "meaning"), parameters))
+    # A class of results lists its attributes, anything else its parameters.
+    for title, section in (("Parameters", "param"), ("Attributes", "attribute")):
+        listed = [
+            (f"`{entry.arg_name}`", entry.type_name, entry.description)
+            for entry in described.params
+            if entry.args[0] == section
+        ]
+        parts.append(cells(title, ("name", "type", "meaning"), listed))
     returned = [(part.return_name or "", part.type_name, part.description) for part in described.many_returns]
     parts.append(cells("Returns", ("name", "type", "meaning"), returned))
     raised = [(part.type_name, part.description) for part in described.raises]
