@@ -49,7 +49,7 @@ EXCESS = 0.002
 # Such an excess where a dense maximum lies closer than `EXCESS` under its limit 1, which the bound must not
 # exceed. Chosen; it is below `_PROOF_SLACK`, with which a requirement counts as met.
 LEAST_EXCESS = 1e-5
-# Limit of work, and of memory: a proof that needs more is given up. With a tenth of it no test moves.
+# Limit of work, and of memory: a proof that needs more is given up. Chosen; with a tenth of it no test moves.
 _MOST_INTERVALS = 60_000
 # Parts into which an interval is cut that is not good enough. With two or six no test moves, and the number
 # of intervals changes by 2 %.
@@ -65,9 +65,10 @@ _LEAST_WIDTH = 1e-11
 _SMALLEST_SHARE = 1e-9
 # Likewise for shapes of ellipses: below this share of the centre (squared, here) an ellipse has no size.
 _SMALLEST_SHAPE = 1e-12
-# Keeps quotients finite; no response in units of a machine is as small.
+# Least divisor: keeps quotients finite; no response in units of a machine is as small.
 _TINY = 1e-300
-# Keeps squares of squares of lengths, and a multiplier of ellipses, away from zero.
+# Least length, in units of a response, by which lengths are scaled: keeps the quotient 0/0 of a point at the
+# centre of an ellipse of no size from being nan. Far below any response, so its value decides nothing.
 _TINY_LENGTH = 1e-100
 
 # Keeps a multiplier of ellipses away from zero; multipliers that decide are of the size of gamma squared.
@@ -101,7 +102,7 @@ class AllFrequencies:
     proved : bool
         No ellipse reaches -1 anywhere, and 1 + K c winds as that of a stable loop.
     obstacle : Obstacle or None
-        Why nothing was proved.
+        Why nothing was proved; None with a proof.
     obstacle_at : float or None
         The number that belongs to it: rad/s, or a relative difference.
     gamma : float
@@ -128,7 +129,11 @@ class AllFrequencies:
 
     @classmethod
     def ended_by(cls, obstacle: Obstacle, at: float | None = None, **results: Any) -> AllFrequencies:
-        """Nothing proved because of an obstacle; at: its number; results: other fields that are known."""
+        """Nothing proved because of an obstacle; at: its number; results: other fields that are known.
+
+        Fields that are not in `results` keep the values of no proof: gamma inf, distance 0. Nothing is
+        checked.
+        """
         return cls(obstacle in _MET_BY_TRYING, False, obstacle, at, **results)
 
 
@@ -174,7 +179,9 @@ class _Asked(NamedTuple):
 class _Loop:
     """Everything rational of one plant, controller and specification.
 
-    controller: without delay. members: expands the ellipses on intervals. asked: the requirements to bound.
+    plant: its `n_integrators` is read. specification: its `computational_delay_samples` is read. controller:
+    zeros, poles and gain in z, without that delay. members: expands the ellipses on intervals, from
+    (intervals, power of z - 1). asked: the requirements to bound, K of them.
     """
 
     plant: UncertainPlant
@@ -184,7 +191,12 @@ class _Loop:
     asked: tuple[_Asked, ...]
 
     def bounds(self, intervals: FrequencyIntervals) -> _Bounds:
-        """Upper bounds of every requirement, and lower bounds of the distance, on F intervals."""
+        """Upper bounds of every requirement, and lower bounds of the distance, on F intervals.
+
+        intervals: middles and half widths (F,), rad/s. Where an interval is too wide for its expansion (a
+        root within it, a remainder larger than the distance), the distance is 0 and the upper bounds are inf,
+        and the caller cuts it. Nothing is checked.
+        """
         # 1 + L, multiplied by (z - 1)^i of controller and plant so that it is finite at zero frequency.
         n_controller = self.controller.integrators
         n_plant = self.plant.n_integrators
@@ -204,7 +216,7 @@ class _Loop:
         ends = _BothEnds(low=along_normal[0] - remainder, high=along_normal[1] - remainder)
         at_middle = np.real(np.conj(normal) * difference.centre.value) - difference.support(normal, 0)
 
-        # Each requirement on the intervals that its band touches; 0 elsewhere.
+        # Each requirement on the intervals that its band touches; 0 elsewhere. No band is all frequencies.
         half_width = intervals.half_width
         upper = np.zeros((len(self.asked), half_width.size))
         middle = np.zeros((len(self.asked), half_width.size))
@@ -236,6 +248,8 @@ class _Loop:
         """Bound of |W S| or |W K S|, times |Gp| of an independent channel, on F intervals.
 
         ends, at_middle (F,): lower bounds of |1 + K G| times (z - 1)^i at the ends, its value at the middles.
+
+        Inf where such a lower bound is not positive. Nothing is checked.
         """
         n_controller = self.controller.integrators
         n_plant = self.plant.n_integrators
@@ -274,6 +288,8 @@ class _Loop:
         omega and at the middle, g = G/(1 + G K):
         g - g0 = (G - G0 + G G0 (K0 - K))/((1 + G K)(1 + G0 K0)), hence with the largest |G - G0| = e
         M <= M0 + e/(d d0) + M M0 |K - K0|.
+
+        Inf where d is not positive or M |K - K0| >= 1, which a cut of the interval mends. Nothing is checked.
         """
         n_cleared = self.controller.integrators + self.plant.n_integrators
         delay = self.specification.computational_delay_samples
@@ -302,6 +318,8 @@ def _normal(point: Complex, shape: Real) -> Complex:
 
     shape: P (F, 2, 2). The normal is (P + t)^-1 point, normalised, t the `secular_root`. Any normal gives a
     valid bound; that of a point inside the ellipse means nothing.
+
+    For a point at the centre it is 1. Nothing is checked: nan in gives nan out.
     """
     major, minor, axis = _axes(shape)
     # Lengths in units of the largest: squares of squares stay far from the ends of the number range.
@@ -321,10 +339,13 @@ def _axes(shape: Real) -> tuple[Real, Real, Complex]:
 
     shape: P (F, 2, 2). They are roots of the eigenvalues of P, and the angle of its first eigenvector as a
     complex number of modulus one.
+
+    Not checked: that P is symmetric. A small eigenvalue that rounding made negative counts as zero.
     """
     a = shape[:, 0, 0]
     b = shape[:, 0, 1]
     d = shape[:, 1, 1]
+    # Closed form of the eigenvalues of a symmetric 2 x 2 matrix: half trace, plus and minus half the gap.
     half_gap = np.hypot((a - d) / 2, b)
     large = (a + d) / 2 + half_gap
     small = np.maximum((a + d) / 2 - half_gap, 0.0)
@@ -333,7 +354,11 @@ def _axes(shape: Real) -> tuple[Real, Real, Complex]:
 
 
 def _farthest(members: SetExpansion, side: int) -> Real:
-    """Largest modulus (F,) over the linear part of the set; side: -1 lower end, 0 middle, 1 upper end."""
+    """Largest modulus (F,) over the linear part of a set of responses on F intervals.
+
+    side: -1 lower end of the intervals, 0 middle, 1 upper end. Of two groups of generators an ellipse around
+    both is taken, so it is an upper bound. Nothing is checked.
+    """
     major, minor, direction = _axes(members.gram(side))
     centre = members.centre.end(side) * np.conj(direction)
     return farthest_distance(centre, major, minor)
@@ -353,14 +378,15 @@ def bound_all_frequencies(
     Parameters
     ----------
     controller : Controller
-        One error, one command.
+        One error, one command (not checked), with a stable loop: callers ask for no other.
     plant : UncertainPlant
         Nominal model and ellipses.
     specification : Specification
-        Its weighted requirements on the plant are bounded.
+        Its weighted requirements on the plant are bounded, with its computational delay.
     worst : WorstCase
-        The dense check: an interval is cut until its bound is within 0.2 % of the dense maximum, or under the
-        limit 1 where the dense maximum lies closer under it.
+        The dense check, of which the largest value of every requirement is read: an interval is cut until its
+        bound is within 0.2 % of the dense maximum, or under the limit 1 where the dense maximum lies closer
+        under it.
     modes : tuple of Mode
         Flexible modes of plant, controller and closed loop, where the first partition is finer.
     between_own_points : {"nothing", "linear"}
@@ -370,6 +396,13 @@ def bound_all_frequencies(
     -------
     AllFrequencies
         With an obstacle where nothing could be proved.
+
+    Raises
+    ------
+    SpecificationError
+        `Specification.weighted`: a mode's peak is limited and the plant has no mode.
+    KeyError
+        `worst` lacks one of the requirements.
 
     Notes
     -----
@@ -436,6 +469,8 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
 
     Compared are the controller's response, and centre and shape matrix of the ellipses of the plant and of
     independent channels: the centre by its size, the shape by its trace and the size of the centre.
+
+    No unit. Not checked: a nan counts as no difference; controllers and `Ellipses` are finite.
     """
     law = frequency_response(controller.to_control(), omega)
     largest = _difference(loop.controller.at(omega), law)
@@ -463,7 +498,10 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
 
 
 def _difference(form: Complex, value: Complex) -> float:
-    """Largest relative difference of two responses (F,), in parts of the second."""
+    """Largest relative difference of two responses (F,), in parts of the second; nan if one of them is nan.
+
+    F = 0 is not possible: numpy would raise ValueError for the maximum of nothing.
+    """
     size = np.abs(value)
     smallest = _SMALLEST_SHARE * np.max(size) + _TINY
     scale = np.maximum(size, smallest)
@@ -478,7 +516,7 @@ def _bisect(
     Parameters
     ----------
     evaluate : callable
-        Bounds on intervals.
+        Gives `_Bounds` (F,) of F intervals.
     edges : (F + 1,) array
         Of the first intervals, rad/s.
     dt_s : float
@@ -489,7 +527,8 @@ def _bisect(
 
     Notes
     -----
-    Where `_MOST_INTERVALS` would be exceeded, intervals are accepted as they are.
+    Where `_MOST_INTERVALS` would be exceeded, intervals are accepted as they are, with their loose bounds.
+    Not checked: at least one interval, and one requirement (the modulus margin is always asked).
     """
     low = edges[:-1]
     high = edges[1:]
@@ -527,6 +566,9 @@ def _verdict(
 
     names: of the K requirements. used: intervals that were looked at. integrators, unstable: numbers of poles
     of the loop gain at z = 1 and outside the circle; a stable loop winds by as many half turns as both.
+
+    bounds: at least one interval, not checked. An interval without a distance ends it with the obstacle
+    NO_DISTANCE, other half turns than a stable loop's with WINDING.
     """
     largest = np.max(bounds.upper, axis=1)
     by_name = dict(zip(names, largest.tolist(), strict=True))

@@ -35,7 +35,8 @@ _RISE_FROM = 0.1
 _RISE_TO = 0.9
 # Band around the final value, as a share of a step, in which it counts as settled: the usual 2 %.
 _SETTLING_BAND = 0.02
-# Part of a record, one n-th at its end, over which the steady error is averaged.
+# Part of the samples after a step, one n-th at their end, over which the steady error is averaged. Chosen: a
+# tenth is enough to average noise, and short beside any settling time that fits the record.
 _STEADY_PARTS = 10
 
 
@@ -56,7 +57,10 @@ class MeasuredMachine(Protocol):
         ...
 
     def advance(self, u: Any, /) -> None:
-        """Hold the command, or commands (U,), for one sample."""
+        """Hold the command, or commands (U,), for one sample.
+
+        A machine without a model of its own refuses what it cannot hold; nothing is said of that here.
+        """
         ...
 
 
@@ -113,7 +117,7 @@ class LinearMachine:
         self._x = np.zeros(self._a.shape[0])
 
     def measure(self) -> Real:
-        """Outputs (Y,) at t_k."""
+        """Outputs (Y,) at t_k, units of the system; nan once a state is."""
         return np.asarray(self._c @ self._x, dtype=np.float64)
 
     def advance(self, u: npt.ArrayLike, /, *, hub_torque_Nm: float = 0.0) -> None:
@@ -122,7 +126,8 @@ class LinearMachine:
         Raises
         ------
         ValueError
-            A disturbance torque is given and the system has no input for it.
+            A disturbance torque is given and the system has no input for it; or, by numpy, another number of
+            commands than the system has inputs. Values that are not finite are not refused.
         """
         # Without an input for the torque it is cut off, and must be zero.
         drive = np.append(u, hub_torque_Nm)[: self._b.shape[1]]
@@ -146,8 +151,9 @@ class LinearMachine:
         signals : (T, 5) array
             Set point, what joins the command, what joins the measurement, what joins the applied command, and
             the hub torque, N m.
-        law, limits : arrays
-            As of `law_arrays`, of one command and one error.
+        law, limits : (n + 1, n + 2), (2,) arrays
+            The controller's matrices [A, B, M; C, D, 0] and its limits of command and of change per sample,
+            as `law_arrays` makes them.
         steps : (2,) array
             Quantisation of measurement and command; 0: none.
         delay : int
@@ -156,6 +162,12 @@ class LinearMachine:
             Index of the controlled output.
         clip : float
             The machine clips its input there.
+
+        Raises
+        ------
+        ValueError
+            A torque is given without an input for it, or the machine has no such output. Shapes of the other
+            arrays are not checked, nor whether values are finite: `simulate` does that.
         """
         self._refuse_torque(signals[:, 4])
         # What joins the applied command, and the torque where the system has an input for it.
@@ -184,8 +196,9 @@ class LinearMachine:
             Set points (M), what joins the commands (U), what joins the measurements (M).
         added : (T, inputs) array
             What joins the applied commands, up to the number of the machine's inputs.
-        law, limits : arrays
-            As of `law_arrays`, of U commands and M errors.
+        law, limits : (n + U, n + M + U), (2 U,) arrays
+            The controller's matrices [A, B, anti-windup; C, D, 0] and its limits of commands and of their
+            changes per sample, as `law_arrays` makes them.
         steps : (2,) array
             Quantisation of measurements and commands; 0: none.
         delay : int
@@ -198,11 +211,13 @@ class LinearMachine:
         Raises
         ------
         ValueError
-            The machine has fewer outputs or inputs, which compiled code would not see.
+            The machine has fewer outputs or inputs, which compiled code would not see; or, by numpy, more
+            columns are added than there are inputs. Other shapes are not checked.
         """
         n_samples = len(given)
         n_outputs = len(self._c)
         n_inputs = self._b.shape[1]
+        # Half of the limits are of size, half of rate.
         n_commands = limits.size // 2
         if max(measured) >= n_outputs or n_commands > n_inputs:
             raise ValueError(f"the machine has {n_outputs} outputs and {n_inputs} inputs only")
@@ -227,7 +242,10 @@ class LinearMachine:
 
 @numba.njit(**INSIDE)
 def _along(rows: Any, i: int, values: Any) -> float:
-    """Product of row i of a matrix (R, N) and a vector (N,), summed from left to right."""
+    """Product of row i of a matrix (R, N) and a vector (N,), summed from left to right.
+
+    Not checked: compiled code looks at no bounds.
+    """
     total = 0.0
     for j in range(values.size):
         total += rows[i, j] * values[j]
@@ -257,7 +275,8 @@ def _run(
 
     values, columns, starts: rows of the machine's A, as `data`, `indices`, `indptr` of
     `scipy.sparse.csr_array`; b (n, inputs) and c (Y, n) its other matrices. Other arguments as there. Loops
-    instead of matrix products: for so few rows a call of BLAS costs more than the arithmetic.
+    instead of matrix products: for so few rows a call of BLAS costs more than the arithmetic. Nothing is
+    checked, and indices are not bounded: `joints_in_loop` makes the arrays fit.
     """
     n_u = command.shape[1]
     n_y = measured.size
@@ -338,7 +357,8 @@ class ClosedLoopTrajectory(Shown):
     Raises
     ------
     ValueError
-        The arrays differ in length, or `output` has no columns.
+        The arrays differ in length, or `output` is not (T, Y). Values are not checked: a run that diverged
+        holds inf and nan.
     """
 
     time_s: Real
@@ -361,7 +381,7 @@ class ClosedLoopTrajectory(Shown):
 
     @property
     def measured(self) -> Real:
-        """The controlled output, (T,)."""
+        """The controlled output, (T,); IndexError where `measured_index` is no column of `output`."""
         return self.output[:, self.measured_index]
 
 
@@ -404,7 +424,9 @@ def simulate(
     Raises
     ------
     ValueError
-        Sampling times or lengths do not match, or a value is not finite.
+        Sampling times or lengths do not match, a signal has a value that is not finite, a quantisation step
+        is negative, or a `LinearMachine` has no such output (IndexError of other machines). What the machine
+        measures is not checked: a loop that diverges ends in inf and nan.
 
     Notes
     -----
@@ -475,6 +497,9 @@ def simulate(
 def law_arrays(controller: Controller) -> tuple[Real, Real]:
     """Arrays of a controller of n states, U commands and Y errors, for compiled loops.
 
+    Of the controller its matrices, its anti-windup gain (n, U) and its limits are read; a `Controller` has
+    checked them.
+
     Returns
     -------
     law : (n + U, n + Y + U) array
@@ -519,7 +544,9 @@ def simulate_joints(
     Raises
     ------
     ValueError
-        Sampling times or shapes do not match.
+        Sampling times or the shape of the reference do not match, or a `LinearMachine` has too few outputs or
+        inputs. The shape of `input_disturbance`, values that are not finite and the number of outputs of
+        other machines are not checked: numpy raises where they do not fit.
 
     Notes
     -----
@@ -630,7 +657,10 @@ class MeasuredSensitivity:
 
     @property
     def peak(self) -> tuple[float, float, float]:
-        """Largest |S| over the lines, its standard deviation, and its frequency, rad/s."""
+        """Largest |S| over the lines, its standard deviation, and its frequency, rad/s.
+
+        ValueError, by numpy, without any line.
+        """
         size = np.abs(self.response)
         at = int(np.argmax(size))
         return float(size[at]), float(self.std[at]), float(self.omega_rad_s[at])
@@ -661,6 +691,11 @@ def measure_sensitivity(
     Returns
     -------
     MeasuredSensitivity
+
+    Raises
+    ------
+    ValueError
+        What `simulate` and `sensitivity_of` refuse.
     """
     run = partial(
         simulate,
@@ -691,7 +726,8 @@ def sensitivity_of(
     Parameters
     ----------
     loop : callable
-        Runs a reference (T,) from rest.
+        Runs a reference (T,) from rest and gives the trajectory, of which `reference`, `measured`, `command`
+        and `limited` (T,) are read.
     rng : numpy.random.Generator
         Draws the phases.
     dt_s : float
@@ -703,9 +739,12 @@ def sensitivity_of(
     period_samples : int
         Samples of a period; the lines are multiples of 2 pi / (period_samples dt_s).
     periods, draws : int
-        Periods that count in each draw, and draws with phases of their own.
+        Periods that count in each draw, and draws with phases of their own. Two periods of one draw are the
+        fewest that show a scatter; only several draws show distortion.
     lead_in_periods : int
-        Periods before, which are left out so that the loop has come to its periodic motion.
+        Periods before, which are left out so that the loop has come to its periodic motion. One is chosen: a
+        period that resolves the loop's slowest mode is as long as its transient. Whether the loop has come to
+        rest is not checked; a slowly decaying one needs more.
 
     Returns
     -------
@@ -715,7 +754,8 @@ def sensitivity_of(
     ------
     ValueError
         The band holds no line of the period, nothing would be left to take a scatter from, or rms is not
-        positive.
+        positive. Not checked: dt_s and period_samples above zero, lead_in_periods not negative, and that the
+        loop returns as many samples as it is given (numpy raises where the periods do not fit).
 
     Notes
     -----
@@ -778,12 +818,12 @@ class StepMetrics:
     overshoot_percent, undershoot_percent : float
         Largest excess over the final level, and largest motion against the step, in % of it.
     settling_time_s : float or None
-        From the step to the last time the response enters the band around its final level, s; None where it
-        does not.
+        From the step to the last time the response enters the band around the reference's final level, s;
+        None where it does not stay there.
     steady_error : float
-        Mean error over the last tenth of the record, unit of the output.
+        Mean error over the last tenth of the samples after the step, unit of the output.
     peak_command : float
-        Largest |command|, input unit.
+        Largest |command| of the whole record, input unit.
     limited_fraction : float
         Share of samples after the step at which the command was limited.
     """
@@ -807,7 +847,7 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
         Its reference changes once: time starts at the first sample that differs from the first value. A
         reference that stands at one level from the beginning is a step from zero at the first sample.
     settling_band : float
-        Half width of the band, as a share of the step.
+        Half width of the band, as a share of the step; the usual 2 %. Not checked: positive.
 
     Returns
     -------
@@ -816,7 +856,8 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
     Raises
     ------
     ValueError
-        The reference is not a step: it stays at zero, or has more than one level after the change.
+        The reference is not a step: it stays at zero, or has more than one level after the change. An output
+        with nan is not refused and its numbers mean nothing: nan lies outside of no band.
     """
     reference = trajectory.reference
     measured = trajectory.measured
@@ -866,7 +907,10 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
 
 
 def _first_crossing(time: Real, value: Real, level: float) -> float | None:
-    """First time (s) at which a signal (T,) reaches a level, interpolated; None if it never does."""
+    """First time (s) at which a signal (T,) reaches a level, interpolated; None if it never does.
+
+    time (T,) in s, value and level in one unit. Not checked; a nan reaches no level.
+    """
     above = np.flatnonzero(value >= level)
     if above.size == 0:
         return None

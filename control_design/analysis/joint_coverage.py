@@ -31,7 +31,8 @@ from control_design.plants.set_expansion import FirstOrderUncertainty
 from control_design.specification import Specification
 from ident.uncertainty import ResponsePosterior
 
-# Draws that are made together: they bound the memory. Another number draws other responses from one seed.
+# Draws that are made together: they bound the memory, 4 MB at a thousand frequencies. Chosen; another number
+# draws other responses from one seed.
 _CHUNK = 250
 # Fewest draws: of a hundred the share that counts at 95 % is known to 2 %.
 _FEWEST_DRAWS = 100
@@ -42,7 +43,7 @@ _SMALLEST_RADIUS = 1e-3
 
 # The largest of them: 8 standard deviations are a level of 1 - 1e-14.
 _LARGEST_RADIUS = 8.0
-# Relative accuracy of that radius, and the most halvings of the way between, which reach it anywhere.
+# Relative accuracy of that radius: far below the sampling error of any number of draws.
 _RADIUS_ACCURACY = 1e-6
 
 # Most halvings of the way between: more than a double has digits.
@@ -54,22 +55,26 @@ _LARGEST_LEVEL = 1 - 1e-15
 # draw has them. The worst case that the draws are compared with is taken on the same grid.
 _LOG_POINTS = 500
 
-# Points per mode of that grid, two in each half width over 20 of them.
+# Points per mode of that grid, some twenty of them within its bandwidth.
 _POINTS_PER_MODE = 80
-# Damping ratio that the grid takes at least for a mode.
+# Damping ratio that the grid takes at least for a mode. Chosen: draws move lighter modes by more than their
+# width, so that points as near as that would find none of them.
 _LEAST_DAMPING = 1e-3
-# Parts into which each step of that grid is cut where the winding of a draw is doubtful.
+# Parts into which each step of that grid is cut where the winding of a draw is doubtful. Chosen: a step as
+# wide as a turn is then one of a tenth of it.
 _PARTS_OF_A_STEP = 10
-# Grid of a guard: fine enough to count the winding of a response whose modes have moved.
+# Logarithmic points of a guard's grid: fine enough to count the winding of a response whose modes have moved.
+# Chosen, twice as many as those of a sampled loop; the grid is stored with each guard.
 _GUARD_LOG_POINTS = 1200
 
 # Points per mode of a guard's grid: five times as many, since its modes are not where the grid expects them.
 _GUARD_POINTS_PER_MODE = 400
 
 # Ratio of axes below which an ellipse counts as a line, whose short axis says nothing about a distance: the
-# response is real there.
+# response is real there. Chosen: far above rounding (1e-8 of an axis, the root of that of a variance), and
+# far below the ratio of axes of a complex response.
 _THIN = 1e-6
-# Keeps quotients finite.
+# Least divisor: keeps quotients finite.
 _TINY = 1e-300
 
 Responses = Callable[[Real], Complex]
@@ -83,7 +88,10 @@ class ResponseDraws(Protocol):
     """What an uncertainty of one's own offers to have its joint coverage calibrated."""
 
     def draw(self, rng: np.random.Generator, draws: int) -> Responses:
-        """Function of omega (F,) that gives the same `draws` posterior samples (draws, F) at every call."""
+        """Function of omega (F,) that gives the same `draws` posterior samples (draws, F) at every call.
+
+        F any number, ascending rad/s. What it raises goes up to who asked for the coverage.
+        """
 
 
 @dataclass(frozen=True)
@@ -144,9 +152,9 @@ def joint_coverage(
         Its weighted requirements make gamma.
     rng : numpy.random.Generator
     coverage : float
-        In (0, 1).
+        In (0, 1); the usual 0.95.
     draws : int
-        Number of sampled responses, at least 100.
+        Number of sampled responses, at least 100. 4000 know a coverage of 0.95 to 0.003.
 
     Returns
     -------
@@ -155,12 +163,15 @@ def joint_coverage(
     Raises
     ------
     ValueError
-        Coverage is outside (0, 1), there are too few draws or no plants, or an uncertainty cannot be drawn
+        Coverage is outside (0, 1), there are too few draws or no plants, sampling times differ or a loop is
+        algebraic (`closed_loop_poles`), or an uncertainty cannot be drawn
         from (a response known on its own frequencies only says nothing about their correlation).
 
     Notes
     -----
     gamma(G) is taken on a grid of about a thousand frequencies, as is the worst case it is compared with.
+    Where more draws are unstable than 1 - coverage allows, gamma is inf and the level that at which an
+    ellipse reaches -1, at most 1 - 1e-14.
     """
     if not 0 < coverage < 1:
         raise ValueError(f"joint coverage must lie in (0, 1); got {coverage}")
@@ -210,7 +221,10 @@ def joint_coverage(
 
 
 def at_level(plant: UncertainPlant, level: float) -> UncertainPlant:
-    """The plant with ellipses of another level, in (0, 1), its performance channel with it."""
+    """The plant with ellipses of another level, in (0, 1), its performance channel with it.
+
+    ValueError for another level, of `PlantChannel` when the plant's channel is first asked for.
+    """
     performance = plant.performance
     if performance is not None:
         performance = replace(performance, level=level)
@@ -238,10 +252,12 @@ class SampledLoop:
     Raises
     ------
     ValueError
-        The uncertainty cannot be drawn from.
+        The uncertainty cannot be drawn from; sampling times differ or the loop is algebraic
+        (`closed_loop_poles`); or the plant is known on its own frequencies only (`PlantChannel.at`).
     """
 
     def __init__(self, controller: Controller, plant: UncertainPlant, specification: Specification) -> None:
+        """Build the grid from the modes of plant, loop and controller, and evaluate everything on it."""
         self.plant = plant
         self.controller = controller
         self.specification = specification
@@ -262,7 +278,11 @@ class SampledLoop:
         self._winding_of_stable = {"integrators": integrators, "unstable_poles": unstable}
 
     def worst(self, radius: float) -> float:
-        """Largest weighted worst case over ellipses of a radius in standard deviations."""
+        """Largest weighted worst case over ellipses of a radius in standard deviations.
+
+        No unit; inf where an ellipse reaches -1. A radius of zero is refused by `PlantChannel` (level 0:
+        ValueError).
+        """
         plant = at_level(self.plant, _level(radius))
         data = PlantData.build(plant, self.specification, self.omega_rad_s)
         return float(np.max(worst_of(data.weighted(self.loop))))
@@ -272,6 +292,9 @@ class SampledLoop:
 
         performance: draws of an independent performance channel, which its requirement is about; None: there
         is none, or nothing is asked of it.
+
+        No unit; it is taken on the grid, whether the loop is stable or not. A response with nan gives nan.
+        Shapes are not checked: numpy raises where they do not fit.
         """
         data = self.data
         size = np.abs(self.loop)
@@ -295,7 +318,11 @@ class SampledLoop:
         return np.asarray(largest, dtype=np.float64)
 
     def distance_of(self, members: Complex) -> Real:
-        """Largest distance (D,) of responses (D, F) from the centre, in standard deviations."""
+        """Largest distance (D,) of responses (D, F) from the centre, in standard deviations.
+
+        A nan gives nan; from an ellipse of no size it is zero, or
+        huge.
+        """
         turned = (members - self.unit.centre) * np.conj(self.unit.direction)
         major = np.maximum(self.unit.semi_major, _TINY)
         minor = np.maximum(self.unit.semi_minor, _TINY)
@@ -308,7 +335,8 @@ class SampledLoop:
     def stable_of(self, responses: Responses, members: Complex) -> Boolean:
         """Whether 1 + K G winds as a stable loop's, (D,); members (D, F): the responses on the grid.
 
-        Draws with a wide step are counted again on a ten times finer grid.
+        responses gives them at other frequencies. Draws with a wide step are counted again on a ten times
+        finer grid. A draw with nan counts as unstable.
         """
         omega = self.omega_rad_s
         stable, has_wide_step = winds(members * (self.loop * self.data.delay), **self._winding_of_stable)
@@ -332,6 +360,11 @@ class SampledLoop:
             Whether it does.
         distance : (D,) array
             Largest distance of the measured response from the centre, in standard deviations.
+
+        Notes
+        -----
+        draws is D; 0 gives empty arrays. The performance channel is drawn only where a requirement is about
+        it, and its ValueError (`drawn`: no samples can be drawn) goes up.
         """
         has_asked_channel = False
         for each in self.data.weightings:
@@ -378,7 +411,8 @@ def unstable_draws(
     draws : int
         Number of samples of every plant.
     most : int
-        Guards of each plant at most, different from one another.
+        Guards of each plant at most, different from one another; at least one is given where a draw is
+        unstable.
 
     Returns
     -------
@@ -389,7 +423,8 @@ def unstable_draws(
     Raises
     ------
     ValueError
-        An uncertainty cannot be drawn from.
+        An uncertainty cannot be drawn from, or `SampledLoop` refuses the plant. No plants and no draws are no
+        error: nothing is unstable then.
     """
     unstable = np.zeros(draws, dtype=bool)
     guards: list[Guard] = []
@@ -411,7 +446,10 @@ def unstable_draws(
 
 
 def _chunks(draws: int) -> Iterator[tuple[slice, int]]:
-    """Positions, and number, of the draws that are made together, until there are `draws`."""
+    """Positions, and number, of the draws that are made together, until there are `draws`.
+
+    None for draws of zero or less.
+    """
     for start in range(0, draws, _CHUNK):
         count = min(_CHUNK, draws - start)
         yield slice(start, start + count), count
@@ -441,12 +479,18 @@ def drawn(channel: PlantChannel) -> Draw:
 
 
 def _nominal_responses(channel: PlantChannel, rng: np.random.Generator, draws: int) -> Responses:
-    """Function of omega (F,) that gives the nominal response `draws` times, (draws, F); draws no number."""
+    """Function of omega (F,) that gives the nominal response `draws` times, (draws, F); draws no number.
+
+    rng is not used. Nothing is checked.
+    """
     return lambda omega: np.broadcast_to(channel.nominal_response(omega), (draws, omega.size))
 
 
 def _posterior_responses(posterior: ResponsePosterior, rng: np.random.Generator, draws: int) -> Responses:
-    """Function of omega (F,) that gives responses (draws, F) of coefficients drawn from the posterior."""
+    """Function of omega (F,) that gives responses (draws, F) of coefficients drawn from the posterior.
+
+    posterior: `sample` gives coefficients (draws, P), `response_of` their responses. Nothing is checked.
+    """
     return partial(posterior.response_of, posterior.sample(rng, draws))
 
 
@@ -457,6 +501,8 @@ def _linear_responses(
 
     They are those of the linear model whose ellipses the uncertainty has. The weights (draws, Q) of the Q
     generators are drawn at the first call, which shows Q, and serve all later ones.
+
+    dt_s in seconds. Nothing is checked.
     """
     weights: list[Real] = []
 
@@ -472,5 +518,8 @@ def _linear_responses(
 
 
 def _level(radius: float) -> float:
-    """Level, the probability of a plane Gaussian inside an ellipse of a radius in standard deviations."""
+    """Level, the probability of a plane Gaussian inside an ellipse of a radius in standard deviations.
+
+    1 - exp(-radius^2 / 2), at most `_LARGEST_LEVEL`. Not checked: the radius is not negative; nan gives nan.
+    """
     return float(min(-np.expm1(-0.5 * radius**2), _LARGEST_LEVEL))

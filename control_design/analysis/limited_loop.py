@@ -28,31 +28,36 @@ ERROR_LEFT = 0.02
 
 # Samples of the longest simulation: 200 s at 1 kHz, and 0.1 s of computation for ten states.
 _LONGEST = 200_000
-# Samples of the shortest one, in which deadbeat loops are seen at rest.
+# Samples of the shortest one, in which deadbeat loops are seen at rest. Chosen: its last tenth is 40 samples.
 _SHORTEST = 400
 # Share to which the slowest mode of a loop that counts as settled has decayed: a twentieth of `ERROR_LEFT`.
 _DECAY = 1e-3
 # Lengths tried, in settling times of the linear loop: a limited loop moves slower. One that is not there
-# after the second does not settle.
+# after the second does not settle. Chosen.
 _LONGER = (4, 16)
-# Share of a simulation, its end, in which the loop has to be at rest.
+# Share of a simulation, its end, in which the loop has to be at rest. Chosen: long enough to see a slow limit
+# cycle, as the simulation is at least four settling times.
 _TAIL = 0.1
-# Constant errors, in errors with which the command just reaches its limit in the time simulated.
+# Constant errors, in errors with which the command just reaches its limit in the time simulated. Chosen: half
+# more than needed, then by decades, since wind-up grows with the error.
 _ERRORS = (1.5, 15.0, 150.0)
 # Reference steps, in steps with which the linear command's peak just reaches the limit. Larger ones are those
-# of nobody who chose the limit for the machine.
+# of nobody who chose the limit for the machine. Chosen.
 _STEPS = (1.5, 4.0)
 # Command at rest after the largest step that has to be followed, as a share of the limit; also the share of
-# its way after which a step counts as risen.
+# its way after which a step counts as risen. Chosen for the first (a command at its limit would leave nothing
+# to regulate with), the usual 90 % for the second.
 _REACHABLE = 0.9
 # Command at rest, as a share of the limit, above which the time that the plant takes by itself counts, too.
+# Chosen: below it as much command is left for speeding the plant up as for holding it.
 _CLOSE = 0.5
-# Command that a step asks for which cannot be followed, as a share of the limit.
+# Command that a step asks for which cannot be followed, as a share of the limit. Chosen.
 _UNREACHABLE = 1.5
 # Modulus of a pole beyond which it is unstable, and not an integrator that rounding moved
 # (`count_integrators` takes poles as close for one).
 _UNSTABLE = 1.0 + 1e-6
 # Factors on the reference gain of `anti_windup_gain`, tried in this order: from half a decade to almost two.
+# Chosen: larger ones come near to no gain, which is tried last.
 _SLOWER = (4.0, 16.0, 64.0)
 
 
@@ -90,12 +95,18 @@ class LimitedLoop:
 
     @property
     def worst(self) -> float:
-        """Largest error left, 0 where no step was simulated."""
+        """Largest error left, 0 where no step was simulated.
+
+        No unit; inf where a run diverged.
+        """
         return max(self.error_left, default=0.0)
 
     @property
     def ends(self) -> bool:
-        """Whether every step ends where it has to; true where nothing is said."""
+        """Whether every step ends where it has to; true where nothing is said.
+
+        False where an error left is nan.
+        """
         return bool(self.worst <= ERROR_LEFT)
 
 
@@ -105,13 +116,16 @@ def limited_controller(controller: Controller) -> LimitedLoop:
     Parameters
     ----------
     controller : Controller
-        With one error and one command, and a limit.
+        With one error and one command (not checked: `simulate` fails with others), and a limit; without any
+        limit no errors are simulated.
 
     Returns
     -------
     LimitedLoop
         Of the plant "controller". The command has to end at what the linear controller ends at, clipped: with
-        an integrator at the limit. Where only its rate is limited and it integrates, at the largest rate.
+        an integrator at the limit. Where only its rate is limited and it integrates, at the largest rate. An
+        obstacle instead of steps: the command ends nowhere or at zero, the controller is unstable, or it
+        takes more than 200 000 samples.
     """
     name = "controller"
     ends_unknown = LimitedLoop(name, obstacle=LimitedObstacle.ENDS_UNKNOWN)
@@ -123,6 +137,7 @@ def limited_controller(controller: Controller) -> LimitedLoop:
     # too slow to be seen decay acts as an integrator for as long as is simulated.
     poles_at_limit = np.linalg.eigvals(law.A - _gain(law) @ law.C)
     moduli = np.abs(np.concatenate([law.poles, poles_at_limit]))
+    # That is a pole which has decayed to `_DECAY` after a quarter of the longest simulation.
     slowest_seen = np.exp(np.log(_DECAY) * _LONGER[0] / _LONGEST)
     slowest = float(np.max(moduli, initial=0.0, where=moduli < slowest_seen))
     samples = _LONGER[0] * (_samples_to_settle(slowest) or _SHORTEST)
@@ -176,7 +191,7 @@ def limited_loop(controller: Controller, plant: UncertainPlant) -> LimitedLoop:
     Parameters
     ----------
     controller : Controller
-        With one error and one command, and a limit.
+        With one error and one command, and a limit; without any limit no steps are simulated.
     plant : UncertainPlant
         Its nominal model, with the controller's computational delay.
 
@@ -184,7 +199,13 @@ def limited_loop(controller: Controller, plant: UncertainPlant) -> LimitedLoop:
     -------
     LimitedLoop
         Steps at which the command reaches its limit and which the plant can follow, and one that it cannot
-        follow where the plant does not integrate.
+        follow where the plant does not integrate. An obstacle instead of steps where plant or loop is
+        unstable, the plant answers in the same sample, or the loop settles too slowly to be simulated.
+
+    Raises
+    ------
+    ValueError
+        Sampling times differ (`simulate`), or the controller has more than one error or command (numpy).
     """
     law = _alone(controller)
     system = delayed(plant.nominal, controller.computational_delay_samples)
@@ -276,7 +297,12 @@ def limited_joints(controller: Controller, plant: MultivariablePlant) -> Limited
     -------
     LimitedLoop
         Steps that the plant can follow, one reference after the other; `limited_loop` has steps beyond, too.
-        Without limits no steps.
+        Without limits no steps; an obstacle as of `limited_loop`.
+
+    Raises
+    ------
+    ValueError
+        Sampling times or numbers of errors and commands do not match (`simulate_joints`).
     """
     if not controller.limited_commands.any():
         return LimitedLoop(plant.name)
@@ -343,7 +369,10 @@ def limited_joints(controller: Controller, plant: MultivariablePlant) -> Limited
 
 
 def limited_loops(controller: Controller, plants: Sequence[UncertainPlant]) -> tuple[LimitedLoop, ...]:
-    """The controller alone under constant errors, then the loop with every plant; none without limits."""
+    """The controller alone under constant errors, then the loop with every plant; none without limits.
+
+    What cannot be simulated is an obstacle in its `LimitedLoop`; ValueError where sampling times differ.
+    """
     if not controller.limited_commands.any():
         return ()
     loops = [limited_controller(controller)]
@@ -362,7 +391,8 @@ def with_safe_limits(
     controller : Controller
         With or without limits.
     check : callable
-        Its limited loops, as those of `limited_loops`.
+        Its limited loops, as those of `limited_loops`, of which `ends` is read; none of them is a yes. What
+        it raises goes up.
 
     Returns
     -------
@@ -383,23 +413,36 @@ def with_safe_limits(
 
 
 def _alone(controller: Controller) -> Controller:
-    """The controller without what the simulated plant has (the delay), or friction would need."""
+    """The controller without what the simulated plant has (the delay), or friction would need.
+
+    Limits, matrices and anti-windup gain stay. Nothing is checked.
+    """
     return replace(controller, computational_delay_samples=0, feedforward=None)
 
 
 def _gain(controller: Controller) -> Real:
-    """Anti-windup gain (n, U) of a controller: what the limited part of its commands does to its states."""
+    """Anti-windup gain (n, U) of a controller: what the limited part of its commands does to its states.
+
+    A `Controller` computes it where none is given; the assertion tells the type checker.
+    """
     assert controller.anti_windup_gain is not None
     return controller.anti_windup_gain
 
 
 def _tail_of(samples: int) -> slice:
-    """Last tenth of a simulation of so many samples, at least one: where the loop has to be at rest."""
+    """Positions of the last tenth of a simulation of so many samples, where the loop has to be at rest.
+
+    At least one sample. Not checked: samples > 0.
+    """
     return slice(-max(1, int(_TAIL * samples)), None)
 
 
 def _samples_to_settle(radius: float) -> int | None:
-    """Samples until a mode of this pole radius has decayed to `_DECAY`; None if too many to simulate."""
+    """Samples until a mode of this pole radius has decayed to `_DECAY`; None if too many to simulate.
+
+    radius: modulus of the slowest pole, no unit. At least `_SHORTEST` samples, also for a nan, which callers
+    do not have; too many are those of which four settling times exceed `_LONGEST`.
+    """
     if radius >= 1.0:
         return None
     samples = _SHORTEST

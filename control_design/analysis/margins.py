@@ -36,16 +36,19 @@ _MINIMA = 16
 # nothing taken off no test moves.
 _MISSED = 1e-6
 
-# Loop values handed to `crossing_margins` lie on the axis or on the circle: these tell which.
+# Imaginary part, as a share of the modulus, within which a loop value handed to `crossing_margins` lies on
+# the real axis. All lie on axis or circle within rounding, so it only tells which. Chosen, far above
+# rounding.
 _ON_AXIS = 1e-7
 
-# Distance from modulus 1 within which a loop value lies on the circle.
+# Distance from modulus 1 within which such a value lies on the circle. Chosen likewise.
 _ON_CIRCLE = 1e-6
-# Relative imaginary part up to which a loop is real at Nyquist but for rounding: of one loop, whose response
-# has the error of its state space, and of the centre of an ellipse, computed from a product of responses.
+# Imaginary part, as a share of the modulus, up to which one loop is real at Nyquist but for rounding: its
+# response has the error of its state space. Chosen, a million roundings of doubles.
 _REAL_LOOP = 1e-9
 
-# The same share for the centre of an ellipse, which is a product of computed responses.
+# Such a share for the centre of an ellipse, whose response comes from an uncertainty's own formulas and loses
+# more digits. Chosen.
 _REAL_CENTRE = 1e-6
 
 # Tolerances of `brentq`, relative to the frequency: a few roundings of doubles.
@@ -54,9 +57,11 @@ _FREQUENCY_TOLERANCE = 1e-13
 # Relative tolerance of `brentq`, which takes none below 4 roundings of doubles, 9e-16.
 _LEAST_BRENTQ_TOLERANCE = 1e-14
 
-# Ellipses with a major axis below this have no boundary to speak of; their centre's crossings are sought.
+# Ellipses with a major axis below this (the loop gain has no unit, and is 1 at the circle) have no boundary
+# to speak of; their centre's crossings are sought instead. Some thousand roundings of 1.
 _LEAST_AXIS = 1e-12
-# Second coefficient of the quartic, as a share of the first, below which a circle is taken for an ellipse.
+# Second-order coefficient of the quartic, as a share of the first-order one, that a circle gets, whose own is
+# zero: rounding size, so that it moves the roots by no more than rounding.
 _LEAST_SECOND_ORDER = 1e-14
 # Distance from the circle up to which a root of the quartic, and the loop value it gives, lie on it. Where
 # the boundary only touches the circle the root is double: half of its digits are right (1e-8), and
@@ -92,7 +97,10 @@ class Margins:
     modulus: float
 
     def worse(self, other: Margins) -> Margins:
-        """Margins that both loops keep: the smaller of each, of `gain_down` the larger."""
+        """Margins that both loops keep: the smaller of each, of `gain_down` the larger.
+
+        A nan margin of this loop stays, one of `other` does not: callers have no nan here.
+        """
         return Margins(
             min(self.gain_up, other.gain_up),
             max(self.gain_down, other.gain_down),
@@ -111,6 +119,9 @@ class _Crossing(NamedTuple):
 
 def crossing_margins(x: Complex, omega_rad_s: Real, modulus: float) -> Margins:
     """Margins that loop values on crossings leave.
+
+    No value gives infinite margins. Not checked: a value on neither axis nor circle counts for nothing, a
+    frequency of 0 gives an infinite delay or nan.
 
     Parameters
     ----------
@@ -153,6 +164,8 @@ def _turns(x: Complex, omega_rad_s: Real) -> tuple[Real, Real]:
     """Rotation (rad) to -1 either way, and extra delay (s) to it, of loop values x on the unit circle.
 
     Both have the shape of x. A delay turns clockwise only, however long that way is.
+
+    omega_rad_s broadcasts with x, above 0 (not checked: 0 gives inf or nan).
     """
     clockwise = np.mod(np.angle(-x), 2 * np.pi)
     either_way = np.minimum(clockwise, 2 * np.pi - clockwise)
@@ -167,6 +180,9 @@ def nominal_margins(
     at_zero: float | None = None,
 ) -> Margins:
     """Margins of one loop on a grid, and between its points.
+
+    Not checked: at least one frequency (IndexError), ascending; that L is finite (nan is no crossing, and the
+    modulus is nan then).
 
     Parameters
     ----------
@@ -218,7 +234,10 @@ class _LoopValues(NamedTuple):
 
     @classmethod
     def of(cls, loop_gain: Complex) -> _LoopValues:
-        """Values of a loop gain (F,)."""
+        """Values of a loop gain (F,).
+
+        A zero counts as 1e-300, so that quotient and logarithm are finite; nan stays nan.
+        """
         size = np.maximum(np.abs(loop_gain), _TINY)
         return cls(
             loop_gain=loop_gain,
@@ -231,7 +250,11 @@ class _LoopValues(NamedTuple):
 def _crossings(
     loop_gain: Callable[[Real], Complex], omega_rad_s: Real, refinable: bool, value: Complex
 ) -> tuple[list[_Crossing], float]:
-    """Crossings of one loop strictly inside a grid (F,), and its least |1 + L|; value (F,): L on the grid."""
+    """Crossings of one loop strictly inside a grid (F,), and its least |1 + L|; value (F,): L on the grid.
+
+    omega_rad_s: rad/s, ascending. refinable: `loop_gain` (N,) may be asked between the points. Fewer than two
+    points give no crossing. Nothing is checked.
+    """
     omega = omega_rad_s
     values = _LoopValues.of(value)
     if refinable:
@@ -240,7 +263,10 @@ def _crossings(
         value = values.loop_gain
 
     def between(side: Callable[[complex], float], k: int) -> _Crossing:
-        """Crossing between the points k and k + 1 of the grid, at which `side` has different signs."""
+        """Crossing between the points k and k + 1 of the grid, at which `side` has different signs.
+
+        side: Im L or |L| - 1, no unit. Not checked: k is the position of a change of sign.
+        """
         low = float(omega[k])
         high = float(omega[k + 1])
         if not refinable:
@@ -251,6 +277,7 @@ def _crossings(
             return _Crossing(low + share * (high - low), complex(value[k] + share * step))
 
         def side_at(place: float) -> float:
+            """Side, no unit, of the loop gain at a frequency `place`, rad/s."""
             return side(complex(loop_gain(np.array([place]))[0]))
 
         if not side_at(low) * side_at(high) < 0:
@@ -307,7 +334,7 @@ def ellipse_margins(
     ellipses : Ellipses
         E on the grid: `omega_rad_s` (F,), `centre`, semi-axes and direction of each.
     distance : (F,) array
-        Distance of -1 from K E on the grid.
+        Distance of -1 from K E on the grid; at least one (numpy: ValueError), finite (not checked).
     between : callable, optional
         Such a factor and the ellipses at other frequencies: the smallest values are then sought between the
         points and rounded to the safe side by `_MISSED`. None where nothing is known there.
@@ -378,7 +405,10 @@ def ellipse_margins(
 
 
 def _axes(factor: Complex, ellipses: Ellipses) -> tuple[Complex, Complex, Complex]:
-    """Centre, major and minor semi-axis of K E, complex (F,) each; factor (F,): K."""
+    """Centre, major and minor semi-axis of K E, complex (F,) each; factor (F,): K.
+
+    ellipses: `centre`, `semi_major`, `semi_minor`, `direction` (F,). Shapes are not checked.
+    """
     turned = factor * ellipses.direction
     centre = factor * ellipses.centre
     major = turned * ellipses.semi_major
@@ -387,7 +417,10 @@ def _axes(factor: Complex, ellipses: Ellipses) -> tuple[Complex, Complex, Comple
 
 
 def _centre(factor: Complex, ellipses: Ellipses) -> Complex:
-    """Centres of K E, complex (F,); factor (F,): K."""
+    """Centres of K E, complex (F,); factor (F,): K.
+
+    Shapes are not checked.
+    """
     return np.asarray(factor * ellipses.centre, dtype=np.complex128)
 
 
@@ -409,7 +442,10 @@ class _MemberValues(NamedTuple):
 
 
 def _members(factor: Complex, ellipses: Ellipses) -> _MemberValues:
-    """Extremes over the members of every ellipse K E; factor (F,): K."""
+    """Extremes over the members of every ellipse K E; factor (F,): K.
+
+    ellipses: F of them, with `omega_rad_s`. Nothing is checked.
+    """
     centre, major, minor = _axes(factor, ellipses)
     up, down = _real_axis(centre, major, minor)
     rotation_rad, delay_s = _unit_circle(centre, major, minor, ellipses.omega_rad_s)
@@ -428,6 +464,8 @@ def _real_axis(centre: Complex, major: Complex, minor: Complex) -> tuple[Real, R
     First 1/|x| at its end x between -1 and 0, then |x| at its end beyond -1 (-1 itself lies outside). The
     boundary is centre + major cos(f) + minor sin(f), centre and semi-axes complex (F,); its imaginary part is
     Im(centre) + reach cos(f - f0), zero at two angles f.
+
+    All three are (F,); nan meets no axis. Nothing is checked.
     """
     up = np.full(centre.size, np.inf)
     down = np.full(centre.size, np.inf)
@@ -462,7 +500,8 @@ def _unit_circle(centre: Complex, major: Complex, minor: Complex, omega: Real) -
 
         a b* w^4 + (a c* + c b*) w^3 + (|a|^2 + |b|^2 + |c|^2 - 1) w^2 + (a c* + c b*)* w + (a b*)* = 0,
 
-    whose roots are the eigenvalues of a companion matrix.
+    whose roots are the eigenvalues of a companion matrix (4 x 4 for four roots). omega (F,): rad/s. Nan meets
+    no circle. Nothing is checked.
     """
     rotation_rad = np.full(centre.size, np.inf)
     delay_s = np.full(centre.size, np.inf)
@@ -518,6 +557,8 @@ def _refined(
     evaluate: the values (N,) at new frequencies (N,), rad/s. omega (F,), values (F,) each: the grid, and what
     holds there. sought: positions of the values whose minima count. `_ROUNDS` times, nine points are put
     between the neighbours of each of the `_MINIMA` smallest minima.
+
+    What `evaluate` raises goes up. Nothing is checked; a nan is no minimum.
     """
     for _ in range(_ROUNDS):
         depths = [-values[which] for which in sought]

@@ -40,7 +40,7 @@ from control_design.specification.multivariable import ChannelWeights, Multivari
 from ident.data.shown import Shown
 
 # Pieces, at most, into which the frequencies of one requirement are cut: a limit of work, as each takes the
-# eigenvalues of a matrix of twice the loop's states. With a tenth of it no test of this module moves.
+# eigenvalues of a matrix of twice the loop's states. Chosen; with a tenth of it no test of this module moves.
 _MOST_PIECES = 3000
 # Real part, as a share of the modulus, below which an eigenvalue of the Hamiltonian counts as imaginary. A
 # double imaginary eigenvalue splits by the root of the rounding error, 1e-8: this is a hundred times that.
@@ -51,7 +51,7 @@ _IMAGINARY_SHARE = 1e-6
 _INTEGRATOR_DISTANCE = 1e-7
 
 # How far ahead of what is proved, in grid points, the next piece is centred: at first, at least and at most.
-# They set how many pieces are computed, never what they prove.
+# They set how many pieces are computed, never what they prove. Chosen, all three.
 _FIRST_STRIDE = 16
 
 # Least stride: shorter ones would compute a piece for every grid point.
@@ -60,16 +60,20 @@ _LEAST_STRIDE = 4
 # Largest stride: a piece that fails after a longer one has to be computed anew.
 _LARGEST_STRIDE = 256
 # Where no piece centred on a grid point reaches back to what is proved: centres on the way to the next grid
-# point, as shares of that way.
+# point, as shares of that way. Chosen: each a third of the one before, down to a hundredth.
 _SHARES_OF_A_STEP = (0.3, 0.1, 0.03, 0.01)
 
 # Damping ratio that the grid takes at least for a mode, so that its points do not fall onto one another.
+# Chosen.
 _LEAST_DAMPING = 1e-5
-# Grid points around each mode of plant, controller and loop.
+# Grid points around each mode of plant, controller and loop, some fourteen of them within its bandwidth.
+# Chosen: half as many as for one channel, since the bounds between points do not need them.
 _POINTS_PER_MODE = 60
-# The grid begins at this share of the lowest corner frequency of a weight, where that is lower.
+# The grid begins at this share of the lowest corner frequency of a weight, where that is lower: a decade
+# below it a weight of first order is within 0.5 % of its limit.
 _BELOW_CORNERS = 0.1
-# The grid ends at this share of the Nyquist frequency, where Tustin's s is still finite.
+# The grid ends at this share of the Nyquist frequency, where Tustin's s is still finite: 4e5 times the
+# Nyquist frequency. Chosen; the bounds go on to Nyquist itself.
 _SHARE_OF_NYQUIST = 0.999999
 
 # Gain of the weight of a channel on which nothing is asked: zero, which a `RationalWeight` refuses.
@@ -105,7 +109,10 @@ class DiskMargin:
 
     @property
     def gain(self) -> float:
-        """Factor by which every channel's gain may be multiplied or divided, all at once; inf from 2 on."""
+        """Factor by which every channel's gain may be multiplied or divided, all at once; inf from 2 on.
+
+        No unit; at least 1 for alpha >= 0.
+        """
         if self.alpha < 2:
             return (2 + self.alpha) / (2 - self.alpha)
         return float("inf")
@@ -174,7 +181,10 @@ class MultivariableVerdict:
 
     @property
     def proved(self) -> bool:
-        """Whether the loop is stable by poles and winding, and every requirement has a finite bound."""
+        """Whether the loop is stable by poles and winding, and every requirement has a finite bound.
+
+        Without any bound false only by poles and winding; the modulus margin always has one.
+        """
         bounds = list(self.bounds.values())
         return self.stable and self.winding.matches and bool(np.all(np.isfinite(bounds)))
 
@@ -194,7 +204,13 @@ class MultivariableCertificate(Shown):
     verdicts : tuple of MultivariableVerdict
         In the order of the plants.
     gamma : float
-        Largest worst case of any requirement and plant on the grids; inf where a nominal loop is unstable.
+        Largest worst case of any requirement and plant on the grids, no unit; inf where a nominal loop is
+        unstable.
+
+    Raises
+    ------
+    ValueError
+        There are no verdicts (Python's error for the maximum of nothing).
     """
 
     table_in_notebook = True
@@ -233,7 +249,8 @@ def certify_multivariable(
     specification : MultivariableSpecification
         What is asked of each output and actuator.
     dense_points : int
-        Logarithmic points of the dense grid; those around modes come on top.
+        Logarithmic points of the dense grid; those around modes come on top. 1500 over some seven decades are
+        1 % from one to the next. Chosen; not checked.
 
     Returns
     -------
@@ -243,13 +260,15 @@ def certify_multivariable(
     ------
     ValueError
         The controller's shape, sampling time or computational delay is not that of plant and specification,
-        or the specification has another number of joints.
+        or the specification has another number of joints or another structure (SpecificationError); no plant
+        is given; or a plant's uncertainty or response cannot be evaluated on the grid.
     """
     if isinstance(plants, MultivariablePlant):
         listed: tuple[MultivariablePlant, ...] = (plants,)
     else:
         listed = tuple(plants)
     for plant in listed:
+        # Sampling times are the same within 1e-5, and 1e-8 s: numpy's own tolerances.
         if controller.D.shape != (plant.inputs, plant.outputs) or not np.isclose(controller.dt_s, plant.dt_s):
             raise ValueError(
                 f"plant {plant.name!r} needs a controller with D ({plant.inputs}, {plant.outputs}) at dt "
@@ -266,7 +285,11 @@ def certify_multivariable(
 def _verdict(
     controller: Controller, plant: MultivariablePlant, specification: MultivariableSpecification, points: int
 ) -> MultivariableVerdict:
-    """Everything that is checked of one plant; points: logarithmic points of the dense grid."""
+    """Everything that is checked of one plant; points: logarithmic points of the dense grid.
+
+    An unstable loop is no error: bounds stay inf and `obstacle` says so. LinAlgError of numpy where I + G K
+    is singular at a grid frequency, or the loop is algebraic.
+    """
     delay = controller.computational_delay_samples
     poles = NominalLoop(plant, delay).poles(controller.A, controller.B, controller.C, controller.D)
     radius = float(np.max(np.abs(poles), initial=0.0))
@@ -393,13 +416,19 @@ def _verdict(
 
 
 def _matrix_of(controller: Controller, plant: MultivariablePlant, omega_rad_s: Real) -> Complex:
-    """Response K (F, U, Y) of the controller without its delay, which `MultivariablePlant.blocks` holds."""
+    """Response K (F, U, Y) of the controller without its delay, which `MultivariablePlant.blocks` holds.
+
+    omega_rad_s (F,): rad/s. The shape was checked by `certify_multivariable`.
+    """
     response = controller.response(omega_rad_s, with_delay=False)
     return response.reshape(omega_rad_s.size, plant.inputs, plant.outputs)
 
 
 def _integrates(asked: ChannelWeights) -> bool:
-    """Whether a weight of any channel has a pole at zero frequency, and is infinite there."""
+    """Whether a weight of any channel has a pole at zero frequency, and is infinite there.
+
+    False where every weight is None. A `RationalWeight` has no other fault to look for.
+    """
     denominators = [weight.denominator for weight in asked.weights if weight is not None]
     return any(np.any(np.roots(denominator) == 0) for denominator in denominators)
 
@@ -408,6 +437,8 @@ def _disk_margin(sensitivity: Any) -> DiskMargin:
     """Disk margin of a loop with the sensitivity S (F, n, n): 1 / max mu(S - I/2) over the frequencies.
 
     mu is over a diagonal of complex factors, of one channel by itself the modulus of its diagonal entry.
+
+    Not checked: a nan gives nan; a loop with S = I/2 at all frequencies would be a division by zero.
     """
     half = sensitivity - 0.5 * np.eye(sensitivity.shape[1])
     diagonal = np.diagonal(half, axis1=1, axis2=2)
@@ -427,6 +458,9 @@ def _dense_grid(
 
     They are logarithmic, denser around modes, zeros and whatever is near the circle; of a plant known on its
     own frequencies only these. loop_poles (n,): of the nominal closed loop. points: logarithmic ones.
+
+    weights: of which the denominators' roots are corners. What `frequency_grid` raises (a lowest frequency
+    above Nyquist: IndexError) goes up.
     """
     dt_s = plant.dt_s
     nyquist_rad_s = np.pi / dt_s
@@ -464,6 +498,8 @@ def _in_s(system: Any, dt_s: float) -> StateSpace:
 
     Both have the same value where s and z belong together, so a frequency keeps its response. system: has
     matrices A, B, C, D, and no eigenvalue of A at -1.
+
+    dt_s in seconds. With such an eigenvalue numpy raises LinAlgError, or rounding decides.
     """
     A = np.asarray(system.A, dtype=np.float64)
     B = np.asarray(system.B, dtype=np.float64)
@@ -480,7 +516,10 @@ def _in_s(system: Any, dt_s: float) -> StateSpace:
 
 
 def _weights_in_s(weights: tuple[RationalWeight | None, ...]) -> StateSpace:
-    """Diagonal of N weights (None: zero) as a state space in s, N inputs and N outputs, in companion form."""
+    """Diagonal of N weights (None: zero) as a state space in s, N inputs and N outputs, in companion form.
+
+    A `RationalWeight` is proper with a first coefficient that is not zero, so nothing is checked.
+    """
     parts: list[StateSpace] = []
     for weight in weights:
         if weight is None:
@@ -513,7 +552,10 @@ def _weights_in_s(weights: tuple[RationalWeight | None, ...]) -> StateSpace:
 
 
 def _side_by_side(parts: Sequence[StateSpace]) -> StateSpace:
-    """Block-diagonal state space: the parts with their own inputs and outputs, one after the other."""
+    """Block-diagonal state space: the parts with their own inputs and outputs, one after the other.
+
+    At least one part (ValueError without any); the matrices of a part fit, not checked.
+    """
     A, B, C, D = (scipy.linalg.block_diag(*blocks) for blocks in zip(*parts, strict=True))
     n_states = sum(part.A.shape[0] for part in parts)
     n_outputs, n_inputs = D.shape
@@ -545,7 +587,10 @@ class _ScaledLoop(NamedTuple):
 
 
 def _slices(sizes: Iterable[int]) -> list[slice]:
-    """Positions of vectors of these sizes that are stacked, a slice each."""
+    """Positions of vectors of these sizes that are stacked, a slice each.
+
+    Sizes are not negative (not checked); none gives none.
+    """
     ends = np.cumsum([0, *sizes]).tolist()
     return [slice(start, stop) for start, stop in pairwise(ends)]
 
@@ -555,6 +600,9 @@ def _scaled_loop(controller: Controller, plant: MultivariablePlant, asked: Chann
 
     The parts (plant with delay, controller, weights, ball, weights of the channels' errors) stand side by
     side; constant matrices say which output goes where, and the loop is then closed at once.
+
+    plant: with `ball` (Lo, Li, radius) and the weights of channel errors. LinAlgError of numpy where the loop
+    is algebraic; shapes were checked by `certify_multivariable`.
     """
     n_u = plant.inputs
     n_y = plant.outputs
@@ -669,7 +717,8 @@ def _bound_ends_at(
     -----
     Everything from `start` to `covered` is proved. Each piece is an interval around a trial frequency within
     which the scaled gain does not cross `level`; it counts where it holds `covered`, which then moves to its
-    end. Trials go ahead as far as the last piece suggests, then closer.
+    end. Trials go ahead as far as the last piece suggests, then closer. After `_MOST_PIECES` it ends where it
+    is. Not checked: F >= 1, ascending above 0.
     """
     # The block that each scalar signal belongs to. The performance (d and e) counts as one more, the last.
     A, B, C, D = loop.system
@@ -691,10 +740,12 @@ def _bound_ends_at(
     last = size_s.size - 1
     while pieces < _MOST_PIECES:
         first = min(int(np.searchsorted(size_s, covered)), last)
+        # A quarter of the stride is the second trial; the least stride is 4, so that it is a point ahead.
         trials = [size_s[min(first + ahead, last)] for ahead in (stride, stride // 4, 0)]
         trials += [covered + share * (size_s[first] - covered) for share in _SHARES_OF_A_STEP]
         for number, trial in enumerate(trials):
-            # Scalings between those of the neighbouring grid points; that of the performance is 1.
+            # Scalings between those of the neighbouring grid points; that of the performance is 1. Half of
+            # the logarithm on either side: a scaling t multiplies signals by its root.
             centre = float(trial)
             log_here = [np.interp(np.log(centre), np.log(size_s), column) for column in log_t.T]
             on_z = np.append(np.exp(-0.5 * np.array(log_here)), 1.0)[block_of_z]
@@ -705,6 +756,7 @@ def _bound_ends_at(
             if low <= covered < high:
                 covered = high
                 farthest_trial = number == 0
+                # Doubled and halved, as usual for lengths of which only the order of magnitude counts.
                 longer = min(2 * stride, _LARGEST_STRIDE)
                 shorter = max(stride // 2, _LEAST_STRIDE)
                 stride = longer if farthest_trial else shorter
@@ -724,6 +776,9 @@ def _interval_below_one(system: StateSpace, centre: float) -> tuple[float, float
     Singular values of G(jw) = C (jw - A)^-1 B + D are 1 only where jw is an eigenvalue of
 
         [[A + B R D^T C, B R B^T], [-C^T (I + D R D^T) C, -(A + B R D^T C)^T]],   R = (I - D^T D)^-1.
+
+    system: in s, with inputs and outputs scaled. LinAlgError of numpy where D has a singular value of 1
+    exactly, or j centre is an eigenvalue of A; else nothing is checked.
     """
     A, B, C, D = system
     n_outputs, n_inputs = D.shape

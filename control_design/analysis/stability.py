@@ -23,6 +23,7 @@ from control_design.plants.multivariable import MultivariablePlant
 from control_design.plants.plant_set import Mode, UncertainPlant, count_integrators, delayed, modes_of
 
 # Determinant of 1 + D_K D_G below which a loop is algebraic, and one that is closed has no defined command.
+# Far above rounding of the 1, far below any loop that somebody would close.
 _SMALLEST_DETERMINANT = 1e-12
 # Relative difference of two sampling times that counts as none: rounding of decimal numbers.
 _SAME_PERIOD = 1e-9
@@ -40,9 +41,10 @@ _NEAR = 1.2
 # Share of its damping ratio that a mode loses before that is told: two digits show no less.
 _LOST = 0.02
 
-# Tolerance of a count of half turns, which comes in steps of 1/2.
+# Tolerance of a count of half turns, which comes in steps of 1/2: half of such a step.
 _HALF_OF_A_STEP = 0.25
-# Widest phase step, rad, between neighbours of a draw that is not counted again on a finer grid.
+# Widest phase step, rad, between neighbours of a draw that is not counted again on a finer grid. Chosen,
+# below the pi/2 that is believed.
 _WIDE_STEP_RAD = np.pi / 3
 # Widest phase step of a count that is believed: below it no turn by pi hides between two points that turn one
 # way and back.
@@ -50,7 +52,7 @@ _WIDEST_STEP_RAD = np.pi / 2
 # A refined count adds points until every phase step is below this: a quarter of what is believed.
 _FINE_STEP_RAD = np.pi / 8
 # Sine of the angle between 1 + L at the lowest frequency and its limit direction at which the grid begins low
-# enough, and the decades by which it is lowered at most, with points per decade.
+# enough. Chosen: the remainder of 0.1 rad is then far from a half turn, and is added to the count.
 _NEAR_LIMIT_DIRECTION = 0.1
 
 # Decades by which it is lowered at most: from 1e-4 to 1e-12 rad/s at 200 Hz, below which all is rounding.
@@ -58,8 +60,8 @@ _MOST_DECADES = 8
 
 # Points in each of these decades, where the response is a power of frequency.
 _POINTS_PER_DECADE = 20
-# Rounds in which wide steps are halved, and the most points: a limit of work for a loop that passes through
-# -1. Steps narrower than this share of their frequency are rounding.
+# Rounds in which wide steps are halved: a limit of work for a loop that passes through -1. Thirty halvings
+# make a step 1e9 times narrower.
 _MOST_ROUNDS = 30
 
 # Most points of a refined count: 30 MB of complex values.
@@ -77,10 +79,11 @@ class NominalLoop:
     plant : UncertainPlant or MultivariablePlant
         Its `nominal` discrete state space counts.
     delay_samples : int
-        Computational delay.
+        Computational delay, not negative (not checked: a negative one counts as none).
     """
 
     def __init__(self, plant: UncertainPlant | MultivariablePlant, delay_samples: int) -> None:
+        """Take the matrices of the plant behind its delay: (n, n), (n, U), (Y, n), (Y, U)."""
         system = delayed(plant.nominal, delay_samples)
         self._a = np.asarray(system.A, dtype=float)
         self._b = np.asarray(system.B, dtype=float)
@@ -93,7 +96,8 @@ class NominalLoop:
         Parameters
         ----------
         a, b, c, d : arrays
-            State space of the controller without delay: (m, m), (m, Y), (U, m), (U, Y).
+            State space of the controller without delay: (m, m), (m, Y), (U, m), (U, Y). Shapes are not
+            checked: numpy raises where they do not fit. Nor is the sampling time, which they do not have.
 
         Returns
         -------
@@ -150,7 +154,10 @@ class ModeChange:
 
     @property
     def loses_damping(self) -> bool:
-        """Whether the damping ratio falls by a share that two digits can show."""
+        """Whether the damping ratio falls by a share that two digits can show.
+
+        No error is possible: an unstable closed-loop mode has a negative ratio.
+        """
         return self.closed_loop.zeta < (1 - _LOST) * self.open_loop.zeta
 
 
@@ -161,12 +168,20 @@ def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeCha
     ----------
     controller : Controller
     plant : UncertainPlant
-        Its nominal modes count: oscillatory pole pairs, each with its frequency and damping ratio.
+        Its `modes` count, those with 0 < zeta < 0.4 below Nyquist, ascending: undamped frequency, rad/s, and
+        damping ratio of each.
 
     Returns
     -------
     tuple of ModeChange
-        Ascending in frequency.
+        Ascending in frequency of the open loop, empty without such modes. `closed_loop` has zeta 1 where the
+        pole no longer swings, and then an infinite frequency where it lies at z = 0.
+
+    Raises
+    ------
+    ValueError, IndexError
+        By numpy, where a loop on the way has fewer finite poles than the plant has modes (an algebraic loop
+        has none). Sampling times are not compared: `closed_loop_poles` does that.
 
     Notes
     -----
@@ -186,8 +201,8 @@ def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeCha
     def follow(before: Complex, low: float, high: float, halvings: int) -> Complex:
         """Poles (M,) at gain `high` that continue those at gain `low`: the nearest ones, each used once.
 
-        Where a pole has not moved clearly less than the way to the next candidate, the step is halved, up to
-        `halvings` times.
+        before (M,), in z. Where a pole has not moved clearly less than the way to the next candidate, the
+        step is halved, up to `halvings` times. With fewer candidates than poles numpy raises an error.
         """
         candidates = poles_at(high)
         distance = np.abs(before[:, None] - candidates[None])
@@ -254,7 +269,10 @@ class NyquistCount:
 
 
 def _steps(value: Complex) -> Real:
-    """Phase steps (..., F - 1), rad, between neighbours on the last axis of values (..., F)."""
+    """Phase steps (..., F - 1), rad, between neighbours on the last axis of values (..., F).
+
+    Between -pi and pi; 0 beside a value of 0, nan beside nan. One value has no steps.
+    """
     return np.asarray(np.angle(value[..., 1:] * np.conj(value[..., :-1])), dtype=np.float64)
 
 
@@ -271,7 +289,9 @@ def half_turns(value: Complex, integrators: int) -> Real:
     Notes
     -----
     The limit directions at both ends are known up to half turns: real at Nyquist, that of j^-integrators at
-    zero frequency. The remainders to them close the count to a multiple of 1/2.
+    zero frequency. The remainders to them close the count to a multiple of 1/2, which is rounded to nine
+    digits (rounding of the sum). Not checked: a nan gives nan, a value of 0 counts as no turn; F = 0 is an
+    IndexError.
     """
     first = np.angle(value[..., 0] * 1j**integrators)
     last = np.angle(value[..., -1])
@@ -286,6 +306,8 @@ def half_turns(value: Complex, integrators: int) -> Real:
 
 def winds(loop_gain: Complex, *, integrators: int, unstable_poles: int) -> tuple[Boolean, Boolean]:
     """Whether 1 + L turns as a stable loop's, and whether some phase step is wider than pi/3, (D,) each.
+
+    Not checked: a draw with nan winds as no stable loop, and has no wide step.
 
     Parameters
     ----------
@@ -315,16 +337,19 @@ def nyquist_count(
     loop_gain : callable
         L (N,) at frequencies (N,), rad/s.
     start : (F,) array
-        First grid, ascending, ending at Nyquist, rad/s.
+        First grid, ascending from above 0, ending at Nyquist, rad/s; at least one (IndexError), else not
+        checked.
     integrators, unstable_poles : int
         Poles of L at z = 1 and outside the circle.
     refinable : bool
         L is known between the points: they are added until every phase step is below pi/8, and the lowest
-        frequency is lowered until F is within 0.1 rad of its limit direction there.
+        frequency is lowered by decades until F is within 0.1 rad of its limit direction there, or of its
+        opposite, since directions are known up to half turns.
 
     Returns
     -------
     NyquistCount
+        `matches` is false where L is not finite somewhere, or a phase step stays as wide as pi/2.
 
     Notes
     -----
@@ -341,6 +366,7 @@ def nyquist_count(
             off_limit_direction = np.angle(value[0] * 1j**integrators)
             if abs(np.sin(off_limit_direction)) < _NEAR_LIMIT_DIRECTION:
                 break
+            # One decade more.
             lower = np.geomspace(omega[0] / 10.0, omega[0], _POINTS_PER_DECADE + 1)[:-1]
             omega = np.concatenate([lower, omega])
             value = np.concatenate([1.0 + loop_gain(lower), value])
@@ -369,6 +395,9 @@ def loop_integrators(controller: Controller, plant: UncertainPlant) -> tuple[int
     """Numbers of integrators and of unstable poles of the loop gain L = G K, nominal plant and controller.
 
     A pole of the controller on the circle away from z = 1 counts as unstable.
+
+    controller: its `poles` in z, without delay (a delay has poles at z = 0). plant: its `n_integrators` and
+    `unstable_poles`. Nothing is checked: both objects have checked themselves.
     """
     poles = controller.poles
     n_controller = count_integrators(poles)

@@ -31,12 +31,14 @@ from control_design.specification.requirement import LoopFunction, WeightedRequi
 # Local maxima of each requirement that a round refines, the largest ones. Chosen; from 2 to 16 no test of the
 # certificate moves.
 _PEAKS = 8
-# Relative distance in frequency below which a mode of the performance channel is one of the plant's.
+# Relative distance in frequency below which a mode of the performance channel is one of the plant's: rounding
+# of two state spaces of one machine.
 _SAME_MODE = 1e-6
 # Frequency around which a controller acts, in bandwidths. Chosen: its roll-off and its notches lie above the
 # bandwidth. It scales parameters and starts of the optimisers, and decides nothing.
 _BANDWIDTHS = 3.0
-# That frequency where neither bandwidth nor mode says it, as a share of Nyquist.
+# That frequency where neither bandwidth nor mode says it, as a share of Nyquist. Chosen: a period of
+# twenty samples, as loops are usually sampled.
 _SHARE_OF_NYQUIST = 0.1
 
 
@@ -60,7 +62,10 @@ class Weighting:
 
     @cached_property
     def size(self) -> Real:
-        """Everything that multiplies the closed-loop function of the member, (F,)."""
+        """Everything that multiplies the closed-loop function of the member, (F,).
+
+        Inf where a weight is infinite (an integrating one at omega = 0, which grids leave out).
+        """
         if self.channel is None:
             return self.magnitude
         return self.magnitude * self.channel
@@ -98,7 +103,10 @@ class PlantData:
         Raises
         ------
         ValueError
-            The plant is known on its own frequencies only, and omega has another one.
+            The plant is known on its own frequencies only, and omega has another one; or its response is not
+            finite at one (`Ellipses`).
+        SpecificationError
+            A mode's peak is limited and the plant has no mode.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         weightings = []
@@ -117,7 +125,10 @@ class PlantData:
         return cls(plant, plant.at(omega), delay, tuple(weightings))
 
     def _largest_of(self, sizes: Iterable[Real]) -> Real:
-        """Largest of several weights (F,) at every frequency, (F,); zeros where there are none."""
+        """Largest of several weights (F,) at every frequency, (F,); zeros where there are none.
+
+        sizes: (F,) each, not checked.
+        """
         nothing = np.zeros(self.delay.size)
         return np.asarray(np.max([nothing, *sizes], axis=0), dtype=np.float64)
 
@@ -134,7 +145,10 @@ class PlantData:
         return self._largest_of(each.magnitude for each in on_sensitivity)
 
     def of(self, kind: type[WeightedRequirement]) -> Real:
-        """Weight (F,) of one kind of requirement; zeros where it is not asked."""
+        """Weight (F,) of one kind of requirement; zeros where it is not asked.
+
+        Times the largest gain of an independent channel. Nothing is checked.
+        """
         return self._largest_of(each.size for each in self.weightings if isinstance(each.requirement, kind))
 
     @property
@@ -152,7 +166,7 @@ class PlantData:
         """Weights (F,) by function of the members, as rows of the optimisers.
 
         Those that are asked at every frequency are one row per function, the largest of them; those of a band
-        come after, each by itself.
+        come after, each by itself. Never empty: the modulus margin is always asked.
         """
         rows: list[tuple[LoopFunction, Real]] = []
         everywhere = [each for each in self.weightings if each.requirement.band is None]
@@ -170,7 +184,7 @@ class PlantData:
         Parameters
         ----------
         k : (F,) complex array
-            Controller values without delay.
+            Controller values without delay, finite and F of them (not checked: nan gives nan).
 
         Returns
         -------
@@ -204,7 +218,10 @@ class PlantData:
 
 
 def worst_of(values: dict[str, Real]) -> Real:
-    """Largest weighted value per frequency, (F,), of what `PlantData.weighted` gives."""
+    """Largest weighted value per frequency, (F,), of what `PlantData.weighted` gives.
+
+    No unit. Without a weighted requirement numpy raises ValueError; the modulus margin is always asked.
+    """
     weighted = [value for name, value in values.items() if name != "distance"]
     return np.asarray(np.max(weighted, axis=0), dtype=np.float64)
 
@@ -236,7 +253,10 @@ class WorstCase:
         return tuple(name for name in self.values if name != "distance")
 
     def joined(self, other: WorstCase) -> WorstCase:
-        """Both on one ascending grid; `other` has other frequencies and the requirements of this one."""
+        """Both on one ascending grid; `other` has other frequencies and the requirements of this one.
+
+        KeyError where `other` lacks a requirement, ValueError where both have a frequency.
+        """
         arrays = [self.loop_factor, *self.values.values()]
         other_arrays = [other.loop_factor, *(other.values[name] for name in self.values)]
         omega, (factor, *values) = joined(self.omega_rad_s, arrays, other.omega_rad_s, other_arrays)
@@ -244,7 +264,10 @@ class WorstCase:
         return WorstCase(omega, ellipses, factor, dict(zip(self.values, values, strict=True)))
 
     def peak(self, kind: str) -> tuple[float, float]:
-        """Largest value of one requirement, and its frequency, rad/s."""
+        """Largest value of one requirement, and its frequency, rad/s.
+
+        KeyError for a requirement that is not asked; nan where a value is nan.
+        """
         index = int(np.argmax(self.values[kind]))
         return float(self.values[kind][index]), float(self.omega_rad_s[index])
 
@@ -267,14 +290,20 @@ def worst_case(
         One that is known on its own frequencies only is not refined.
     specification : Specification
     start : (F,) array
-        First grid, rad/s.
+        First grid, ascending, rad/s, on the plant's own frequencies where it has such.
     rounds : int
-        Each puts nine points between the neighbours of the eight largest local maxima of every requirement:
-        two neighbours are then a fifth as far apart.
+        Three make neighbours of a maximum 125 times nearer to each other; 0 leaves the grid. Each puts nine
+        points between the neighbours of the eight largest local maxima of every requirement: two neighbours
+        are then a fifth as far apart.
 
     Returns
     -------
     WorstCase
+
+    Raises
+    ------
+    ValueError
+        What `PlantData.build` refuses.
     """
 
     def evaluated(omega: Real) -> WorstCase:
@@ -306,6 +335,11 @@ class Grids:
     options : GridOptions
         Numbers of points.
 
+    Raises
+    ------
+    ValueError
+        What `programme_grid` and `PlantData.build` refuse, among it a peak of a mode that a plant has not.
+
     Attributes
     ----------
     grids : list of (F,) arrays
@@ -317,6 +351,7 @@ class Grids:
     def __init__(
         self, plants: Sequence[UncertainPlant], specification: Specification, options: GridOptions
     ) -> None:
+        """Put every plant on its two grids, and its dense data with them."""
         self.plants = tuple(plants)
         self.spec = specification
         self.grids: list[Real] = []
@@ -336,7 +371,10 @@ class Grids:
             self.dense.append(PlantData.build(plant, specification, dense))
 
     def lean(self, grids: Sequence[Real] | None = None) -> list[PlantData]:
-        """Every plant on its lean grid, as it is now or as given, rad/s."""
+        """Every plant on its lean grid, as it is now or as given, rad/s.
+
+        ValueError for another number of grids than plants, and what `PlantData.build` refuses.
+        """
         used = self.grids if grids is None else grids
         pairs = zip(self.plants, used, strict=True)
         return [PlantData.build(plant, self.spec, grid) for plant, grid in pairs]
@@ -345,7 +383,9 @@ class Grids:
     def scale_rad_s(self) -> float:
         """Frequency around which the controller has to act, rad/s.
 
-        Geometric mean of three bandwidths and the lowest mode of every plant; a tenth of Nyquist without any.
+        Geometric mean of three times the bandwidth (of `bandwidth_rad_s` only, no weight counts) and the
+        first and lowest mode of each plant; without any of them a tenth of the first plant's Nyquist
+        frequency. IndexError without plants and bandwidth.
         """
         candidates = [mode.omega_rad_s for plant in self.plants for mode in plant.modes[:1]]
         if self.spec.bandwidth_rad_s is not None:
@@ -356,7 +396,10 @@ class Grids:
 
 
 def _is_among(mode: Mode, modes: Sequence[Mode]) -> bool:
-    """Whether one of the modes has the mode's frequency, but for `_SAME_MODE`."""
+    """Whether one of the modes has the mode's frequency, but for `_SAME_MODE`.
+
+    Frequencies in rad/s; damping is not compared. False for no modes.
+    """
     for other in modes:
         difference = abs(mode.omega_rad_s - other.omega_rad_s)
         if not difference > _SAME_MODE * other.omega_rad_s:
