@@ -61,7 +61,9 @@ class MultivariableSpecification(Settings):
     structure: Literal["full", "decentralised"] | tuple[tuple[bool, ...], ...] = Field(
         default="full", description="which entries of K (actuators x sensors) may differ from zero"
     )
+    # Chosen, default and limit: 6 is an integrator and a pair of poles for each of two joints.
     controller_order: int = Field(default=6, ge=0, le=40, description="number of controller states")
+    # Chosen: lighter pairs would ring by themselves; as light as a lightly damped arm.
     controller_damping: float = Field(
         default=0.02, gt=0, le=1, description="smallest damping ratio of the controller's own pole pairs"
     )
@@ -80,7 +82,10 @@ class MultivariableSpecification(Settings):
 
     @property
     def computational_delay_samples(self) -> int:
-        """Samples between measuring and applying the commands, the same for all joints."""
+        """Samples between measuring and applying the commands, the same for all joints.
+
+        Validation has made sure of both: one joint at least, one delay.
+        """
         return self.joints[0].computational_delay_samples
 
     def pattern(self, inputs: int, outputs: int) -> Boolean:
@@ -115,6 +120,9 @@ class MultivariableSpecification(Settings):
         """Weights of the requirements "tracking", "effort" and "modulus" that are asked of some channel.
 
         inputs, outputs: numbers U and Y of the plant; joints beyond them are left out.
+
+        W(s) of each channel, s in rad/s. Not checked: the number of joints, which `pattern` refuses; of too
+        few the missing channels have no entry.
         """
         # Tracking and modulus margin are about outputs, effort about actuators.
         at_outputs = self.joints[:outputs]
@@ -135,7 +143,10 @@ class MultivariableSpecification(Settings):
         return asked
 
     def limits(self, inputs: int) -> tuple[tuple[float | None, ...], tuple[float | None, ...]]:
-        """Input limits and rate limits of the U actuators, in input units (per second); None: no limit."""
+        """Input limits and rate limits of the U actuators, in input units (per second); None: no limit.
+
+        inputs: U; with fewer joints the missing ones have no entry (`pattern` refuses that).
+        """
         at_inputs = self.joints[:inputs]
         input_limits = tuple(joint.input_limit for joint in at_inputs)
         rate_limits = tuple(joint.rate_limit for joint in at_inputs)
@@ -143,7 +154,10 @@ class MultivariableSpecification(Settings):
 
 
 def gram(weights: tuple[RationalWeight | None, ...], s: Complex) -> Real:
-    """W^H W (F, n, n) of a diagonal of n weights at complex s (F,); zero where a weight is None."""
+    """W^H W (F, n, n) of a diagonal of n weights at complex s (F,); zero where a weight is None.
+
+    s in rad/s. No weight at all is numpy's ValueError; inf at a pole of a weight.
+    """
     squares: list[Real] = []
     for weight in weights:
         if weight is None:

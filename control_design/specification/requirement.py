@@ -91,7 +91,10 @@ class SpecificationItem:
 
     @property
     def only_unproved(self) -> bool:
-        """Whether `achieved` is enough and what was proved of it for all frequencies is not."""
+        """Whether `achieved` is enough and what was proved of it for all frequencies is not.
+
+        A nan in either number is no yes.
+        """
         if self.met or self.bound is None:
             return False
         # The limit lies between the two.
@@ -116,10 +119,11 @@ class Findings:
     modulus : (float, float or None)
         Smallest distance from -1, and where, rad/s; nan and None where the loop is not stable.
     delay_s : float
-        Worst delay margin, s.
+        Worst delay margin, s; inf without a crossing, nan where the loop is not stable.
     modes : sequence of Mode
-        Oscillatory pole pairs of the nominal closed loop.
+        Oscillatory pole pairs of the nominal closed loop: rad/s and damping ratio of each.
     controller : Controller
+        Its `poles` in z and `dt_s` are read by requirements on it alone.
     """
 
     plant: str
@@ -131,7 +135,10 @@ class Findings:
     controller: Controller
 
     def proved(self, name: str) -> bool:
-        """Whether a requirement is shown to hold for all frequencies, where that can be shown at all."""
+        """Whether a requirement is shown to hold for all frequencies, where that can be shown at all.
+
+        name: of the requirement; without a bound of its own it is not shown. True where `bounds` is None.
+        """
         return self.bounds is None or self.bounds.get(name, np.inf) <= 1.0 + _PROOF_SLACK
 
 
@@ -142,7 +149,10 @@ class Requirement(ABC):
 
     @abstractmethod
     def check(self, found: Findings) -> SpecificationItem:
-        """Met or not, and the number that decides."""
+        """Met or not, and the number that decides.
+
+        A number that is nan meets nothing.
+        """
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +166,7 @@ class WeightedRequirement(Requirement):
     function : LoopFunction
         The closed-loop function f.
     weight : RationalWeight
-        W(s), seen through the Tustin frequency.
+        W(s), seen through the Tustin frequency s = j (2/dt) tan(omega dt/2), rad/s.
     band : (float, float) or None
         Frequencies, rad/s, where it is asked; None: all.
     above : float
@@ -183,7 +193,11 @@ class WeightedRequirement(Requirement):
         return LoopFunction.SENSITIVITY
 
     def magnitude(self, omega_rad_s: Real, dt_s: float) -> Real:
-        """|W| (F,) at omega (F,), 0 where nothing is asked; without the independent channel."""
+        """|W| (F,) at omega (F,), 0 where nothing is asked; without the independent channel.
+
+        omega in rad/s, dt_s in seconds. At Nyquist s is infinite but for rounding, and W has its value there.
+        Inf where the weight has a pole on omega; nothing is checked.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         size = np.abs(self.weight.at(imaginary_axis(omega, dt_s)))
         size = np.where(size > self.above, size, 0.0)
@@ -194,7 +208,11 @@ class WeightedRequirement(Requirement):
         return np.asarray(size, dtype=np.float64)
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item with the largest |W f|, met where it and its bound, if one can be had, are at most 1."""
+        """Item with the largest |W f|, met where it and its bound, if one can be had, are at most 1.
+
+        KeyError where `found.peaks` has no value of this requirement; nan (a loop that is not stable) is not
+        met.
+        """
         value, omega_rad_s = found.peaks[self.name]
         bound = None
         if found.bounds is not None:
@@ -213,5 +231,8 @@ class WeightedRequirement(Requirement):
 
 
 def constant_weight(value: float) -> RationalWeight:
-    """W = value at all frequencies."""
+    """W = value at all frequencies.
+
+    pydantic's ValidationError, a ValueError, where it is 0 or not finite.
+    """
     return RationalWeight(numerator=(value,), denominator=(1.0,))

@@ -55,27 +55,30 @@ _BAND_OF_MODE = 1.5
 # Frequency, rad per sample, below which an integrating plant is its integrator and no more: a band that
 # starts there has no finite open-loop peak. Ten times the lowest frequency of the grids.
 _INTEGRATES_BELOW_RAD = 5e-6
-# Distance of a zero from z = 1 that an integrator would cancel.
+# Distance of a zero from z = 1 that an integrator would cancel: rounding of a zero that is at 1, whose double
+# splits by 1e-8.
 _ZERO_AT_ONE = 1e-6
 # Modulus beyond which a zero lies outside the circle, but for rounding.
 _OUTSIDE_CIRCLE = 1.0 + 1e-9
 # Halvings with which the largest possible bandwidth is told: more than a double has digits.
 _HALVINGS = 60
-# Frequencies at which tracking and effort are compared, and those at which an open-loop peak is sought.
+# Frequencies at which tracking and effort are compared, 0.4 % from one to the next. Chosen; a conflict that
+# is narrower is found later, by the certificate.
 _POINTS_OF_CONFLICT = 4000
 
-# Frequencies, on a logarithmic scale, at which an open-loop peak is sought before the modes get their own.
+# Frequencies, on a logarithmic scale, at which an open-loop peak is sought before the modes get their own:
+# 0.04 % from one to the next in a band of a factor 2.25. Chosen.
 _POINTS_OF_PEAK = 2000
-# Points around each mode where that peak is sought, in 10 half widths of the mode (sinh 3) either side, and
-# the damping ratio that they take at least.
+# Points around each mode where that peak is sought: twenty in each half width next to its middle, so that the
+# peak is met within 0.1 %.
 _POINTS_OF_MODE = 121
 
-# Reach of these points: sinh 3 = 10 half widths either side.
+# Reach of these points, sinh 3 = 10 half widths either side, where a mode is a tenth of its peak.
 _REACH_OF_MODE = 3
 
 # Damping ratio that they take at least, so that they are different numbers.
 _LEAST_DAMPING = 1e-9
-# Keeps a quotient and a bandwidth above zero.
+# Least divisor, and least bandwidth, rad/s: keeps both above zero.
 _TINY = 1e-300
 
 
@@ -96,12 +99,14 @@ class Specification(Settings):
         "bandwidth_rad_s as it stands",
     )
     integrator: bool = Field(default=False, description="the controller has a pole at z = 1")
+    # Chosen: 60 dB.
     low_frequency_rejection: float = Field(
         default=1e-3,
         gt=0,
         lt=1,
         description="largest |S| towards zero frequency; with bandwidth_rad_s and without integrator",
     )
+    # The usual: |S| of at most 2, hence a gain margin of 2 and a phase margin of 29 degrees.
     modulus_margin: float = Field(
         default=0.5, gt=0, lt=1, description="smallest distance of the loop from -1 (1/max|S|)"
     )
@@ -136,6 +141,7 @@ class Specification(Settings):
     rate_limit: _Positive | None = Field(
         default=None, description="largest change of the command, input unit per second"
     )
+    # Chosen: 4 is an integrator, a lead and one notch; 16 leaves room for seven notches.
     controller_order: Annotated[int, Field(ge=1, le=16)] | Literal["auto"] = Field(
         default=4,
         description="number of controller states, with lowest_bandwidth_rad_s at most: fewer where the step "
@@ -159,6 +165,8 @@ class Specification(Settings):
         description="period of the new controller, s: a whole multiple or part of the step of the logs; "
         "default: that step (certificate, simulation and C code are about this rate)",
     )
+    # One sample: the usual of a controller that computes during a period. At most 10, chosen: more is a
+    # mistake.
     computational_delay_samples: int = Field(
         default=1,
         ge=0,
@@ -251,6 +259,9 @@ class Specification(Settings):
 
         plant: whose slow poles add to the slope that an integrator of the controller asks for; None: a plant
         without any.
+
+        Of the plant its poles, zeros and integrators are read; W1 is a rational function of s, rad/s. Not
+        checked: the bandwidth against Nyquist (`check_against` does that).
         """
         if self.sensitivity_weight is not None or self.bandwidth_rad_s is None:
             return self.sensitivity_weight
@@ -265,7 +276,10 @@ class Specification(Settings):
         return bandwidth_weight(self.bandwidth_rad_s, self.modulus_margin, floor, slow_poles_rad_s=slow_poles)
 
     def limit_weight(self) -> RationalWeight | None:
-        """W3, or None where effort is not limited."""
+        """W3, or None where effort is not limited.
+
+        W3 is a rational function of s, rad/s. Validation has checked its parts.
+        """
         if self.effort_weight is not None or self.effort_limit is None:
             return self.effort_weight
         return effort_limit_weight(self.effort_limit, self.effort_rolloff_rad_s)
@@ -277,6 +291,8 @@ class Specification(Settings):
         ------
         SpecificationError
             Damping of a mode is asked for, and the plant has none.
+        ValueError
+            By numpy, where the mode's band begins above Nyquist; `check_against` refuses that before.
         """
         requirements: list[Requirement] = []
         for kind in REQUIREMENTS:
@@ -286,12 +302,18 @@ class Specification(Settings):
         return tuple(requirements)
 
     def weighted(self, plant: UncertainPlant) -> tuple[WeightedRequirement, ...]:
-        """The requirements on the loop of one plant that bound a closed-loop function."""
+        """The requirements on the loop of one plant that bound a closed-loop function.
+
+        Never empty: the modulus margin is one of them. Raises what `requirements` raises.
+        """
         requirements = self.requirements(plant)
         return tuple(each for each in requirements if isinstance(each, WeightedRequirement))
 
     def on_controller(self) -> tuple[Requirement, ...]:
-        """Requirements on the controller alone."""
+        """Requirements on the controller alone.
+
+        Empty where none is asked; nothing can be refused.
+        """
         requirements: list[Requirement] = []
         if self.controller_damping is not None:
             requirements.append(ControllerDamping(self.controller_damping))
@@ -300,7 +322,11 @@ class Specification(Settings):
         return tuple(requirements)
 
     def magnitude(self, plant: UncertainPlant, omega_rad_s: Real, function: LoopFunction) -> Real:
-        """|W| (F,) on one closed-loop function, all requirements on it together; zeros where none is."""
+        """|W| (F,) on one closed-loop function, all requirements on it together; zeros where none is.
+
+        omega_rad_s (F,), rad/s; function: S, K S, G S or T, as it is asked of the plant. Raises what
+        `requirements` raises; omega is not checked.
+        """
         sizes = [
             each.magnitude(omega_rad_s, plant.dt_s)
             for each in self.weighted(plant)
@@ -316,7 +342,8 @@ class Specification(Settings):
         Raises
         ------
         SpecificationError
-            One line, with both steps.
+            One line, with both steps, for the first such plant. Nothing is refused without `controller_dt_s`,
+            or without plants.
         """
         wanted_s = self.controller_dt_s
         if wanted_s is None:
@@ -374,7 +401,10 @@ class Tracking(WeightedRequirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> Tracking | None:
-        """Requirement with the specification's weight for this plant; None where tracking is not asked."""
+        """Requirement with the specification's weight for this plant; None where tracking is not asked.
+
+        spec: its bandwidth or sensitivity weight. Raises nothing.
+        """
         weight = spec.tracking_weight(plant)
         if weight is None:
             return None
@@ -391,11 +421,17 @@ class ModulusMargin(WeightedRequirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> ModulusMargin:
-        """Requirement with the specification's margin; always asked."""
+        """Requirement with the specification's margin; always asked.
+
+        Raises nothing: validation has put the margin between 0 and 1.
+        """
         return cls(constant_weight(spec.modulus_margin))
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item in terms of the distance from -1 itself, of which a bound of |m S| makes a lower bound."""
+        """Item in terms of the distance from -1 itself, of which a bound of |m S| makes a lower bound.
+
+        found: `modulus` (distance, rad/s) and `bounds` are read. A nan distance is not met.
+        """
         wanted = self.weight.numerator[0]
         achieved, omega_rad_s = found.modulus
         bound = None
@@ -423,7 +459,10 @@ class Effort(WeightedRequirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> Effort | None:
-        """Requirement with the specification's weight; None where effort is not limited."""
+        """Requirement with the specification's weight; None where effort is not limited.
+
+        Raises nothing; the plant is not read.
+        """
         weight = spec.limit_weight()
         if weight is None:
             return None
@@ -445,6 +484,8 @@ class ModePeak(WeightedRequirement):
         ------
         SpecificationError
             The plant has no flexible mode and no band is given.
+        ValueError
+            By numpy, where the band begins above Nyquist (`check_against` refuses that before).
         """
         if spec.mode_peak_ratio is None:
             return None
@@ -457,6 +498,7 @@ class ModePeak(WeightedRequirement):
                 )
             lowest_rad_s = modes[0].omega_rad_s
             band = (lowest_rad_s / _BAND_OF_MODE, lowest_rad_s * _BAND_OF_MODE)
+        # Above Nyquist there is no response to take a peak of.
         band_end = min(band[1], plant.nyquist_rad_s)
         open_loop_peak = _nominal_peak(plant.damped, band[0], band_end)
         weight = constant_weight(1.0 / (spec.mode_peak_ratio * open_loop_peak))
@@ -466,7 +508,11 @@ class ModePeak(WeightedRequirement):
 # Kept for the last 32 channels and bands: every grid of a synthesis asks for the requirements of its plant.
 @lru_cache(maxsize=32)
 def _nominal_peak(channel: PlantChannel, low_rad_s: float, high_rad_s: float) -> float:
-    """Largest nominal gain |Gp| of a channel in a band, on a grid that is finer around its modes."""
+    """Largest nominal gain |Gp| of a channel in a band, on a grid that is finer around its modes.
+
+    low_rad_s, high_rad_s: ends of the band, 0 < low < high, not checked: an empty band is numpy's ValueError,
+    a band with an integrator's pole gives a huge value. Units of output per input.
+    """
     omega = np.geomspace(low_rad_s, high_rad_s, _POINTS_OF_PEAK)
     for mode in channel.modes:
         half_width = max(mode.zeta, _LEAST_DAMPING) * mode.omega_rad_s
@@ -486,13 +532,19 @@ class DelayMargin(Requirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> DelayMargin | None:
-        """Requirement with the specification's delay; None where it is not asked."""
+        """Requirement with the specification's delay; None where it is not asked.
+
+        Raises nothing; the plant is not read.
+        """
         if spec.delay_margin_s is None:
             return None
         return cls(spec.delay_margin_s)
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item with the worst delay margin, s."""
+        """Item with the worst delay margin, s.
+
+        found: `delay_s` is read; nan, of a loop that is not stable, is not met.
+        """
         return SpecificationItem(
             requirement=self.caption,
             plant=found.plant,
@@ -514,13 +566,19 @@ class ModeDamping(Requirement):
 
     @classmethod
     def of(cls, spec: Specification, plant: UncertainPlant) -> ModeDamping | None:
-        """Requirement with the specification's ratio and band; None where it is not asked."""
+        """Requirement with the specification's ratio and band; None where it is not asked.
+
+        Raises nothing: validation asks for a band with the ratio. The plant is not read.
+        """
         if spec.mode_damping is None or spec.mode_band_rad_s is None:
             return None
         return cls(spec.mode_damping, spec.mode_band_rad_s)
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item with the smallest damping ratio in the band; 1, and no frequency, without a mode there."""
+        """Item with the smallest damping ratio in the band; 1, and no frequency, without a mode there.
+
+        found: `modes` are read, also those of a loop that is not stable (zeta negative).
+        """
         low_rad_s, high_rad_s = self.band
         inside = [mode for mode in found.modes if low_rad_s <= mode.omega_rad_s <= high_rad_s]
         achieved = 1.0
@@ -555,7 +613,11 @@ class ControllerDamping(Requirement):
     caption = "damping ratio of the controller's own poles"
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item with the smallest damping ratio of the controller's pole pairs; 1 without a pair."""
+        """Item with the smallest damping ratio of the controller's pole pairs; 1 without a pair.
+
+        found: `controller` with `poles` in z and `dt_s` is read. A pole at z = -1 has no place in Tustin's
+        plane: numpy warns, and it is no pair.
+        """
         # In Tustin's plane, where the cascade and its bound live: ln z would call fast pairs less damped.
         poles = found.controller.poles
         w = 2 / found.controller.dt_s * (poles - 1) / (poles + 1)
@@ -588,7 +650,10 @@ class ControllerIntegrator(Requirement):
     caption = "integrators in the controller"
 
     def check(self, found: Findings) -> SpecificationItem:
-        """Item with the number of such poles."""
+        """Item with the number of such poles.
+
+        found: `controller.poles` in z are counted by `count_integrators`; at least one is met.
+        """
         n_integrators = count_integrators(found.controller.poles)
         return SpecificationItem(
             requirement=self.caption,
@@ -607,7 +672,11 @@ REQUIREMENTS = (ModulusMargin, Tracking, Effort, ModePeak, DelayMargin, ModeDamp
 
 
 def _refuse_frequencies(spec: Specification, plant: UncertainPlant) -> None:
-    """Raise SpecificationError for a frequency that the plant's sampling, integrator or zeros rule out."""
+    """Raise SpecificationError for a frequency that the plant's sampling, integrator or zeros rule out.
+
+    plant: `nyquist_rad_s`, `n_integrators`, `zeros` and `dt_s` of its nominal are read. Returns nothing where
+    all is well.
+    """
     nyquist = plant.nyquist_rad_s
     for name in ("bandwidth_rad_s", "effort_rolloff_rad_s"):
         value = getattr(spec, name)
@@ -637,6 +706,8 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
 
     There S = 1 for every stable loop, so |W1| must not exceed 1. The message names the zero and, of a
     bandwidth, the largest that is possible there.
+
+    plant: zeros in z and D of its nominal are read. A zero on the circle is not looked at.
     """
     # In the Tustin plane; the sample of delay's zero at z = infinity is w = 2/dt, the last.
     is_outside = np.abs(plant.zeros) > _OUTSIDE_CIRCLE
@@ -685,6 +756,9 @@ def _refuse_effort(spec: Specification, plant: UncertainPlant) -> None:
     """Raise SpecificationError where tracking needs more effort than its limit allows, at some frequency.
 
     1 = S + G K S gives gamma >= 1 / (1/|W1| + |G|/|W3|) there.
+
+    Raises also what `Specification.requirements` raises. Not checked: a plant whose gain is 0 at such a
+    frequency, where the needed effort is shown as inf.
     """
     # The nominal plant on a grid: a necessary condition, so points between may be missed.
     lowest = lowest_rad_s(plant.dt_s, plant.poles)
