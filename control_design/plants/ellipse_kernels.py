@@ -34,7 +34,10 @@ _TINY = 1e-300
 @numba.njit(**INSIDE)
 def _secular_root(p: float, q: float, c: float, d: float) -> Any:
     """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d >= 0; 0 where the left side is below 1
-    at t = 0. The left side is convex and decreasing, so Newton's method from the left never overshoots."""
+    at t = 0. The left side is convex and decreasing, so Newton's method from the left never overshoots.
+
+    All are of one unit, that of a square of lengths. Nothing is checked: of a nan the root means nothing.
+    """
     # Lower bounds of the root: each term alone <= 1. Both make the sum >= 1, where Newton is monotone.
     t = max(max(p - c, q - d), 0.0)
     for _ in range(_MOST_STEPS):
@@ -48,6 +51,7 @@ def _secular_root(p: float, q: float, c: float, d: float) -> Any:
         if value > 0 and slope < 0:
             step = -value / slope
         t += step
+        # Relative, but not below the rounding of lengths, which callers scale to 1 at most.
         if not step > _ROUNDING_SHARE * (t + 1e-16):
             break
     return t
@@ -56,7 +60,10 @@ def _secular_root(p: float, q: float, c: float, d: float) -> Any:
 @numba.njit(**INSIDE)
 def _nearest(point: complex, semi_major: float, semi_minor: float) -> Any:
     """Distance from `point` to the filled ellipse; 0 inside. By symmetry the point is taken to the first
-    quadrant, and everything is divided by the largest size, so that squares neither overflow nor vanish."""
+    quadrant, and everything is divided by the largest size, so that squares neither overflow nor vanish.
+
+    In the unit of the point. Not checked: semi_major >= semi_minor >= 0, and that all are finite.
+    """
     scale = max(max(abs(point.real), abs(point.imag)), max(semi_major, _TINY))
     x = abs(point.real) / scale
     y = abs(point.imag) / scale
@@ -88,7 +95,10 @@ def _nearest(point: complex, semi_major: float, semi_minor: float) -> Any:
 @numba.njit(**INSIDE)
 def _farthest(point: complex, semi_major: float, semi_minor: float) -> Any:
     """Distance from `point` to the farthest member of the ellipse, which lies in the quadrant opposite to the
-    point at (-a cos f, -b sin f). Scaled as in `_nearest`."""
+    point at (-a cos f, -b sin f). Scaled as in `_nearest`.
+
+    In the unit of the point; nothing is checked either.
+    """
     scale = max(max(abs(point.real), abs(point.imag)), max(semi_major, _TINY))
     x = abs(point.real) / scale
     y = abs(point.imag) / scale
@@ -110,19 +120,28 @@ def _farthest(point: complex, semi_major: float, semi_minor: float) -> Any:
 
 @_elementwise(cache=True)
 def root_of_each(p: float, q: float, c: float, d: float) -> Any:
-    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1, element by element; see `_secular_root`."""
+    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1, element by element; see `_secular_root`.
+
+    (F,) arrays or numbers, which broadcast; nothing is checked.
+    """
     return _secular_root(p, q, c, d)
 
 
 @_elementwise(cache=True)
 def nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
-    """Distance from each point to the nearest member of its ellipse; 0 inside."""
+    """Distance from each point to the nearest member of its ellipse; 0 inside.
+
+    point complex (F,), half axes real (F,), all of one unit; nothing is checked.
+    """
     return _nearest(point, semi_major, semi_minor)
 
 
 @_elementwise(cache=True)
 def farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
-    """Distance from each point to the farthest member of its ellipse."""
+    """Distance from each point to the farthest member of its ellipse.
+
+    point complex (F,), half axes real (F,), all of one unit; nothing is checked.
+    """
     return _farthest(point, semi_major, semi_minor)
 
 
@@ -146,12 +165,15 @@ def bisected(
     semi_major, semi_minor: the ellipse. For h = mid the members with a ratio of at most h are a disc around
     g0, or everything outside of one where h |k| > |alpha| (an Apollonius circle; the formulas stand in
     `largest_ratio`).
+
+    Nothing is checked: of a nan, or of ends in the wrong order, the result means nothing.
     """
     for _ in range(_MOST_STEPS):
         mid = 0.5 * (low + high)
         alpha_square = abs(alpha) ** 2
         k_square = (mid * abs(k)) ** 2
-        # A half-plane is the limit of disc and outside of a disc: a gap of rounding size stands for it.
+        # A half-plane is the limit of disc and outside of a disc: a gap of rounding size (some hundred
+        # roundings of the squares that it is the difference of) stands for it.
         smallest_gap = 1e-13 * (alpha_square + k_square) + _TINY
         gap = alpha_square - k_square
         if abs(gap) < smallest_gap:

@@ -30,7 +30,10 @@ _ROUNDING_SHARE = 1e-9
 
 def radius_of(level: float) -> float:
     """Radius, in standard deviations, of the ellipse that holds a Gaussian of the plane with probability
-    `level` in (0, 1): the root of the chi-square quantile with two degrees of freedom, 2.45 for .95."""
+    `level` in (0, 1): the root of the chi-square quantile with two degrees of freedom, 2.45 for .95.
+
+    Not checked: inf at 1 and nan beyond, with numpy's warning.
+    """
     return float(np.sqrt(-2.0 * np.log1p(-level)))
 
 
@@ -38,6 +41,8 @@ def quotient(above: Any, below: Real, otherwise: float = 0.0) -> Any:
     """above/below where below is positive, `otherwise` elsewhere.
 
     above is real or complex, below real; their shapes broadcast and no warning is given.
+
+    Nan below counts as not positive. Shapes that do not broadcast are numpy's ValueError.
     """
     positive = below > 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
@@ -74,7 +79,10 @@ class EvaluableUncertainty(Protocol):
     """Uncertainty known at any frequency; `ident.uncertainty.ResponsePosterior` is one."""
 
     def at(self, omega_rad_s: Real, level: float) -> ResponseSet:
-        """Responses and covariances at omega (F,) in rad/s, for ellipses of that level."""
+        """Responses and covariances at omega (F,) in rad/s, for ellipses of that level.
+
+        Nothing is promised for a bad level: `Ellipses.from_covariance` checks it, and shapes and values.
+        """
         ...
 
 
@@ -164,6 +172,7 @@ class Ellipses:
         large = trace / 2 + np.hypot(difference / 2, cross)
         determinant = real_variance * imag_variance - cross * cross_below
         small = quotient(determinant, large)
+        # Above zero, so that an ellipse of no size passes.
         tolerance = _ROUNDING_SHARE * np.abs(large) + 1e-300
         symmetric = np.abs(cross - cross_below) <= tolerance
         good = np.isfinite(trace) & (large >= 0) & (small >= -tolerance) & symmetric
@@ -182,16 +191,25 @@ class Ellipses:
 
     @classmethod
     def of_no_size(cls, omega_rad_s: Real, response: Complex) -> Ellipses:
-        """Ellipses of size zero around a response (F,) that is known exactly at omega (F,) in rad/s."""
+        """Ellipses of size zero around a response (F,) that is known exactly at omega (F,) in rad/s.
+
+        ValueError where the response is not finite or shapes differ.
+        """
         zero = np.zeros(omega_rad_s.size)
         return cls(omega_rad_s, response, zero, zero, np.ones(zero.size, np.complex128))
 
     def scaled(self, factor: float) -> Ellipses:
-        """Ellipses with both axes times a factor >= 0, their centres where they are."""
+        """Ellipses with both axes times a factor >= 0, their centres where they are.
+
+        A negative factor is the constructor's ValueError.
+        """
         return replace(self, semi_major=factor * self.semi_major, semi_minor=factor * self.semi_minor)
 
     def subset(self, index: Integer | Boolean) -> Ellipses:
-        """The ellipses at the given positions (N,), integers or a mask (F,)."""
+        """The ellipses at the given positions (N,), integers or a mask (F,).
+
+        IndexError for a position that is not there; ValueError where integers do not ascend.
+        """
         return Ellipses(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def joined(self, other: Ellipses) -> Ellipses:
@@ -210,12 +228,17 @@ class Ellipses:
         d1, d2 : (..., F) arrays
             Coordinates along major and minor axis in units of the half axes; in the ellipse for
             d1^2 + d2^2 <= 1.
+
+        Not checked: that d1, d2 lie inside; shapes must broadcast with (F,).
         """
         offset = self.semi_major * d1 + 1j * self.semi_minor * d2
         return np.asarray(self.centre + self.direction * offset, dtype=np.complex128)
 
     def farthest(self) -> Real:
-        """Largest |G| over each ellipse, (F,)."""
+        """Largest |G| over each ellipse, (F,).
+
+        In units of output per input.
+        """
         origin_seen_from_ellipse = -self.centre * np.conj(self.direction)
         return farthest_distance(origin_seen_from_ellipse, self.semi_major, self.semi_minor)
 
@@ -229,8 +252,11 @@ def _compiled() -> Any:
 
 def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
     """Root t >= 0 (F,) of (p/(c + t))^2 + (q/(d + t))^2 = 1 for p, q, c, d (F,), none negative; 0 where the
-    left side is below 1 at t = 0. The condition of a nearest or farthest point of an ellipse comes to it."""
-    # Compiled loops divide first and choose then.
+    left side is below 1 at t = 0. The condition of a nearest or farthest point of an ellipse comes to it.
+
+    Shapes broadcast. Nothing is checked.
+    """
+    # Compiled loops divide first and choose then, so numpy would warn of quotients that are not used.
     with np.errstate(all="ignore"):
         return np.asarray(_compiled().root_of_each(p, q, c, d), dtype=np.float64)
 
@@ -241,6 +267,8 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
 
     With half axes a, b and the point (x, y), the nearest member is (a^2 x/(a^2 + t), b^2 y/(b^2 + t)), where
     t is the `secular_root` for p = a x, q = b y, c = a^2, d = b^2.
+
+    All of one unit. Not checked: a >= b >= 0, and that all are finite.
     """
     with np.errstate(all="ignore"):
         return np.asarray(_compiled().nearest_of_each(point, semi_major, semi_minor), dtype=np.float64)
@@ -252,6 +280,8 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
 
     With half axes a >= b and the point (x, y) in the first quadrant, the multiplier m is the largest root of
     (a x/(m - a^2))^2 + (b y/(m - b^2))^2 = 1, so n = m - a^2 is a `secular_root` for c = 0, d = a^2 - b^2.
+
+    All of one unit. Not checked: a >= b >= 0.
     """
     with np.errstate(all="ignore"):
         return np.asarray(_compiled().farthest_of_each(point, semi_major, semi_minor), dtype=np.float64)
@@ -262,6 +292,8 @@ def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
 
     k : (F,) complex array
         The controller's response with its delay, at the frequencies of the ellipses.
+
+    No unit. Not checked: k is finite; of another length numpy raises ValueError.
     """
     size = np.abs(k)
     # 1 + G k = k u1 (conj(u1) (centre + 1/k) + s1 d1 + j s2 d2). With k (centre + 1/k) = 1 + k centre the
@@ -278,6 +310,8 @@ def scale_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
 
     Below 1 the ellipse covers -1, the deeper the smaller; inf where no size of it does (k = 0, or an axis of
     length zero in the way).
+
+    Not checked: a k that is not finite gives inf or nan.
     """
     # -1/k seen from the ellipse: its coordinates along the axes, in units of the half axes.
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -291,7 +325,10 @@ def scale_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
 
 
 def largest_disturbance_gain(k: Complex, ellipses: Ellipses) -> Real:
-    """Largest |G / (1 + G k)| over G in each ellipse, (F,): `largest_ratio` with alpha = 1, beta = 0."""
+    """Largest |G / (1 + G k)| over G in each ellipse, (F,): `largest_ratio` with alpha = 1, beta = 0.
+
+    In units of output per input; inf where a member puts the loop on -1.
+    """
     return largest_ratio(np.ones_like(k), np.zeros_like(k), k, ellipses)
 
 
@@ -309,12 +346,13 @@ def largest_ratio(
     ellipses : Ellipses
         Of the plant at F frequencies.
     accuracy : float
-        Relative; the bisection ends there.
+        Relative; the bisection ends there. 1e-13 is some five hundred roundings of doubles.
 
     Returns
     -------
     (F,) array
-        Rounded up by at most the accuracy; inf where some member has 1 + k G = 0.
+        Rounded up by at most the accuracy; inf where some member has 1 + k G = 0. Values that are not finite
+        are not checked; shapes that do not broadcast are numpy's ValueError.
 
     Notes
     -----
@@ -330,6 +368,7 @@ def largest_ratio(
     centre_denominator = np.abs(1.0 + k * ellipses.centre)
     largest_numerator = centre_numerator + np.abs(alpha) * ellipses.semi_major
     upper = largest_numerator / np.where(blocked, 1.0, distance)
+    # Where the centre itself is on -1 the quotient is not used: it only has to be a number.
     low = centre_numerator / np.maximum(centre_denominator, 1e-300)
     # A little above, so that rounding of the two ends does not begin the bisection with an empty interval.
     high = np.maximum(upper, low) * (1 + 1e-12) + 1e-300

@@ -46,6 +46,11 @@ class FrequencyIntervals:
         rad/s.
     dt_s : float
         Sampling period in seconds.
+
+    Notes
+    -----
+    Nothing is checked: who cuts the intervals gives half widths that are not negative. Expansions that it
+    makes have slopes in 1/(rad/s).
     """
 
     centre: Real
@@ -59,7 +64,10 @@ class FrequencyIntervals:
         return np.asarray(-2.0 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta), dtype=np.complex128)
 
     def distance_to(self, root_minus_1: complex) -> Real:
-        """Smallest |e^{j omega dt} - p| over each arc of the unit circle, (F,), with p = 1 + root_minus_1."""
+        """Smallest |e^{j omega dt} - p| over each arc of the unit circle, (F,), with p = 1 + root_minus_1.
+
+        No unit. root_minus_1: one complex number; p = 0 is as far as 1.
+        """
         size = abs(1.0 + root_minus_1)
         # 1 - |p| without cancellation for p near 1.
         radial = -(2.0 * root_minus_1.real + abs(root_minus_1) ** 2) / (1.0 + size)
@@ -71,11 +79,17 @@ class FrequencyIntervals:
         return np.asarray(np.hypot(radial, chord), dtype=np.float64)
 
     def part(self, index: Boolean) -> FrequencyIntervals:
-        """The intervals that a mask (F,) chooses."""
+        """The intervals that a mask (F,) chooses.
+
+        Of another length IndexError, by numpy.
+        """
         return replace(self, centre=self.centre[index], half_width=self.half_width[index])
 
     def constant(self, value: complex) -> FirstOrder:
-        """Expansion (F,) of a constant."""
+        """Expansion (F,) of a constant.
+
+        value: one number; what is not finite stays so.
+        """
         size = self.centre.size
         return FirstOrder(
             np.full(size, complex(value)), np.zeros(size, complex), np.zeros(size), self.half_width
@@ -83,7 +97,10 @@ class FrequencyIntervals:
 
     def zero(self, root_minus_1: complex) -> FirstOrder:
         """Expansion (F,) of z - q with q = 1 + root_minus_1. Its second derivative in omega has modulus
-        dt^2."""
+        dt^2.
+
+        root_minus_1: one complex number, not checked.
+        """
         z_minus_1 = self.z_minus_1
         slope = 1j * self.dt_s * (1.0 + z_minus_1)
         remainder = 0.5 * (self.half_width * self.dt_s) ** 2
@@ -91,7 +108,11 @@ class FrequencyIntervals:
 
     def pole(self, root_minus_1: complex) -> FirstOrder:
         """Expansion (F,) of 1/(z - p) with p = 1 + root_minus_1. Its second derivative in omega has modulus
-        dt^2 |z + p|/|z - p|^3, which is bounded on the arc by the smallest distance from p."""
+        dt^2 |z + p|/|z - p|^3, which is bounded on the arc by the smallest distance from p.
+
+        root_minus_1: one complex number. A pole at the middle gives inf or nan with numpy's warning; one
+        elsewhere in the interval a huge remainder.
+        """
         z_minus_1 = self.z_minus_1
         value = 1.0 / (z_minus_1 - root_minus_1)
         slope = -1j * self.dt_s * (1.0 + z_minus_1) * value**2
@@ -100,14 +121,20 @@ class FrequencyIntervals:
         return FirstOrder(value, slope, 0.5 * self.half_width**2 * second_derivative, self.half_width)
 
     def shift(self, samples: int) -> FirstOrder:
-        """Expansion (F,) of z^samples. Its second derivative in omega has modulus (samples dt)^2."""
+        """Expansion (F,) of z^samples. Its second derivative in omega has modulus (samples dt)^2.
+
+        samples: a delay if negative.
+        """
         rate = samples * self.dt_s
         value = np.exp(1j * rate * self.centre)
         remainder = 0.5 * (rate * self.half_width) ** 2
         return FirstOrder(value, 1j * rate * value, remainder, self.half_width)
 
     def cleared(self, count: int) -> FirstOrder:
-        """Expansion (F,) of (z - 1)^count; a negative count gives 1/(z - 1)^|count|."""
+        """Expansion (F,) of (z - 1)^count; a negative count gives 1/(z - 1)^|count|.
+
+        A negative count needs intervals away from zero frequency, see `pole`.
+        """
         factor = self.zero(0.0) if count > 0 else self.pole(0.0)
         result = self.constant(1.0)
         for _ in range(abs(count)):
@@ -135,7 +162,10 @@ class FirstOrder:
     half_width: Real
 
     def __add__(self, other: FirstOrder) -> FirstOrder:
-        """Sum of two expansions of one shape on the same intervals."""
+        """Sum of two expansions of one shape on the same intervals.
+
+        Of other shapes numpy raises ValueError or broadcasts; not checked.
+        """
         return FirstOrder(
             self.value + other.value,
             self.slope + other.slope,
@@ -148,6 +178,8 @@ class FirstOrder:
 
         The remainder holds the product of the two changes, and each remainder times the largest the other
         linear part can be.
+
+        Intervals of both must be the same, not checked.
         """
         value = self.value
         slope = self.slope
@@ -168,14 +200,20 @@ class FirstOrder:
         return FirstOrder(value * other.value, product_slope, remainder, self.half_width)
 
     def scaled(self, factor: complex) -> FirstOrder:
-        """Expansion times a constant."""
+        """Expansion times a constant.
+
+        Shapes stay. Nothing is checked.
+        """
         return FirstOrder(
             self.value * factor, self.slope * factor, self.remainder * abs(factor), self.half_width
         )
 
     def end(self, side: int) -> Complex:
         """Linear part, (F,) or (F, Q), at the upper (side = 1) or lower (side = -1) end of the intervals; at
-        the middle for side = 0."""
+        the middle for side = 0.
+
+        Another side is not refused: it extrapolates.
+        """
         half_width = self.half_width if self.value.ndim == 1 else self.half_width[:, None]
         return np.asarray(self.value + side * half_width * self.slope, dtype=np.complex128)
 
@@ -190,7 +228,10 @@ class FirstOrder:
 
 
 def _norm(value: Complex) -> Real:
-    """Modulus (F,) of values (F,), or Euclidean norm (F,) of values (F, Q)."""
+    """Modulus (F,) of values (F,), or Euclidean norm (F,) of values (F, Q).
+
+    Real and imaginary parts are squared by themselves: faster than a modulus of each. Nan gives nan.
+    """
     if value.ndim == 1:
         return np.abs(value)
     real_square = np.einsum("fq,fq->f", value.real, value.real)
@@ -233,7 +274,9 @@ class RationalResponse:
         system : control.StateSpace
             n states.
         integrators : int
-            Number of its poles at z = 1: those nearest to it are put exactly there.
+            Number of its poles at z = 1, as `count_integrators` says: those nearest to it are put exactly
+            there, however far away they are (not checked). Of more inputs or outputs the first of D counts
+            and numpy raises where B and C do not fit.
 
         Notes
         -----
@@ -278,6 +321,8 @@ class RationalResponse:
 
         A root r becomes q = (1 + r dt/2)/(1 - r dt/2): s - r = (2/dt - r) (z - q)/(z + 1). Where the weight
         has fewer zeros than poles the factors z + 1 remain as zeros at z = -1.
+
+        dt_s in seconds. A `RationalWeight` has checked itself: proper, stable, no first coefficient of zero.
         """
         gain = abs(weight.numerator[0] / weight.denominator[0])
         roots_minus_1: list[list[complex]] = []
@@ -285,7 +330,7 @@ class RationalResponse:
             mapped: list[complex] = []
             for root in np.roots(coefficients):
                 scale = 2.0 / dt_s - root
-                # q at infinity: s - 2/dt = -(4/dt)/(z + 1).
+                # q at infinity: s - 2/dt = -(4/dt)/(z + 1). Equal to rounding is equal here.
                 if abs(scale) < _ROUNDING_SHARE / dt_s:
                     gain *= (4.0 / dt_s) ** sign
                     continue
@@ -306,12 +351,18 @@ class RationalResponse:
         )
 
     def delayed(self, samples: int) -> RationalResponse:
-        """Response times z^-samples."""
+        """Response times z^-samples.
+
+        A negative number takes delay away; nothing is checked.
+        """
         return replace(self, delay_samples=self.delay_samples + samples)
 
     def expand(self, intervals: FrequencyIntervals, cleared: int = 0) -> FirstOrder:
         """Expansion (F,) of the response times (z - 1)^cleared on F intervals; cleared takes integrators
-        away."""
+        away.
+
+        A root at the middle of an interval gives inf or nan, see `FrequencyIntervals.pole`.
+        """
         result = intervals.constant(self.gain)
         zero_order = np.argsort(np.abs(self.zeros_minus_1), kind="stable")
         pole_order = np.argsort(np.abs(self.poles_minus_1), kind="stable")
@@ -330,12 +381,18 @@ class RationalResponse:
         return result
 
     def at(self, omega_rad_s: Real) -> Complex:
-        """Values (F,) complex at omega (F,) in rad/s."""
+        """Values (F,) complex at omega (F,) in rad/s.
+
+        Inf or nan, with numpy's warning, at a pole on the circle.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         points = FrequencyIntervals(omega, np.zeros(omega.size), self.dt_s)
         return self.expand(points).value
 
 
 def _eigenvalues(matrix: npt.NDArray[np.float64]) -> Complex:
-    """Eigenvalues (n,) of a real matrix (n, n), complex also where all of them are real."""
+    """Eigenvalues (n,) of a real matrix (n, n), complex also where all of them are real.
+
+    LinAlgError, by numpy, where a number is not finite.
+    """
     return np.asarray(np.linalg.eigvals(matrix), dtype=np.complex128)

@@ -66,7 +66,10 @@ class Guard:
 
     def ellipses(self, wanted: Real) -> Ellipses:
         """Ellipses of no size at those of the guard's own frequencies nearest to `wanted` (W,) in rad/s, each
-        frequency once."""
+        frequency once.
+
+        No wanted frequency gives no ellipses; one outside of the range the end. Nan is not checked.
+        """
         omega = self.omega_rad_s
         upper = np.clip(np.searchsorted(omega, wanted), 1, omega.size - 1)
         lower = upper - 1
@@ -83,13 +86,14 @@ def different_responses(responses: Complex, most: int) -> Integer:
     responses : (D, F) complex array
         Draws on one grid of frequencies.
     most : int
-        Largest number of positions.
+        Largest number of positions; of zero or less still the first.
 
     Returns
     -------
     (N,) integer array
         N <= most. Each position is the one farthest from its nearest neighbour among those before it; fewer
-        where what is left differs by rounding only.
+        where what is left differs by rounding only. Not checked: at least one draw, all finite (a draw with
+        nan is chosen first).
 
     Notes
     -----
@@ -117,7 +121,10 @@ def different_responses(responses: Complex, most: int) -> Integer:
 
 def sorted_by_plant(guards: Sequence[Guard]) -> list[tuple[int, Real, Complex]]:
     """Guards that have plant and grid in common, stacked: (number of the plant, omega (F,) in rad/s,
-    responses (D, F)), in the order in which each pair appears first."""
+    responses (D, F)), in the order in which each pair appears first.
+
+    Empty without guards. Guards have checked themselves; grids are the same only bit for bit.
+    """
     groups: dict[tuple[int, bytes], list[Guard]] = {}
     for guard in guards:
         key = (guard.plant, guard.omega_rad_s.tobytes())

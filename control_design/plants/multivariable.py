@@ -41,6 +41,8 @@ def tustin_s(omega_rad_s: Real, dt_s: float) -> Complex:
     """s = j (2/dt) tan(omega dt/2), (F,) complex in rad/s, in which weights and controllers are written.
 
     omega_rad_s (F,), dt_s in seconds. At most 1e9/dt, where the tangent goes to infinity at Nyquist.
+
+    Not checked: frequencies above Nyquist, where the tangent changes its sign.
     """
     largest = _INFINITE_S_DT / dt_s
     with np.errstate(over="ignore"):
@@ -63,11 +65,17 @@ class IdentifiedMatrix(Protocol):
 
     def input_factor(self, lowest_rad_s: float) -> tuple[Real, Real, Real, Real]:
         """State-space matrices A, B, C, D of the stable Li(z) with U inputs, kept constant below a
-        frequency."""
+        frequency.
+
+        lowest_rad_s: that frequency, rad/s. What it refuses goes up through `ResponseBall.of`.
+        """
         ...
 
     def largest_radius(self, lowest_rad_s: float) -> float:
-        """Radius of the ball that holds the response at every frequency from lowest_rad_s on."""
+        """Radius of the ball that holds the response at every frequency from lowest_rad_s on.
+
+        No unit. What it refuses goes up through `ResponseBall.of`.
+        """
         ...
 
 
@@ -139,6 +147,11 @@ class ResponseBall:
             The slowest motion that the records tell: 2 pi over the length of the longest, or the lowest
             frequency that was excited. Below, an integrator's uncertainty grows without bound and is kept as
             it is there. Lower values widen every ball (one radius for all), higher ones leave more unchecked.
+
+        Raises
+        ------
+        ValueError
+            What the posterior or the constructor refuses, among it a lowest frequency that is not positive.
         """
         # Imported here, because it brings a plotting library with it.
         import control
@@ -149,12 +162,16 @@ class ResponseBall:
 
     def gram(self, omega_rad_s: Real) -> Complex:
         """radius^2 Li^H Li, (F, U, U) complex, at omega (F,) in rad/s. Raises ValueError at a frequency
-        between those that values are given at."""
+        between those that values are given at.
+
+        Frequencies outside their range are refused, too.
+        """
         if self.omega_rad_s is None:
             values = matrix_response(self.Li, omega_rad_s)
         else:
             grid = self.omega_rad_s
-            # A little below what is asked for, so that rounding does not take the next one.
+            # A little below what is asked for, a tenth of `_SAME_FREQUENCY_SHARE`, so that rounding does not
+            # take the next one.
             index = np.clip(np.searchsorted(grid, omega_rad_s * (1 - 1e-9)), 0, grid.size - 1)
             if np.any(np.abs(grid[index] - omega_rad_s) > _SAME_FREQUENCY_SHARE * omega_rad_s):
                 raise ValueError("the uncertainty is known on its own frequencies only; ask there")
@@ -252,6 +269,8 @@ class MultivariablePlant(NominalPlant):
         """Transmission zeros in z, (N,) complex, of a plant with as many inputs as outputs; none otherwise.
 
         They are the finite generalised eigenvalues of the pencil [A - zI, B; C, D].
+
+        Where the pencil is singular at every z, zeros come out as nan and are left out.
         """
         if self.inputs != self.outputs or self.nominal.nstates == 0:
             return np.zeros(0, complex)
@@ -283,6 +302,12 @@ class MultivariablePlant(NominalPlant):
             L_i^H L_i of each block B_i Delta_i L_i: what it sees of the input.
         entering : (F, N, Y, Y) complex array
             B_i B_i^H: how it enters the output. Both are fields of `scaled_bound.BoundRows`.
+
+        Raises
+        ------
+        ValueError
+            A ball known on its own frequencies only is asked between them. LinAlgError of numpy at a pole of
+            the nominal on the circle (omega = 0 with an integrator). Not checked: that frequencies ascend.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         delay_response = np.exp(-1j * omega * self.dt_s * delay_samples)[:, None, None]
@@ -311,7 +336,10 @@ class MultivariablePlant(NominalPlant):
             entering.append(np.broadcast_to(axis, output_square))
 
         def stacked(blocks: list[Any], shape: tuple[int, int, int]) -> Complex:
-            """Blocks of a shape (F, n, n) as one array (F, N, n, n); N = 0 for none."""
+            """Blocks of a shape (F, n, n) as one array (F, N, n, n); N = 0 for none.
+
+            Lists and shapes are made above; nothing is checked.
+            """
             if blocks:
                 return np.asarray(np.stack(blocks, axis=1), dtype=np.complex128)
             return np.zeros((shape[0], 0, *shape[1:]), dtype=np.complex128)
@@ -319,5 +347,8 @@ class MultivariablePlant(NominalPlant):
         return G, stacked(seen, input_square), stacked(entering, output_square)
 
     def delayed(self, samples: int) -> control.StateSpace:
-        """The nominal system behind a computational delay of whole samples."""
+        """The nominal system behind a computational delay of whole samples.
+
+        samples: not negative, not checked (a negative number counts as none).
+        """
         return delayed(self.nominal, samples)

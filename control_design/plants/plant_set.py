@@ -66,12 +66,19 @@ class NominalPlant:
 
     @cached_property
     def poles(self) -> Complex:
-        """Nominal poles in z, (n,)."""
+        """Nominal poles in z, (n,).
+
+        LinAlgError of numpy where A is not finite, which the plants' constructors refuse.
+        """
         return np.asarray(np.linalg.eigvals(self.nominal.A), dtype=np.complex128)
 
     @cached_property
     def modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the nominal below the Nyquist frequency, ascending in frequency."""
+        """Flexible modes of the nominal below the Nyquist frequency, ascending in frequency.
+
+        Those with a damping ratio below 0.4 (`modes_of`), unstable ones with a negative ratio too; empty
+        without any.
+        """
         modes = modes_of(self.poles, self.dt_s)
         return tuple(mode for mode in modes if mode.omega_rad_s < np.pi / self.dt_s)
 
@@ -88,8 +95,8 @@ class PlantChannel(NominalPlant):
         With a method `at(omega_rad_s, level)` it is known at any frequency; with omega_rad_s, centre,
         covariance and level on these frequencies only; None: the nominal response is exact.
     level : float
-        Probability in (0, 1) of the ellipses where the uncertainty is known at any frequency; a record on its
-        own frequencies brings its own level.
+        Probability in (0, 1) of the ellipses where the uncertainty is known at any frequency, the usual 0.95;
+        a record on its own frequencies brings its own level.
 
     Raises
     ------
@@ -157,14 +164,20 @@ class PlantChannel(NominalPlant):
         return np.asarray(self.uncertainty.omega_rad_s, dtype=np.float64)
 
     def nominal_response(self, omega_rad_s: Real) -> Complex:
-        """G_nom(e^{j omega dt}), (F,) complex, at omega (F,) in rad/s."""
+        """G_nom(e^{j omega dt}), (F,) complex, at omega (F,) in rad/s.
+
+        Units of output per input. LinAlgError of numpy at a pole on the circle (omega = 0 with an
+        integrator).
+        """
         return frequency_response(self.nominal, omega_rad_s)
 
     def at(self, omega_rad_s: Real) -> Ellipses:
         """Ellipses at omega (F,) in rad/s, ascending.
 
         Frequencies of a record that is known on its own ones only must be among these; outside their range
-        the nominal response stands alone, without uncertainty. Raises ValueError at a frequency between them.
+        the nominal response stands alone, without uncertainty. Raises ValueError at a frequency between them,
+        and where `Ellipses` refuses the record (not ascending, not finite, a covariance that is none);
+        LinAlgError where the nominal has a pole there.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         if self.uncertainty is None:
@@ -199,7 +212,11 @@ class PlantChannel(NominalPlant):
 
 
 def frequency_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
-    """Response (F,) complex of a discrete system with one input and one output at omega (F,) in rad/s."""
+    """Response (F,) complex of a discrete system with one input and one output at omega (F,) in rad/s.
+
+    Of a larger system the response from its first input to its first output. LinAlgError of numpy at a pole
+    on the circle.
+    """
     return matrix_response(system, omega_rad_s)[:, 0, 0]
 
 
@@ -217,6 +234,11 @@ def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
     -------
     (F, Y, U) complex array
         C (zI - A)^-1 B + D on z = e^{j omega dt}.
+
+    Raises
+    ------
+    LinAlgError
+        By numpy, at a pole on the circle exactly; nan frequencies give nan.
 
     Notes
     -----
@@ -247,7 +269,10 @@ def matrix_response(system: control.StateSpace, omega_rad_s: Real) -> Complex:
 
 def delayed(system: control.StateSpace, samples: int) -> control.StateSpace:
     """Discrete system behind a delay of whole samples of every input; the states of the delay come after
-    those of the system. samples = 0 returns the system itself."""
+    those of the system. samples = 0 returns the system itself.
+
+    A negative number counts as none (not checked).
+    """
     if samples == 0:
         return system
     import control
@@ -271,6 +296,8 @@ def count_integrators(poles_z: Complex) -> int:
 
     A multiple pole splits by a root of the rounding error (1e-8 for two poles, 1e-5 for three), but the mean
     of the cluster stays accurate. A true slow pole (1e-3 rad/s at 1 kHz: 1e-6 from z = 1) is no integrator.
+
+    0 for no poles. A nan is never at 1.
     """
     distance = np.asarray(poles_z, dtype=np.complex128) - 1.0
     distance = distance[np.argsort(np.abs(distance), kind="stable")]
@@ -307,7 +334,8 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
     Returns
     -------
     tuple of Mode
-        From s = ln(z)/dt.
+        From s = ln(z)/dt: frequency |s|, rad/s, and zeta = -Re s/|s|, negative outside the circle. Empty
+        without pairs; nan is none. Not checked: dt_s above 0.
     """
     poles = np.asarray(poles_z, dtype=np.complex128)
     oscillating = (np.imag(poles) > _REAL_BELOW) & (np.abs(poles) > _DEADBEAT_BELOW)
@@ -337,7 +365,7 @@ class UncertainPlant(NominalPlant, Shown):
         The response whose |Gp S| the damping requirement bounds, from the same input; None: the measured
         output.
     level : float
-        Probability of the ellipses of the measured output, in (0, 1).
+        Probability of the ellipses of the measured output, in (0, 1); the usual 0.95.
 
     Raises
     ------
@@ -392,7 +420,10 @@ class UncertainPlant(NominalPlant, Shown):
 
     @property
     def damped(self) -> PlantChannel:
-        """The channel whose |Gp S| the damping requirement bounds."""
+        """The channel whose |Gp S| the damping requirement bounds.
+
+        That is `performance`, or the measured output's channel without one.
+        """
         return self.channel if self.performance is None else self.performance
 
     @cached_property
@@ -421,6 +452,8 @@ class UncertainPlant(NominalPlant, Shown):
 
         Each zero below that frequency takes the slope of one pole away again: as many poles are left out, the
         fastest first.
+
+        Not checked: a frequency of 0 or less leaves the integrators alone.
         """
         poles = self._other_poles
         zeros = self.zeros
@@ -462,5 +495,8 @@ class UncertainPlant(NominalPlant, Shown):
         return self.channel.own_grid
 
     def at(self, omega_rad_s: Real) -> Ellipses:
-        """Ellipses of the response from the input to the measured output at omega (F,) in rad/s."""
+        """Ellipses of the response from the input to the measured output at omega (F,) in rad/s.
+
+        Raises what `PlantChannel.at` raises.
+        """
         return self.channel.at(omega_rad_s)

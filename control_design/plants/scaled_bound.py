@@ -29,8 +29,8 @@ from ident.data.arrays import COMPILED, INSIDE
 
 Array = npt.NDArray[Any]  # real or complex
 
-# Most steps of Newton's method in log t. Usual are 3 to 8; whatever the last one, the bound holds, so more
-# would only make it tighter where it is flat.
+# Most steps of Newton's method, or of the secant, in log t. Usual are 3 to 8; whatever the last one, the
+# bound holds, so more would only make it tighter where it is flat.
 _MOST_STEPS = 40
 
 # Shift of log t in the difference quotient of the slope: about the fourth root of the rounding error, at
@@ -77,12 +77,18 @@ _MOST_SWEEPS = 30
 
 
 def conjugate(matrix: Array) -> Array:
-    """Conjugate transpose of the last two axes."""
+    """Conjugate transpose of the last two axes.
+
+    Of a vector numpy raises an error.
+    """
     return np.asarray(np.conj(np.swapaxes(matrix, -1, -2)))
 
 
 def apply(matrix: Array, vector: Array) -> Array:
-    """Matrices (..., M, N) times vectors (..., N)."""
+    """Matrices (..., M, N) times vectors (..., N).
+
+    Shapes that do not fit are numpy's ValueError.
+    """
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
@@ -106,6 +112,10 @@ class BoundRows:
         gain).
     base : (R, Y, Y) array or None
         Gram matrix of how the performance input enters; None: identity.
+
+    Notes
+    -----
+    Shapes are not checked: who makes the rows takes them from one plant (`MultivariablePlant.blocks`).
     """
 
     G: Array
@@ -117,7 +127,10 @@ class BoundRows:
     base: Array | None = None
 
     def part(self, index: Integer | Boolean) -> BoundRows:
-        """The rows at the given positions, integers or a mask (R,)."""
+        """The rows at the given positions, integers or a mask (R,).
+
+        IndexError for a position that is not there.
+        """
         chosen = {}
         for field in fields(self):
             value = getattr(self, field.name)
@@ -151,6 +164,8 @@ def stability_bound(rows: BoundRows, K: Array) -> Array:
 
     Where it stays below 1 the loop is stable for all blocks of size one, and it tolerates them enlarged by
     its inverse. The last block takes the place of the performance, whose weights are not used.
+
+    No unit. IndexError without any block.
     """
     last = rows.entering[:, -1]
     trace = np.trace(last, axis1=1, axis2=2).real[:, None, None]
@@ -171,6 +186,8 @@ def structured_norm(M: Array) -> Array:
     """Smallest largest singular value of D M D^-1 over diagonal D, (F,), for M (F, n, n) complex.
 
     It is the structured singular value of M for n scalar blocks up to n = 3, and an upper bound of it beyond.
+
+    Not checked: nan gives inf.
     """
     count = M.shape[0]
     n = M.shape[1]
@@ -194,12 +211,18 @@ def scaled_bound(rows: BoundRows, K: Array, log_t: Array | None = None, *, accur
     log_t : (R, N) array or None
         Where to begin; None: from the sizes of the blocks.
     accuracy : float
-        Relative, of gamma.
+        Of log gamma^2, hence relative of gamma: 1e-9 is beyond what anybody reads. Chosen.
 
     Returns
     -------
     Bound
-        Every gamma is a bound, whatever the scalings.
+        Every gamma is a bound, whatever the scalings; inf where no scaling shows stability, or a value is not
+        finite.
+
+    Raises
+    ------
+    LinAlgError
+        By numpy, where I + G K is singular exactly. Shapes are not checked.
 
     Notes
     -----
@@ -229,6 +252,8 @@ def largest_channel(rows: BoundRows, K: Array, right: Array) -> Integer:
     case.
 
     K : (R, U, Y) controller values. right : (R, Y) worst outputs of a `Bound`.
+
+    Shapes are not checked; nan counts as the largest.
     """
     output_weight = np.diagonal(rows.V_y, axis1=1, axis2=2).real
     actuator_weight = np.diagonal(rows.V_u, axis1=1, axis2=2).real
@@ -263,7 +288,8 @@ class Expansion:
 def expansion(rows: BoundRows, K: Array, log_t: Array) -> Expansion:
     """Linearisation of the bound around controller values K (R, U, Y) and scalings log_t (R, N).
 
-    For worst-case gain only: rows.together is false and rows.base None (not checked).
+    For worst-case gain only: rows.together is false and rows.base None (not checked). LinAlgError of numpy
+    where the loop is singular; scalings that show no stability give matrices that mean nothing.
     """
     identity = np.eye(K.shape[2])
     S = np.linalg.inv(identity + rows.G @ K)
@@ -298,7 +324,8 @@ def _lowest(
 
     performance (R, Y, Y) is A without the blocks; seen and entering (R, N, Y, Y) are the blocks through the
     loop; base (R, Y, Y). log_t (R, N) holds the best scalings afterwards; nan in it: a start is looked for.
-    Row by row: numpy's calls would cost more than the arithmetic.
+    Row by row: numpy's calls would cost more than the arithmetic. Inf, and s without meaning, where no
+    scaling shows stability. Shapes are not checked, and indices not bounded.
     """
     count, n = log_t.shape
     size = performance.shape[1]
@@ -341,9 +368,10 @@ def _begin(
         sees = np.sqrt(_trace(seen[i]))
         enters = np.sqrt(_trace(entering[i]))
         total += sees * enters
+        # Both above 1e-150, so that the quotient and its square stay in the range of doubles.
         log_t[i] = np.log(max(sees, 1e-150) / max(enters * whole, 1e-150))
-    # Blocks of fixed size leave 1 - total to the performance. Where that is nothing a twentieth is tried;
-    # smaller scalings follow if stability does not show.
+    # Blocks of fixed size leave 1 - total to the performance. Where that is nothing a twentieth (chosen) is
+    # tried; smaller scalings follow if stability does not show.
     if not together:
         log_t += np.log(max(1.0 - total, 0.05))
 
@@ -357,12 +385,15 @@ def _bracketed(
     lowest and slope (1,) are value and derivative at log_t; problem: performance, seen, entering, base,
     together of one row; work, p: memory. Steps of the secant of the slope, within a bracket of its sign:
     kinks (two eigenvalues that cross) do no harm.
+
+    Nothing is checked: value and slope at the start are finite.
     """
     low = -np.inf
     high = np.inf
     here = log_t[0]
     rise = slope[0]
-    # Curvature of a sum of t and 1/t near its minimum, until a secant tells it.
+    # Curvature of the logarithm of a sum of t and 1/t is between 0 and 1: their middle, until a secant tells
+    # it.
     curvature = 0.5
     trial = log_t.copy()
     trial_s = s.copy()
@@ -373,12 +404,14 @@ def _bracketed(
         else:
             high = here
         width = high - low
+        # Without a slope: towards smaller scalings, by a factor of e.
         step = -1.0
         promised_slope = 1.0
         if np.isfinite(rise):
             step = min(max(-rise / curvature, -_LONGEST_SECANT_STEP), _LONGEST_SECANT_STEP)
             promised_slope = abs(rise)
-        # Next to an end of the bracket a step would shorten it by nothing: its middle instead.
+        # Next to an end of the bracket, within a twentieth of it (chosen), a step would shorten it by
+        # nothing: its middle instead.
         edge = 0.05 * min(width, 1.0)
         trial[0] = here + step
         if np.isfinite(width) and not (low + edge < trial[0] < high - edge):
@@ -389,7 +422,7 @@ def _bracketed(
         value = _at(trial, *problem, work, trial_s, p, slope)
         trial_rise = slope[0] if np.isfinite(value) else np.inf
         secant = (trial_rise - rise) / (trial[0] - here)
-        # Between a nearly flat function and a kink.
+        # Between a nearly flat function and a kink; the limits are chosen, steps are bounded anyway.
         if np.isfinite(secant):
             curvature = min(max(secant, 0.02), 1e6)
         here = trial[0]
@@ -408,6 +441,8 @@ def _newton(
     """Lowest log gamma^2 over N scalings; log_t (N,), slope (N,) and s (Y,) hold what attains it.
 
     The arguments are those of `_bracketed`. Newton's method with a curvature from differences of slopes.
+
+    Nothing is checked: value and slope at the start are finite.
     """
     n = log_t.size
     curvature = np.empty((n, n), dtype=np.complex128)
@@ -432,7 +467,7 @@ def _newton(
                 curvature[i, j] = mean
                 curvature[j, i] = mean
         # The step along each axis of curvature, whose sign does not matter: the function is convex but for
-        # rounding and kinks.
+        # rounding and kinks. 1e-300 below keeps a step of zero from dividing by it.
         _diagonalise(curvature, axes)
         step[:] = 0.0
         for i in range(n):
@@ -505,6 +540,7 @@ def _at(
         _congruence(root, A, product, H)
     else:
         inside[:] = A
+        # 1e-290 where nothing is asked and A is zero.
         jitter = _JITTER_SHARE * _trace(A) + 1e-290
         for j in range(size):
             inside[j, j] += jitter
@@ -532,6 +568,7 @@ def _at(
                     H[j, k] += np.conj(axes[m, j]) * axes[m, k]
     _diagonalise(H, axes)
     best = np.argmax(np.diag(H).real)
+    # Above zero for its logarithm, where nothing is asked.
     gamma_square = max(H[best, best].real, 1e-300)
     # Vectors of the largest eigenvalue: s, in which A acts, and p, in which the blocks enter.
     if together:
@@ -553,7 +590,10 @@ def _at(
 
 @numba.njit(**INSIDE)
 def _trace(matrix: Array) -> float:
-    """Sum of the real parts of the diagonal of a matrix (n, n)."""
+    """Sum of the real parts of the diagonal of a matrix (n, n).
+
+    Not checked: square; indices are not bounded.
+    """
     total = 0.0
     for j in range(matrix.shape[0]):
         total += matrix[j, j].real
@@ -562,7 +602,10 @@ def _trace(matrix: Array) -> float:
 
 @numba.njit(**INSIDE)
 def _form(matrix: Array, vector: Array) -> float:
-    """vector^H matrix vector, a real number for a Hermitian matrix (n, n) and a vector (n,)."""
+    """vector^H matrix vector, a real number for a Hermitian matrix (n, n) and a vector (n,).
+
+    Nothing is checked; of a matrix that is not Hermitian it is the real part.
+    """
     total = 0.0
     for j in range(vector.size):
         for k in range(vector.size):
@@ -572,7 +615,10 @@ def _form(matrix: Array, vector: Array) -> float:
 
 @numba.njit(**INSIDE)
 def _congruence(root: Array, matrix: Array, product: Array, result: Array) -> None:
-    """Write root^H matrix root into `result` (n, n), root lower triangular; `product` (n, n) is memory."""
+    """Write root^H matrix root into `result` (n, n), root lower triangular; `product` (n, n) is memory.
+
+    Nothing is checked, and indices are not bounded.
+    """
     size = root.shape[0]
     for j in range(size):
         for k in range(size):
@@ -589,7 +635,11 @@ def _congruence(root: Array, matrix: Array, product: Array, result: Array) -> No
 @numba.njit(**INSIDE)
 def _factored(matrix: Array, root: Array, least: float) -> bool:
     """Whether a Hermitian matrix (n, n) has Cholesky's factor, written into `root` (n, n) as a lower
-    triangle; false where a pivot is not above `least`."""
+    triangle; false where a pivot is not above `least`.
+
+    Only the lower triangle of the matrix is read. False for nan; of what is written before a pivot fails
+    nothing is used.
+    """
     size = matrix.shape[0]
     for j in range(size):
         for k in range(j + 1):
@@ -609,7 +659,10 @@ def _factored(matrix: Array, root: Array, least: float) -> bool:
 @numba.njit(**INSIDE)
 def _diagonalise(matrix: Array, axes: Array) -> None:
     """Turn a Hermitian matrix (n, n) in place into the diagonal of its eigenvalues, by Jacobi's rotations,
-    and write the eigenvectors into the columns of `axes` (n, n)."""
+    and write the eigenvectors into the columns of `axes` (n, n).
+
+    After `_MOST_SWEEPS` it is left as it is. Nothing is checked: nan stays nan.
+    """
     size = matrix.shape[0]
     for j in range(size):
         for k in range(size):
@@ -621,6 +674,7 @@ def _diagonalise(matrix: Array, axes: Array) -> None:
             for k in range(j + 1, size):
                 part = abs(matrix[j, k])
                 sizes = abs(matrix[j, j].real) + abs(matrix[k, k].real)
+                # Below rounding of the diagonal, or too small to divide by.
                 if part <= 1e-16 * sizes or part < 1e-290:
                     continue
                 off = max(off, part / sizes)
@@ -650,5 +704,6 @@ def _diagonalise(matrix: Array, axes: Array) -> None:
                     matrix[k, m] = np.conj(sine) * first + cosine * second
                 matrix[j, k] = 0.0
                 matrix[k, j] = 0.0
+        # Some roundings of the diagonal: the next sweep would change nothing.
         if off < 1e-15:
             break

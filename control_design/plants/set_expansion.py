@@ -46,7 +46,10 @@ class SetExpansion:
     groups: tuple[FirstOrder, ...]
 
     def times(self, factor: FirstOrder) -> SetExpansion:
-        """The set of every member times a response (F,)."""
+        """The set of every member times a response (F,).
+
+        Intervals of both must be the same, not checked.
+        """
         groups = tuple(factor.times(group) for group in self.groups)
         return SetExpansion(factor.times(self.centre), groups)
 
@@ -55,6 +58,8 @@ class SetExpansion:
         intervals.
 
         direction : (F,) complex array. side : 1 the upper, -1 the lower end, 0 the middle.
+
+        Without groups it is 0. Units of the response if |direction| = 1; not checked.
         """
         total = np.zeros(direction.size)
         for group in self.groups:
@@ -63,13 +68,19 @@ class SetExpansion:
         return total
 
     def remainder(self) -> Real:
-        """Bound (F,) of everything beyond the linear part, centre and groups together."""
+        """Bound (F,) of everything beyond the linear part, centre and groups together.
+
+        In units of the response; inf or huge where an interval holds a pole.
+        """
         of_groups = sum(group.remainder for group in self.groups)
         return np.asarray(self.centre.remainder + of_groups, dtype=np.float64)
 
     def gram(self, side: int = 0) -> Real:
         """Shape matrix P (F, 2, 2) of the ellipse e^T P^-1 e <= 1 around the linear part, at the middle
-        (side = 0) or one end (side = +-1) of the intervals; the sum of several groups lies inside of it."""
+        (side = 0) or one end (side = +-1) of the intervals; the sum of several groups lies inside of it.
+
+        Zero without groups. Another side extrapolates, not checked.
+        """
         total = np.zeros((self.centre.value.size, 2, 2))
         for group in self.groups:
             value = group.end(side)
@@ -91,6 +102,9 @@ class FirstOrderUncertainty(Protocol):
         """Centre (F,) and generators (F, Q) on the intervals, both times (z - 1)^cleared.
 
         The Gram matrix of the generators' real and imaginary parts is the covariance that `at` gives.
+
+        Both are of one standard deviation. An interval that cannot be bounded has a huge remainder rather
+        than an error.
         """
 
 
@@ -130,7 +144,10 @@ def expandable(channel: PlantChannel, integrators: int, between_own_points: str)
         return None
 
     def expand(intervals: FrequencyIntervals, cleared: int) -> SetExpansion:
-        """Ellipses of the channel's level on the intervals, times (z - 1)^cleared."""
+        """Ellipses of the channel's level on the intervals, times (z - 1)^cleared.
+
+        What `first_order` raises goes up.
+        """
         centre, generators = first_order(intervals, cleared)
         scaled_generators = generators.scaled(radius_of(channel.level))
         return SetExpansion(centre, (scaled_generators,))
@@ -152,6 +169,12 @@ def posterior_expansion(
         F of them.
     cleared : int
         Power of z - 1 that takes integrators away.
+
+    Returns
+    -------
+    tuple of FirstOrder
+        Centre and generators of one standard deviation. Nothing is refused: an interval that holds a pole has
+        a huge remainder, or nan where the pole is its middle.
 
     Notes
     -----
@@ -182,6 +205,9 @@ def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tup
     basis functions of real poles and of pairs, the feedthrough, lags of the impulse response and, for an
     unstable plant, derivatives with respect to its unstable poles. Integrators, delay and the all-pass of the
     unstable poles, which all columns have in common, are left out.
+
+    posterior: `poles`, `has_feedthrough`, `fir_length`, `unstable` and `mean` (P,) are read; it has checked
+    itself.
     """
     columns: list[FirstOrder] = []
     # Each basis function is a section of its own pole behind the all-passes of the poles before it.
@@ -223,6 +249,8 @@ def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list
 
     unstable : Poles, held as their mirror images inside the circle. A real pole is one parameter; a pair is
     two, its real and its imaginary part, in this order.
+
+    Not checked: a pole at 0 has no mirror image (ZeroDivisionError).
     """
 
     def slope(p: complex) -> FirstOrder:
@@ -241,14 +269,20 @@ def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list
 
 
 def _reflected_zero(p: complex, intervals: FrequencyIntervals) -> FirstOrder:
-    """Expansion (F,) of 1 - conj(p) z, the numerator of an all-pass with the pole p."""
+    """Expansion (F,) of 1 - conj(p) z, the numerator of an all-pass with the pole p.
+
+    p: one complex number, not checked.
+    """
     q = p.conjugate()
     factor = intervals.zero(0.0).scaled(-q)
     return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
 
 
 def _in_range(grid: Real, low: Real, high: Real) -> Boolean:
-    """Whether each interval from low to high (F,) lies between the ends of grid (K,), all in rad/s."""
+    """Whether each interval from low to high (F,) lies between the ends of grid (K,), all in rad/s.
+
+    grid ascending, K >= 1, not checked; nan is not in range.
+    """
     above_first = low >= grid[0] * (1 - _SAME_FREQUENCY_SHARE)
     below_last = high <= grid[-1] * (1 + _SAME_FREQUENCY_SHARE)
     return np.asarray(above_first & below_last)
@@ -269,6 +303,12 @@ def own_grid_set(
         F of them, none across a frequency of the record.
     cleared : int
         Power of z - 1.
+
+    Returns
+    -------
+    SetExpansion
+        Two groups of two generators, of the record's own level. An interval across a frequency of the record
+        is not seen and bounded as if it lay in one gap.
 
     Notes
     -----
@@ -334,7 +374,11 @@ class StraightBetween:
 
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
         """Centre and covariances at omega (F,) in rad/s, such that ellipses of `level` enclose those of the
-        record; outside its range the nominal response without uncertainty."""
+        record; outside its range the nominal response without uncertainty.
+
+        ValueError where frequencies do not ascend or a value is not finite (`FrequencyUncertainty`); the
+        level is not checked before (radius 0 at level 0 divides by zero).
+        """
         grid = self.channel.own_grid
         assert grid is not None
         record: Any = self.channel.uncertainty
@@ -366,7 +410,10 @@ class StraightBetween:
 
 
 def with_straight_between(plant: UncertainPlant) -> UncertainPlant:
-    """The plant with `StraightBetween` in place of every record that is known on its own frequencies only."""
+    """The plant with `StraightBetween` in place of every record that is known on its own frequencies only.
+
+    Nothing is refused; of a plant that is known everywhere nothing is changed.
+    """
     performance = plant.performance
     if performance is not None and performance.own_grid is not None:
         performance = replace(performance, uncertainty=StraightBetween(performance))
@@ -376,7 +423,10 @@ def with_straight_between(plant: UncertainPlant) -> UncertainPlant:
 
 
 def stacked(columns: Sequence[FirstOrder]) -> FirstOrder:
-    """Q expansions (F,) on the same intervals as one (F, Q)."""
+    """Q expansions (F,) on the same intervals as one (F, Q).
+
+    At least one (IndexError); the remainder is the root of the sum of squares.
+    """
     squares: Any = sum(column.remainder**2 for column in columns)
     return FirstOrder(
         np.stack([column.value for column in columns], axis=1),

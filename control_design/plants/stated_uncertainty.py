@@ -44,12 +44,13 @@ class StatedDiscs:
         Whether the weight is relative to the nominal response.
     level : float
         Probability in (0, 1) of the ellipses that are these discs: ellipses of another level are larger or
-        smaller in the ratio of their Gaussian radii.
+        smaller in the ratio of their Gaussian radii. The default is the plants' usual one.
 
     Raises
     ------
     ValueError
-        For a weight with a pole on the imaginary axis, or a level outside (0, 1).
+        For a weight with a pole on the imaginary axis, or a level outside (0, 1). Another kind counts as
+        additive, and a nominal of more inputs or outputs fails where it is evaluated: neither is checked.
     """
 
     nominal: control.StateSpace
@@ -71,14 +72,20 @@ class StatedDiscs:
 
     @cached_property
     def _rational(self) -> tuple[RationalResponse, RationalResponse]:
-        """Nominal response and weight, each by gain, zeros and poles in z."""
+        """Nominal response and weight, each by gain, zeros and poles in z.
+
+        Both keep their distance from z = 1, so that slow roots keep their digits.
+        """
         integrators = count_integrators(np.asarray(self.nominal.poles(), dtype=np.complex128))
         nominal = RationalResponse.from_state_space(self.nominal, integrators)
         weight = RationalResponse.from_weight(self.weight, float(self.nominal.dt))
         return nominal, weight
 
     def radius(self, omega_rad_s: Real) -> Real:
-        """Radius (F,) of the discs at omega (F,) in rad/s, units of output per input."""
+        """Radius (F,) of the discs at omega (F,) in rad/s, units of output per input.
+
+        Inf or nan, with numpy's warning, at an integrator or a pole of the nominal on the circle (omega = 0).
+        """
         _, weight = self._rational
         size = np.abs(weight.at(omega_rad_s))
         if self.kind == "multiplicative":
@@ -87,7 +94,10 @@ class StatedDiscs:
 
     def at(self, omega_rad_s: Real, level: float) -> FrequencyUncertainty:
         """Nominal response and circular covariances at omega (F,) in rad/s, whose ellipses of `self.level`
-        are the discs; `level` is handed on as that of the record."""
+        are the discs; `level` is handed on as that of the record.
+
+        ValueError, of the record, where the response is not finite or frequencies do not ascend.
+        """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         standard_deviation = self.radius(omega) / radius_of(self.level)
         variance = standard_deviation**2
@@ -114,7 +124,8 @@ class StatedDiscs:
         Returns
         -------
         tuple of FirstOrder
-            Centre (F,) and two generators (F, 2), of one standard deviation.
+            Centre (F,) and two generators (F, 2), of one standard deviation. Intervals that hold a pole have
+            a huge remainder; nothing is refused.
 
         Notes
         -----

@@ -33,7 +33,9 @@ def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: f
     Raises
     ------
     ValueError
-        If there are more zeros than poles.
+        If there are more zeros than poles. A nan is LinAlgError of numpy in the numerator; in the denominator
+        it is not seen and makes all poles integrators. A numerator of zeros alone gives a system that answers
+        nothing.
     """
     zeros_polynomial = np.trim_zeros(np.atleast_1d(numerator), "f")
     poles_polynomial = np.trim_zeros(np.atleast_1d(denominator), "f")
@@ -49,6 +51,7 @@ def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: f
     n_integrators = 0
     remaining = poles_polynomial
     while remaining.size > 1:
+        # Rounding of a sum of so many terms: one unit of the last digit each.
         rounding = remaining.size * np.finfo(float).eps * np.sum(np.abs(remaining))
         if abs(np.sum(remaining)) > rounding:
             break
@@ -75,6 +78,12 @@ def of_roots(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt_s: floa
     -------
     control.StateSpace
         One input, one output, as many states as poles.
+
+    Raises
+    ------
+    ValueError
+        By `zip`, where there are more factors of zeros than of poles. A complex root without its conjugate is
+        not seen: it counts as a pair in the upper half plane, and is left out in the lower one.
     """
     denominators = _factors(np.atleast_1d(poles))
     numerators = _factors(np.atleast_1d(zeros))
@@ -92,6 +101,9 @@ def _factors(roots: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
 
     Conjugate pairs come first, one polynomial each; real roots follow two by two from the largest on, and the
     last one alone where their number is odd.
+
+    A root of the lower half plane alone is left out, one of the upper half gets a conjugate; nothing is
+    checked.
     """
     factors = []
     upper_half_plane = roots.imag > 0

@@ -22,9 +22,9 @@ from ident.data.settings import Settings
 # Doubled, the integral action takes twice the phase from the crossover.
 _INTEGRAL_SHARE = 0.2
 
-# Slowest pole that a factor of the bandwidth weight may have, as a share of the weight's corner. No record
-# that a loop of that bandwidth is designed from tells whether a pole of the plant is slower than a hundredth
-# of it: beside such a pole the ellipses are wide.
+# Slowest pole that a factor of the bandwidth weight may have, as a share of the weight's corner. Chosen: no
+# record that a loop of that bandwidth is designed from tells whether a pole of the plant is slower than a
+# hundredth of it: beside such a pole the ellipses are wide.
 _SLOWEST_POLE_SHARE = 0.01
 
 # The effort weight flattens at this multiple of its roll-off frequency, which keeps it proper. By then it
@@ -49,7 +49,10 @@ class RationalWeight(Settings):
 
     @model_validator(mode="after")
     def _stable_and_proper(self) -> RationalWeight:
-        """The weight itself, once its coefficients, degree and poles are checked."""
+        """The weight itself, once its coefficients, degree and poles are checked.
+
+        Raises ValueError, which pydantic hands on, for what the class refuses.
+        """
         for name in ("numerator", "denominator"):
             values = np.array(getattr(self, name))
             if not (np.all(np.isfinite(values)) and values[0] != 0):
@@ -63,14 +66,20 @@ class RationalWeight(Settings):
         return self
 
     def at(self, s: Complex) -> Complex:
-        """W (F,) at complex s (F,) in rad/s; infinite at a pole on the axis."""
+        """W (F,) at complex s (F,) in rad/s; infinite at a pole on the axis.
+
+        Nan where numerator and denominator vanish together, or s is infinite; shapes as of s.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             value = np.polyval(self.numerator, s) / np.polyval(self.denominator, s)
         return np.asarray(value, dtype=np.complex128)
 
 
 def integral_corner(bandwidth_rad_s: float, modulus_margin: float) -> float:
-    """Frequency in rad/s up to which `bandwidth_weight` asks for integral action: a fifth of its corner."""
+    """Frequency in rad/s up to which `bandwidth_weight` asks for integral action: a fifth of its corner.
+
+    Not checked: bandwidth above 0, modulus margin between 0 and 1, which `Specification` has made sure of.
+    """
     return float(_INTEGRAL_SHARE * bandwidth_rad_s * np.sqrt(2.0 - modulus_margin**2))
 
 
@@ -94,6 +103,11 @@ def bandwidth_weight(
     -------
     RationalWeight
         W = (m s + wc)/(s + wc r) times (s + wc/5)/(s + p) for every slow pole p.
+
+    Raises
+    ------
+    ValueError
+        By pydantic, where a coefficient is not finite. Ranges are not checked: `Specification` has done that.
 
     Notes
     -----
@@ -129,6 +143,11 @@ def effort_limit_weight(effort_limit: float, rolloff_rad_s: float | None) -> Rat
     -------
     RationalWeight
         W = 1/limit, times (s/wr + 1)/(s/(40 wr) + 1) with a roll-off.
+
+    Raises
+    ------
+    ZeroDivisionError
+        A limit or a roll-off is zero, which `Specification` does not allow.
     """
     if rolloff_rad_s is None:
         return RationalWeight(numerator=(1.0 / effort_limit,), denominator=(1.0,))
