@@ -61,9 +61,10 @@ _MODEL_ERROR = 1e-6
 _LEAST_WIDTH = 1e-11
 
 # The comparison of `_difference` is relative to the value, but not below this share of the largest one: where
-# a response has a zero, its rounding is that of its terms.
+# a response has a zero, its rounding is that of its terms. Chosen, some million roundings.
 _SMALLEST_SHARE = 1e-9
-# Likewise for shapes of ellipses: below this share of the centre (squared, here) an ellipse has no size.
+# Likewise for shapes of ellipses: below this share of the centre's square, axes of a millionth of the centre,
+# an ellipse has no size. Chosen.
 _SMALLEST_SHAPE = 1e-12
 # Least divisor: keeps quotients finite; no response in units of a machine is as small.
 _TINY = 1e-300

@@ -412,11 +412,17 @@ def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase
     integrators, _ = loop_integrators(controller, plant)
 
     def loop_gain(omega: Real) -> Complex:
-        """Loop gain K c (N,) of the centres at frequencies (N,), rad/s."""
+        """Loop gain K c (N,) of the centres at frequencies (N,), rad/s.
+
+        Raises what `UncertainPlant.at` raises.
+        """
         return controller.response(omega) * plant.at(omega).centre
 
     def factor_and_ellipses(omega: Real) -> tuple[Complex, Ellipses]:
-        """Controller with its delay (N,), and the ellipses, at frequencies (N,), rad/s."""
+        """Controller with its delay (N,), and the ellipses, at frequencies (N,), rad/s.
+
+        Raises what `UncertainPlant.at` raises.
+        """
         return controller.response(omega), plant.at(omega)
 
     # A loop that integrates is infinite at zero frequency, and no gain moves a pole through z = 1.

@@ -53,7 +53,10 @@ class MeasuredMachine(Protocol):
         ...
 
     def measure(self) -> Real:
-        """Outputs (Y,) at this sample."""
+        """Outputs (Y,) at this sample.
+
+        In the machine's units; a value that is not finite is passed on as it is.
+        """
         ...
 
     def advance(self, u: Any, /) -> None:
@@ -72,7 +75,10 @@ class SampledMachine(MeasuredMachine, Protocol):
     """
 
     def advance(self, u: float, /, *, hub_torque_Nm: float = 0.0) -> None:
-        """Hold the command and a disturbance torque (N m) for one sample."""
+        """Hold the command and a disturbance torque (N m) for one sample.
+
+        A machine without an input for the torque raises ValueError where it is not zero.
+        """
         ...
 
 
@@ -93,6 +99,8 @@ class LinearMachine:
     """
 
     def __init__(self, system: control.StateSpace) -> None:
+        """Take the matrices A (n, n), B (n, inputs), C (Y, n) and the period, and bring all states to
+        zero; raises the ValueError that the class names."""
         if system.dt is None or system.dt is True or not system.dt > 0:
             raise ValueError(
                 f"LinearMachine needs a discrete system with dt in seconds; got dt = {system.dt}"
@@ -108,7 +116,10 @@ class LinearMachine:
         self.reset()
 
     def __init_subclass__(cls) -> None:
-        """Take the compiled loop from a subclass that measures or advances otherwise, and must be stepped."""
+        """Take the compiled loop from a subclass that measures or advances otherwise, and must be stepped.
+
+        Nothing is refused: `simulate` then finds no `in_loop` and goes sample by sample.
+        """
         if {"measure", "advance"} & vars(cls).keys():
             cls.in_loop = cls.joints_in_loop = None  # type: ignore[assignment]
 
@@ -370,7 +381,10 @@ class ClosedLoopTrajectory(Shown):
     measured_index: int = 0
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only and check their shapes."""
+        """Make the arrays read-only and check their shapes.
+
+        Raises the ValueError that the class names.
+        """
         lock(self, "time_s", "reference", "output", "command")
         lock(self, "limited", dtype=np.bool_)
         names = ("time_s", "reference", "output", "command", "limited")
@@ -649,7 +663,10 @@ class MeasuredSensitivity:
     limited_fraction: float
 
     def __post_init__(self) -> None:
-        """Make the arrays read-only and check their shapes."""
+        """Make the arrays read-only and check their shapes.
+
+        Raises the ValueError that the class names; values are not checked.
+        """
         lock(self, "omega_rad_s", "std")
         lock(self, "response", dtype=np.complex128)
         if not self.omega_rad_s.shape == self.response.shape == self.std.shape == (self.omega_rad_s.size,):

@@ -257,7 +257,10 @@ class SampledLoop:
     """
 
     def __init__(self, controller: Controller, plant: UncertainPlant, specification: Specification) -> None:
-        """Build the grid from the modes of plant, loop and controller, and evaluate everything on it."""
+        """Build the grid from the modes of plant, loop and controller, and evaluate everything on it.
+
+        Raises the ValueError that the class names.
+        """
         self.plant = plant
         self.controller = controller
         self.specification = specification
@@ -507,7 +510,10 @@ def _linear_responses(
     weights: list[Real] = []
 
     def at(omega: Real) -> Complex:
-        """Responses (draws, F) at omega (F,), rad/s."""
+        """Responses (draws, F) at omega (F,), rad/s.
+
+        Raises what `first_order` raises.
+        """
         points = FrequencyIntervals(omega, np.zeros(omega.size), dt_s)
         centre, generators = uncertainty.first_order(points, 0)
         if not weights:

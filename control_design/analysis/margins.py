@@ -523,6 +523,7 @@ def _unit_circle(centre: Complex, major: Complex, minor: Complex, omega: Real) -
     # Circles (b = 0) have no second-order term; a tiny one keeps the companion form and sends two roots away.
     least_second = _LEAST_SECOND_ORDER * np.abs(first)
     second = np.where(np.abs(second) < least_second, least_second + _TINY, second)
+    # One 4 x 4 companion matrix for each quartic: ones below the diagonal, coefficients in the last column.
     companion = np.zeros((c.size, 4, 4), dtype=np.complex128)
     for row in range(1, 4):
         companion[:, row, row - 1] = 1.0

@@ -119,7 +119,10 @@ class DiskMargin:
 
     @property
     def phase_rad(self) -> float:
-        """Phase, rad, that every channel may gain or lose, all at once."""
+        """Phase, rad, that every channel may gain or lose, all at once.
+
+        Between 0 and pi; nan where alpha is nan.
+        """
         return 2 * float(np.arctan(self.alpha / 2))
 
 
@@ -190,7 +193,10 @@ class MultivariableVerdict:
 
     @property
     def met(self) -> bool:
-        """Whether every bound is at most 1, and the loop at its limits ends where it has to."""
+        """Whether every bound is at most 1, and the loop at its limits ends where it has to.
+
+        False where a bound is nan.
+        """
         limited_ends = self.limited is None or self.limited.ends
         return self.proved and max(self.bounds.values()) <= 1.0 and limited_ends
 
@@ -219,14 +225,20 @@ class MultivariableCertificate(Shown):
     gamma: float = field(init=False)
 
     def __post_init__(self) -> None:
-        """Compute `gamma` from the verdicts."""
+        """Compute `gamma` from the verdicts.
+
+        ValueError without verdicts.
+        """
         stable = all(verdict.stable for verdict in self.verdicts)
         worst = max(value for verdict in self.verdicts for value in verdict.worst.values())
         object.__setattr__(self, "gamma", worst if stable else float("inf"))
 
     @property
     def met(self) -> bool:
-        """Whether the requirements are proved for every plant."""
+        """Whether the requirements are proved for every plant.
+
+        Nothing can be refused: verdicts are not empty.
+        """
         return all(verdict.met for verdict in self.verdicts)
 
 
@@ -333,7 +345,11 @@ def _verdict(
         unstable_poles += int(np.sum(outside))
 
     def determinant_less_one(asked_rad_s: Real) -> Complex:
-        """det(I + G K) - 1 (F,): takes the place of a loop gain L, whose 1 + L is counted."""
+        """det(I + G K) - 1 (F,): takes the place of a loop gain L, whose 1 + L is counted.
+
+        asked_rad_s (F,): rad/s. No unit. Other frequencies than the plant's own, where it has such, are not
+        seen: the next higher own one answers.
+        """
         if plant.own_grid is None:
             response = plant.blocks(asked_rad_s, delay)[0]
         else:

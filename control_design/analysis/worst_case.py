@@ -133,12 +133,18 @@ class PlantData:
         return np.asarray(np.max([nothing, *sizes], axis=0), dtype=np.float64)
 
     def largest(self, function: LoopFunction) -> Real:
-        """Largest weight (F,) on a closed-loop function of the members; zeros where none is asked."""
+        """Largest weight (F,) on a closed-loop function of the members; zeros where none is asked.
+
+        Times the largest gain of an independent channel. Inf where a weight is.
+        """
         return self._largest_of(each.size for each in self.weightings if each.function is function)
 
     @property
     def sensitivity(self) -> Real:
-        """Largest weight (F,) on S itself: tracking and modulus margin."""
+        """Largest weight (F,) on S itself: tracking and modulus margin.
+
+        Without independent channels, which S itself has not. Inf where a weight is.
+        """
         on_sensitivity = [
             each for each in self.weightings if each.requirement.function is LoopFunction.SENSITIVITY
         ]
@@ -153,7 +159,10 @@ class PlantData:
 
     @property
     def open_loop_disturbance(self) -> Real:
-        """Largest |W Gp| (F,) of the requirements on disturbances without a controller, at the centre."""
+        """Largest |W Gp| (F,) of the requirements on disturbances without a controller, at the centre.
+
+        No unit: W is 1/(output per input). Zeros where no peak of a mode is limited.
+        """
         centre = np.abs(self.ellipses.centre)
         sizes: list[Real] = []
         for each in self.weightings:
@@ -249,7 +258,10 @@ class WorstCase:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the weighted requirements."""
+        """Names of the weighted requirements.
+
+        At least the modulus margin's, in the order of `Specification.weighted`.
+        """
         return tuple(name for name in self.values if name != "distance")
 
     def joined(self, other: WorstCase) -> WorstCase:
@@ -307,7 +319,10 @@ def worst_case(
     """
 
     def evaluated(omega: Real) -> WorstCase:
-        """Worst cases at frequencies (N,), rad/s."""
+        """Worst cases at frequencies (N,), rad/s.
+
+        Raises what `PlantData.build` raises.
+        """
         data = PlantData.build(plant, specification, omega)
         k = response(omega)
         return WorstCase(omega, data.ellipses, k * data.delay, data.weighted(k))
@@ -351,7 +366,10 @@ class Grids:
     def __init__(
         self, plants: Sequence[UncertainPlant], specification: Specification, options: GridOptions
     ) -> None:
-        """Put every plant on its two grids, and its dense data with them."""
+        """Put every plant on its two grids, and its dense data with them.
+
+        Raises the ValueError that the class names.
+        """
         self.plants = tuple(plants)
         self.spec = specification
         self.grids: list[Real] = []
