@@ -86,7 +86,10 @@ class SpecificationItem:
 
     @property
     def proved(self) -> bool:
-        """Whether it is met for all frequencies by proof."""
+        """Whether it is met for all frequencies by proof.
+
+        False where no bound could be had, or it is inf or nan.
+        """
         return self.met and self.bound is not None and bool(np.isfinite(self.bound))
 
     @property
@@ -185,7 +188,10 @@ class WeightedRequirement(Requirement):
 
     @property
     def of_member(self) -> LoopFunction:
-        """Closed-loop function of the member: f without the factor that an independent channel replaces."""
+        """Closed-loop function of the member: f without the factor that an independent channel replaces.
+
+        A factor K stays. Nothing can be refused.
+        """
         if self.channel is None:
             return self.function
         if self.function.of_controller:
