@@ -115,7 +115,10 @@ class Ellipses:
     direction: Complex
 
     def __post_init__(self) -> None:
-        """Lock the arrays and check them."""
+        """Lock the arrays and check them.
+
+        Raises the ValueError that the class names; directions are not checked.
+        """
         lock(self, "omega_rad_s", "semi_major", "semi_minor")
         lock(self, "centre", "direction", dtype=np.complex128)
         shapes = {field.name: getattr(self, field.name).shape for field in fields(self)}
@@ -244,7 +247,10 @@ class Ellipses:
 
 
 def _compiled() -> Any:
-    """Module of the compiled functions. It is imported where one is called, because numba takes a second."""
+    """Module of the compiled functions. It is imported where one is called, because numba takes a second.
+
+    ImportError where numba is not there.
+    """
     from control_design.plants import ellipse_kernels
 
     return ellipse_kernels

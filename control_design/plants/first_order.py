@@ -59,7 +59,10 @@ class FrequencyIntervals:
 
     @property
     def z_minus_1(self) -> Complex:
-        """e^{j omega dt} - 1 at the centres, (F,) complex, without the cancellation near omega = 0."""
+        """e^{j omega dt} - 1 at the centres, (F,) complex, without the cancellation near omega = 0.
+
+        No unit. Nan where a centre is not finite.
+        """
         theta = self.centre * self.dt_s
         return np.asarray(-2.0 * np.sin(theta / 2) ** 2 + 1j * np.sin(theta), dtype=np.complex128)
 
@@ -218,12 +221,18 @@ class FirstOrder:
         return np.asarray(self.value + side * half_width * self.slope, dtype=np.complex128)
 
     def change(self) -> Real:
-        """Upper bound (F,) of the distance from the value at the middle, over the interval."""
+        """Upper bound (F,) of the distance from the value at the middle, over the interval.
+
+        In the unit of the value. Nan where value or slope is nan.
+        """
         return _norm(self.slope) * self.half_width + self.remainder
 
     def largest(self) -> Real:
         """Upper bound (F,) of the modulus over the interval. The modulus of a linear function is convex, so
-        that it is largest at one of the ends."""
+        that it is largest at one of the ends.
+
+        In the unit of the value; of Q functions it is their Euclidean norm.
+        """
         return np.maximum(_norm(self.end(1)), _norm(self.end(-1))) + self.remainder
 
 

@@ -127,6 +127,7 @@ def near_the_circle(roots_z: Complex, dt_s: float, per_decade: int = 25) -> Real
         # One more, because the points begin at a tenth of the distance.
         decades = np.log10(_WIDE_ANGLE_RAD / distance) + 1.0
         n_points = int(np.ceil(per_decade * decades))
+        # From a tenth of the distance on: nearer points would see the same response.
         offset = np.geomspace(0.1 * distance, _WIDE_ANGLE_RAD, n_points)
         parts.append(np.concatenate([angle - offset, [angle], angle + offset]))
     angles = np.concatenate(parts)

@@ -51,7 +51,10 @@ class Guard:
     response: Complex
 
     def __post_init__(self) -> None:
-        """Lock the arrays and check them."""
+        """Lock the arrays and check them.
+
+        Raises the ValueError that the class names; the number of the plant is not checked.
+        """
         lock(self, "omega_rad_s")
         lock(self, "response", dtype=np.complex128)
         omega = self.omega_rad_s
@@ -104,7 +107,10 @@ def different_responses(responses: Complex, most: int) -> Integer:
     size = np.abs(responses)
 
     def distance_from(index: int) -> Real:
-        """Distance (D,) of every draw from the one at `index`."""
+        """Distance (D,) of every draw from the one at `index`.
+
+        Between 0 and 1, no unit; nan for a draw with nan.
+        """
         difference = np.abs(responses - responses[index])
         # The smallest sum keeps 0/0, two draws that vanish at one frequency, from being nan.
         return np.asarray(np.mean(difference / np.maximum(size + size[index], 1e-300), axis=1))

@@ -113,7 +113,10 @@ class ResponseBall:
     lowest_rad_s: float = 0.0
 
     def __post_init__(self) -> None:
-        """Lock the arrays and check them."""
+        """Lock the arrays and check them.
+
+        Raises the ValueError that the class names; `lowest_rad_s` is not checked.
+        """
         lock(self, "Lo")
         if self.Lo.ndim != 2 or not np.all(np.isfinite(self.Lo)):
             raise ValueError(f"Lo must be a finite matrix (Y, P); got shape {self.Lo.shape}")
@@ -212,7 +215,10 @@ class MultivariablePlant(NominalPlant):
     output_error: tuple[RationalWeight, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check the parts against one another."""
+        """Check the parts against one another.
+
+        Raises the ValueError that the class names; poles outside the circle are allowed.
+        """
         # Imported here, because it brings a plotting library with it.
         import control
 

@@ -32,7 +32,8 @@ _SAME_FREQUENCY_SHARE = 1e-9
 # twenty states. No digit depends on it.
 _BATCH_FREQUENCIES = 2048
 
-# A pole in z with a smaller imaginary part is real, one nearer to z = 0 has died out within a sample.
+# A pole in z with a smaller imaginary part counts as real. Chosen, some million roundings of a pole near one;
+# a pair as slow would turn once in 6e9 samples.
 _REAL_BELOW = 1e-9
 
 # A pole in z nearer to 0 has died out within a sample: its frequency would be the logarithm of rounding.
@@ -111,7 +112,10 @@ class PlantChannel(NominalPlant):
     level: float = 0.95
 
     def __post_init__(self) -> None:
-        """Check nominal, level and uncertainty."""
+        """Check nominal, level and uncertainty.
+
+        Raises the ValueError that the class names; centre and covariance are checked when they are asked for.
+        """
         # Imported here and below, because it brings a plotting library with it.
         import control
 
@@ -158,7 +162,10 @@ class PlantChannel(NominalPlant):
     @property
     def own_grid(self) -> Real | None:
         """Frequencies (F,) in rad/s where alone the uncertainty is known, or None if it can be evaluated
-        anywhere."""
+        anywhere.
+
+        Not checked here: the constructor has done that.
+        """
         if self.uncertainty is None or hasattr(self.uncertainty, "at"):
             return None
         return np.asarray(self.uncertainty.omega_rad_s, dtype=np.float64)
@@ -382,7 +389,10 @@ class UncertainPlant(NominalPlant, Shown):
     level: float = 0.95
 
     def __post_init__(self) -> None:
-        """Check the parts against one another and count the integrators."""
+        """Check the parts against one another and count the integrators.
+
+        Raises the ValueError that the class names.
+        """
         if not self.name:
             raise ValueError("an uncertain plant needs a name")
         channel = self.channel
@@ -410,7 +420,10 @@ class UncertainPlant(NominalPlant, Shown):
 
     @cached_property
     def channel(self) -> PlantChannel:
-        """The response from the input to the measured output."""
+        """The response from the input to the measured output.
+
+        Raises the ValueError of `PlantChannel` when it is first asked for.
+        """
         return PlantChannel(self.nominal, self.uncertainty, self.level)
 
     @property
@@ -428,7 +441,10 @@ class UncertainPlant(NominalPlant, Shown):
 
     @cached_property
     def zeros(self) -> Complex:
-        """Finite nominal zeros in z, (n,) complex; those that are infinite but for rounding are dropped."""
+        """Finite nominal zeros in z, (n,) complex; those that are infinite but for rounding are dropped.
+
+        Empty for a static plant. By the control library, from the state space.
+        """
         if self.nominal.nstates == 0:
             return np.zeros(0, complex)
         zeros = np.asarray(self.nominal.zeros(), dtype=np.complex128)
@@ -443,7 +459,10 @@ class UncertainPlant(NominalPlant, Shown):
 
     @cached_property
     def unstable_poles(self) -> int:
-        """Number of nominal poles outside the unit circle; integrators are not among them."""
+        """Number of nominal poles outside the unit circle; integrators are not among them.
+
+        None lies on the circle: the constructor refuses that.
+        """
         return int(np.sum(np.abs(self._other_poles) > 1.0))
 
     def slow_poles_rad_s(self, below_rad_s: float) -> tuple[float, ...]:
@@ -471,14 +490,21 @@ class UncertainPlant(NominalPlant, Shown):
 
     @property
     def _other_poles(self) -> Complex:
-        """Nominal poles without the integrators, (n,) complex, the nearest to z = 1 first."""
+        """Nominal poles without the integrators, (n,) complex, the nearest to z = 1 first.
+
+        Nothing can be refused.
+        """
         by_distance = np.argsort(np.abs(self.poles - 1.0), kind="stable")
         return self.poles[by_distance][self.n_integrators :]
 
     @property
     def ellipse_modes(self) -> tuple[Mode, ...]:
-        """Flexible modes of the poles on which the ellipses of both channels stand; the nominal need not have
-        them. Empty where an uncertainty is no posterior over basis functions."""
+        """Flexible modes of the basis functions whose coefficients the posteriors of both channels are about.
+
+        An ellipse is narrow or wide around them, and the nominal need not have them. Ascending in frequency
+        by channel, twice where both channels have one; none of an uncertainty that is no posterior. Nothing
+        is checked.
+        """
         # Imported here, because it brings compiled kernels with it.
         from ident.uncertainty import ResponsePosterior
 

@@ -361,7 +361,10 @@ def _begin(
 ) -> None:
     """Write scalings to begin with into log_t (N,): the stationary ones for blocks and a performance that
     have one direction each. base is not used; it is here so that all functions of a problem take the same
-    parts."""
+    parts.
+
+    performance (Y, Y), seen and entering (N, Y, Y). A nan in them shows no stability in `_at`.
+    """
     whole = _trace(performance)
     total = 0.0
     for i in range(log_t.size):

@@ -254,7 +254,10 @@ def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list
     """
 
     def slope(p: complex) -> FirstOrder:
-        """Derivative of log B by p, which stands in z - p and in 1 - p z: 1/(z - p) - z/(1 - p z)."""
+        """Derivative of log B by p, which stands in z - p and in 1 - p z: 1/(z - p) - z/(1 - p z).
+
+        ZeroDivisionError for p = 0.
+        """
         # -z / (1 - p z) = 1/p + 1/p^2 / (z - 1/p)
         mirrored = intervals.constant(1 / p) + intervals.pole(1 / p - 1.0).scaled(1 / p**2)
         return intervals.pole(p - 1.0) + mirrored

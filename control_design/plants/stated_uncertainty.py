@@ -59,7 +59,10 @@ class StatedDiscs:
     level: float = 0.95
 
     def __post_init__(self) -> None:
-        """Check weight and level."""
+        """Check weight and level.
+
+        Raises the ValueError that the class names.
+        """
         roots = np.roots(self.weight.denominator)
         on_axis = np.abs(roots.real) <= _AXIS_SHARE * (1.0 + np.abs(roots))
         if np.any(on_axis):
