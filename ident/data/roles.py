@@ -8,6 +8,10 @@ test in `ident.data.causality`).
 
 What remains in doubt is asked for: every complaint ends with a command that works as it is typed (`_ask`). It
 proposes columns by weaker signs, as whether a command moves them; these decide nothing by themselves.
+
+Every name that functions here take is a column of the table; another one ends in KeyError where its cells are
+asked for. A number in `shown(text, 30)` is how many characters of a name a complaint quotes, so that it stays
+within 300 characters with its command; it decides nothing.
 """
 
 from __future__ import annotations
@@ -81,8 +85,9 @@ _MOVED_KINDS = frozenset(
 # Where a word begins inside of another: posRef, SetAngle.
 _CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 # Letters in which names of a reference and its output differ behind what they share: y and yr, qg and qm, x1
-# and xr. Two columns that are called by whole words are asked about. Doubled or halved, no test of units
-# moves.
+# and xr. These need one letter; two leave room for a sensor's number behind it (y1 and yr1). Three would take
+# words: ref, set, cmd, act. Two columns that are called by whole words are asked about. Chosen; doubled or
+# halved, no test of units moves.
 _TWIN_LETTERS = 2
 # Columns that are compared with each other at most: the number of pairs grows with their square, and a pair
 # takes up to twelve least-squares fits of the whole log. More are asked about. Halved, no test of units
@@ -129,7 +134,8 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
         What a complaint offers to type: 'flexlink COMMAND LOG ...'; log as a shell takes it, with the options
         that were given and are no roles.
     stated : str or None
-        input, output, time and reference, as far as the user named them.
+        input, output, time and reference, as far as the user named them. Taken as they are: a name that is no
+        column is not refused here, but by `Table.columns`. Other keys only keep their column from a role.
 
     Returns
     -------
@@ -139,7 +145,8 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
     Raises
     ------
     ValueError
-        A role has no column or several: the message names them, and ends with a command that works.
+        A role has no column or several: the message names them, and ends with a command that works. Cells
+        that hold no numbers are not refused here; their column is judged by its name alone.
 
     Notes
     -----
@@ -214,8 +221,10 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
 def _with_reference(table: Table, roles: Roles, wished: Sequence[str], typed: str) -> Roles:
     """The roles with their reference: what is wished for the output, in its unit, else of its quantity.
 
-    wished: columns that may be it; typed: the command so far. Where the only one is in another unit, the
-    roles come without it and with a doubt. Raises ValueError for several that fit.
+    roles: with input and output (names of columns), reference None. wished: columns that may be it; typed:
+    the command so far. Where the only one is in another unit, the roles come without it and with a doubt;
+    where it is a speed to a position, or the other way, without either. Raises ValueError for several that
+    fit.
     """
     output_unit = table.unit(roles.output)
     candidates = [name for name in wished if name not in (roles.input, roles.output)]
@@ -315,7 +324,12 @@ def _loop_of_twins(
 
 
 def _are_twins(table: Table, first: str, second: str) -> bool:
-    """Whether two names have one unit and one beginning, and differ in `_TWIN_LETTERS` behind it at most."""
+    """Whether two names have one unit and one beginning, and differ in `_TWIN_LETTERS` behind it at most.
+
+    Letters and digits alone are compared, capitals as small letters, the unit in the name left out. False
+    without a common beginning, and where both endings are digits (x1 and x2); x1 and x12 are twins, as one
+    ending is empty: `_is_loop` then asks the numbers. Two equal names are twins.
+    """
     if table.unit(first) != table.unit(second):
         return False
     unit = table.unit(first).replace("/", "_")
@@ -327,14 +341,17 @@ def _are_twins(table: Table, first: str, second: str) -> bool:
             break
         n_shared += 1
     endings = [stem[n_shared:] for stem in stems]
-    # x1 and x2, channel 1 and channel 2 are numbered, not paired.
+    # x1 and x2, channel 1 and channel 2 are numbered, not paired: both endings are digits.
     if n_shared == 0 or all(ending.isdigit() for ending in endings):
         return False
     return max(map(len, endings)) <= _TWIN_LETTERS
 
 
 def _is_loop(table: Table, loop: _Loop) -> bool:
-    """Whether the numbers of three columns are those of a closed loop; not where one has other cells."""
+    """Whether the numbers of three columns are those of a closed loop; not where one has other cells.
+
+    False, too, for columns that `Table.columns` refuses.
+    """
     with suppress(ValueError):  # cells that hold no number are somebody else's to say
         return is_loop(*table.columns([loop.reference, loop.output, loop.command]).values())
     return False
@@ -351,8 +368,9 @@ def _ask(
 ) -> NoReturn:
     """Raise ValueError: a role has no column or several. The message ends with a command to type.
 
-    typed: the command so far; known: the columns of roles that are; inputs, outputs, wished: columns that
-    may be input, output and reference; left: columns of no role.
+    typed: the command so far; known: by role (input, output, reference, time) its column, None where it is
+    asked for; inputs, outputs, wished: columns that may be input, output and reference, each perhaps empty;
+    left: columns of no role. Reads cells to propose columns; those that hold no numbers are passed over.
     """
     # A column that would be it, but stands still.
     for role, candidates in (("input", inputs), ("output", outputs)):
@@ -373,6 +391,7 @@ def _ask(
     pair = None
     if not known["output"] and not reference:
         pair = _led_and_follower(table, outputs)
+    # Without an output two columns have to be left over, or one wished for: one drives, the other moves.
     nothing_left = not left if outputs else len(left) < 2 and not wished
     if nothing_left and not inputs and not known["input"]:
         named = _typed({"input": pair.leading, "output": pair.following}) if pair else "--input NAME"
@@ -430,17 +449,23 @@ def _ask(
 
 
 def _typed(options: Mapping[str, str | None]) -> str:
-    """Options with their values as they are typed, names in full; those without a value are left out."""
+    """Options with their values as they are typed, names in full; those without a value are left out.
+
+    Empty for no options. Names of options are not checked.
+    """
     return " ".join(f"--{option} {as_typed(value)}" for option, value in options.items() if value)
 
 
 def _not_in(excluded: set[str], names: list[str]) -> list[str]:
-    """Names that are not among the excluded ones; all of them where none is left."""
+    """Names that are not among the excluded ones; all of them where none is left.
+
+    In their order; empty for no names.
+    """
     return [name for name in names if name not in excluded] or names
 
 
 def _only(names: Sequence[str]) -> str | None:
-    """The name, where there is just one; else None."""
+    """The name, where there is just one; else None. None, too, for no name."""
     return names[0] if len(names) == 1 else None
 
 
@@ -471,14 +496,20 @@ def _led_and_follower(table: Table, names: list[str]) -> _Pair | None:
 
 
 def _is_moved(table: Table, name: str, command: str) -> bool:
-    """Whether a command moves a column, as far as their numbers tell; not where one has other cells."""
+    """Whether a command moves a column, as far as their numbers tell; not where one has other cells.
+
+    Ones with too few samples to tell are not moved (`is_moved_by`).
+    """
     with suppress(ValueError):
         return is_moved_by(*table.columns([name, command]).values())
     return False
 
 
 def is_time(table: Table, name: str) -> bool:
-    """Whether a column looks like time: dates, a unit of time, or its name."""
+    """Whether a column looks like time: dates, a unit of time, or its name.
+
+    KeyError for a name that is no column.
+    """
     if table.is_clock(name) or says_time(name):
         return True
     unit = TIME_UNITS.get(table.unit(name).lower(), "")
@@ -492,7 +523,8 @@ def is_time(table: Table, name: str) -> bool:
 def times_in(table: Table) -> list[str]:
     """The columns that look like time; of several those that increase, if there are any.
 
-    Where none looks like it, those that may be called so ('cycle_time') and increase.
+    Where none looks like it, those that may be called so ('cycle_time') and increase. Empty where none does;
+    cells without numbers do not increase.
     """
     times = [name for name in table.names if is_time(table, name)]
     if not times:
@@ -505,7 +537,10 @@ def times_in(table: Table) -> list[str]:
 
 
 def rising(table: Table) -> list[str]:
-    """The first column, if it increases by no whole numbers, as a row's number does: it may be time."""
+    """The first column, if it increases by no whole numbers, as a row's number does: it may be time.
+
+    The list has one name or none; no columns, or a first one that holds no numbers: empty.
+    """
     first = list(table.names[:1])
     if first and _increases(table, first[0]):
         numbers = table.columns(first)[first[0]]
@@ -520,21 +555,31 @@ def time_of(table: Table) -> str | None:
 
 
 def _holds(table: Table, name: str, what: Callable[[RealArray], object], otherwise: bool = False) -> bool:
-    """Whether something holds of the numbers (T,) of a column; `otherwise` where a cell is no number."""
+    """Whether something holds of the numbers (T,) of a column; `otherwise` where a cell is no number.
+
+    what: takes the numbers (T,), and its answer is taken as true or false. Of a column without rows numpy may
+    raise ValueError, which counts as a cell that is no number.
+    """
     with suppress(ValueError):
         return bool(what(table.columns([name])[name]))
     return otherwise
 
 
 def _is_text(values: object) -> bool:
-    """Whether a column, as a `Table` has it in `raw`, holds words alone, or nothing that is read."""
+    """Whether a column, as a `Table` has it in `raw`, holds words alone, or nothing that is read.
+
+    Not checked beyond that: a column that is text in half of its cells is none.
+    """
     if isinstance(values, tuple):
         return not any(is_number(cell, sign) for cell in values for sign in ".,")
     return isinstance(values, Unread) or np.asarray(values).dtype.kind in "USO"
 
 
 def _increases(table: Table, name: str) -> bool:
-    """Whether each number of a column is larger than the one before."""
+    """Whether each number of a column is larger than the one before.
+
+    False where a cell is no number; a column of one row does.
+    """
     return _holds(table, name, lambda values: np.all(np.diff(values) > 0))
 
 
@@ -549,7 +594,11 @@ def _is_signal(table: Table, name: str) -> bool:
 
 
 def is_position(name: str, unit: str) -> bool:
-    """Whether an output is a position by its unit, else by its name; not its speed or acceleration."""
+    """Whether an output is a position by its unit, else by its name; not its speed or acceleration.
+
+    unit: '' where none is known, then the name decides; a unit that is not known counts as a position unless
+    it looks like a rate. True without either.
+    """
     if unit:
         return "/" not in kind_of(unit) and _RATE.search(unit) is None
     return _RATE_NAME.search(in_short(name)) is None
@@ -569,7 +618,10 @@ def _quantity(table: Table, name: str) -> _Quantity:
 
 
 def _is_wished(table: Table, name: str) -> bool:
-    """Whether a name says what the motion should be: 'posRef', 'Sollwinkel', 'r_deg'."""
+    """Whether a name says what the motion should be: 'posRef', 'Sollwinkel', 'r_deg'.
+
+    False for an empty name.
+    """
     short = in_short(name)
     words_apart = _CAMEL.sub("_", short)
     if _WISHED.search(words_apart):
@@ -582,7 +634,8 @@ def _is_wished(table: Table, name: str) -> bool:
 
 
 def _role_by_name(table: Table, name: str) -> str:
-    """What a column is: 'input', 'output', 'v' (a voltage or a speed), 'counted', or empty.
+    """What a column is: 'input', 'output', 'v' (a voltage or a speed), 'counted', or empty for no sign of
+    either.
 
     Its unit says it, where there is one, else the last word of its name that speaks of either, else the
     letter that it begins with. A unit of counts leaves it to the name, else 'counted'.
@@ -611,7 +664,8 @@ def _role_by_name(table: Table, name: str) -> str:
 def _roles_of_v(role: Mapping[str, str]) -> dict[str, str]:
     """What columns called v are, by name; role: of every column.
 
-    They are voltages unless another column is the input; then speeds, unless another one is the output.
+    They are voltages unless another column is the input; then speeds, unless another one is the output. Other
+    columns are left out; empty where none is called so.
     """
     ambiguous = [name for name, kind in role.items() if kind == "v"]
     kinds = set(role.values())

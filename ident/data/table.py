@@ -5,6 +5,9 @@ known of their lines and units. Nothing is converted before it is asked for, so 
 needs may hold anything. `Table.columns` gives equally long vectors of finite numbers, `Table.stamps` times
 that increase, in seconds; a cell that cannot be taken is quoted with its line. Where nobody can tell what a
 cell means, as of '1.500', the user is asked.
+
+A number in `shown(text, 40)` is how many characters of a name or cell a complaint quotes: enough to find it
+in the file, few enough that the complaint stays below 300 characters. It decides nothing.
 """
 
 from __future__ import annotations
@@ -100,7 +103,8 @@ class Table:
     def place(self, row: int, name: str | None = None) -> str:
         """Where a row (from 0) of this run stands in the file: 'line 12', or 'index 11' without lines.
 
-        name: the column, where columns may have rows of their own.
+        name: the column, where columns may have rows of their own. A row beyond the file is not refused here,
+        except with clocks, where the lookup ends in IndexError.
         """
         if self.first_line is None:
             return f"index {row + self.begin}"
@@ -113,6 +117,9 @@ class Table:
 
     def runs(self, time: str | None) -> list[Table]:
         """The runs in a table: its parts, where time starts again and another column says so.
+
+        Nothing is refused: the table alone comes back, too, where there is no such column, its cells are no
+        finite times, or columns have rows of their own.
 
         Parameters
         ----------
@@ -158,7 +165,10 @@ class Table:
 
     @property
     def sparse(self) -> bool:
-        """Whether it is a table of text whose columns have rows of their own."""
+        """Whether it is a table of text whose columns have rows of their own.
+
+        A bag, whose columns have clocks but no lines of text, is not.
+        """
         return bool(self.clocks) and self.layout is not None
 
     def with_decimal(self, sign: str | None) -> Table:
@@ -176,7 +186,11 @@ class Table:
         return replace(self, layout=replace(self.layout, decimal=sign, stated=True))
 
     def unit(self, name: str) -> str:
-        """The unit of a column as the file has it, beside the name or in it; empty if there is none."""
+        """The unit of a column as the file has it, beside the name or in it; empty if there is none.
+
+        Of a name that is no column only the name is read. A unit that nobody knows comes back as it is
+        written.
+        """
         unit = self.units.get(name, "") or written_unit(name)
         return SIGNAL_WORDS.get(unit.lower(), unit)
 
@@ -199,15 +213,16 @@ class Table:
         Parameters
         ----------
         wanted : sequence of str
-            Names.
+            Names, at least one; a name that is there twice counts once.
         rows_of : str, optional
-            Column whose rows count, where columns have rows of their own; else the first wanted one.
+            Column whose rows count, where columns have rows of their own (KeyError for one without); default:
+            the first wanted one. Ignored in a table without clocks.
 
         Returns
         -------
         dict of str to ndarray, shape (T,)
             Dates and clock times are in seconds since the first. Where columns have rows of their own, the
-            others hold what came last, from the row on at which all have come.
+            others hold what came last, from the row on at which all have come; without such a row, T = 0.
 
         Raises
         ------
@@ -231,13 +246,16 @@ class Table:
         sizes = {name: column.size for name, column in columns.items()}
         if len(set(sizes.values())) > 1:
             raise ValueError(
-                f"{self.path}: columns must be equally long; got {shown(str(sizes), 160)}: cut them to the "
-                "samples of one time"
+                f"{self.path}: columns must be equally long; got {shown(str(sizes), _LONGEST_LIST)}: cut "
+                "them to the samples of one time"
             )
         return columns
 
     def _alike(self, wanted: str) -> list[str]:
-        """Columns of one name, as `distinct` tells them apart: '#1 angle', '#2 angle'."""
+        """Columns of one name, as `distinct` tells them apart: '#1 angle', '#2 angle'.
+
+        Empty where no column or a single one has the name.
+        """
         if not wanted:
             return []
         return [name for name in self.names if re.fullmatch(rf"#\d+ {re.escape(wanted)}", name)]
@@ -245,7 +263,8 @@ class Table:
     def listed(self, wanted: str = "") -> str:
         """Names of columns in a line for a complaint: all, or those that are meant by a name.
 
-        wanted: the name of a matrix or struct, whose columns are listed, or one that several columns have.
+        wanted: the name of a matrix or struct, whose columns are listed, or one that several columns have. A
+        name that nothing begins with lists all. Names beyond `_MOST_LISTED` are counted, not listed.
         """
         names = self._alike(wanted)
         if not names and wanted:
@@ -261,7 +280,11 @@ class Table:
         return shown(listed, _LONGEST_LIST) + hint
 
     def is_clock(self, name: str) -> bool:
-        """Whether a column holds dates or clock times, which need no unit."""
+        """Whether a column holds dates or clock times, which need no unit.
+
+        Of text the first filled cell decides; a column without a filled cell is none. KeyError for a name
+        that is no column.
+        """
         values = self.raw[name]
         if isinstance(values, tuple):
             first_filled = next((cell for cell in values if cell), "")
@@ -272,7 +295,9 @@ class Table:
     def _numbers(self, name: str) -> RealArray:
         """A column as finite numbers (T,); dates and clock times in seconds since the first.
 
-        Raises ValueError that quotes what cannot be taken.
+        Raises ValueError that quotes what cannot be taken: text, complex numbers or objects in an array
+        (`as_numbers`), another shape than (T,), an instant that is missing, a number that `_finite` refuses.
+        KeyError for a name that is no column.
         """
         column = self.raw[name]
         if isinstance(column, tuple):
@@ -290,7 +315,7 @@ class Table:
             if np.isnat(values).any():
                 row = int(np.argmax(np.isnat(values)))
                 raise ValueError(f"{self.path}, {self.place(row, name)}: column '{shown(name)}' is empty")
-            # The difference first: instants are exact, doubles of them are not.
+            # The difference first: instants are exact, doubles of them are not. 1e9 ns are a second.
             since_first = values - values[:1]
             values = since_first / np.timedelta64(1, "ns") / 1e9
         return self._finite(name, values.astype(np.float64), values)
@@ -298,7 +323,8 @@ class Table:
     def _parsed(self, name: str, cells: tuple[str, ...]) -> RealArray:
         """Numbers (T,) of a column of text, NaN for what is none; stamps in seconds since the first.
 
-        Raises ValueError for a stamp that is none, and where a sign may separate decimals or thousands.
+        Raises ValueError for a stamp that is none, and where a sign may separate decimals or thousands. An
+        empty cell is NaN as well, which `_finite` then refuses.
         """
         if name in self.parsed:
             return self.parsed[name].copy()
@@ -328,11 +354,17 @@ class Table:
     def _refuse_doubtful_groups(self, name: str, cells: tuple[str, ...]) -> None:
         """Raise ValueError where '1.500' in a column may be one and a half, or fifteen hundred.
 
-        Nothing is refused where the user stated the decimal sign.
+        cells: the column as text, (T,). Doubtful is a column in which every cell with a point or comma has
+        exactly three digits behind it (`doubtful_groups`, which says the first such row). The table's own
+        decimal sign counts as proven, and only the other one is doubted, where some cell of the table leaves
+        no doubt of it ('0.5': `Layout.plain`). Nothing is refused where the user stated the decimal sign, or
+        where the table is no text.
         """
         if self.layout is None or self.layout.stated:
             return
-        # Between commas a point is a decimal sign, but in a column of counts, which are whole.
+        # In a table separated by commas a comma cannot separate decimals, so that a point does: proven, too.
+        # Not so in a column of counts: these are whole, and a point in them rather groups thousands. Per cent
+        # are in `COUNTED` as a unit of unknown size, but they need not be whole.
         is_counted = says_counts(name) or kind_of(self.unit(name)) in COUNTED - {"%"}
         is_proven = self.layout.plain or (self.layout.separator == "," and not is_counted)
         row = doubtful_groups(cells, self.layout.decimal, proven=is_proven)
@@ -348,7 +380,7 @@ class Table:
         """The numbers (T,) of a column, where all are finite and `LARGEST` at most.
 
         cells: what they were read from. Raises ValueError that quotes the first that is not, and says what to
-        do.
+        do. numbers: NaN where a cell is no number. An empty column comes back as it is.
         """
         bad_rows = np.flatnonzero(~(np.abs(numbers) <= LARGEST))
         if not bad_rows.size:
@@ -373,7 +405,8 @@ class Table:
                 "again, or write values"
             )
 
-        # A few such rows may be left out; of more it is no column of numbers.
+        # Where fewer than half of the rows are bad they may be left out; of more it is no column of numbers.
+        # "1e100" below is `LARGEST`.
         is_too_large = bool(np.isfinite(numbers[row]))
         sign = " with a decimal comma" if self.layout and self.layout.decimal == "," else ""
         limit = " up to 1e100" if is_too_large else ""
@@ -393,7 +426,7 @@ class Table:
         name : str
             Column of time.
         stamps : ndarray, shape (T,)
-            Its numbers, as of `columns`.
+            Its numbers, as of `columns`: finite, in the unit of the column. None, or a single one, pass.
         unit : str or None
             Unit that the user states.
 
@@ -446,13 +479,16 @@ class Table:
             )
         if unit is not None and not (is_unclear and unit in ("h", "min")):
             raise ValueError(f"{self.path}: '{shown(name)}' holds clock times; they have no unit")
+        # '12:30' was taken for hours and minutes; as minutes and seconds it is a sixtieth of that.
         seconds = stamps / 60 if unit == "min" else stamps
         return seconds, TimeColumn(name, "s", "s", stated=True)
 
     def _since_first(self, name: str, stamps: RealArray) -> RealArray:
         """Stamps (T,) of a column, in its unit; since the first one where they are long (`_LONG_STAMP`).
 
-        Integers and text with more digits than doubles keep them in the difference.
+        Integers and text with more digits than doubles keep them in the difference. Cells of text that are no
+        plain decimals (with groups, brackets or a Fortran exponent) are not refused: the difference is then
+        one of doubles.
         """
         values = self.raw[name]
         if not stamps.size or abs(stamps[0]) < _LONG_STAMP:
@@ -490,11 +526,14 @@ class Table:
         -------
         seconds : ndarray, shape (T,)
         column : TimeColumn
+            Its `unit` is what the stamps were taken for, `doubtful` whether that looks wrong.
 
         Raises
         ------
         ValueError
-            As of `columns`, `seconds` and `increasing`.
+            No such column, cells that are no finite numbers, or columns of different length (`columns`); a
+            unit that is not known or makes no time (`seconds`); fewer than two stamps, or a stamp that is not
+            later than the one before (`increasing`).
         """
         wanted = [name] if rows_of is None else [name, rows_of]
         numbers = self.columns(wanted, rows_of)[name]
@@ -506,7 +545,7 @@ class Table:
         """Raise ValueError unless there are two time stamps (T,) at least, each later than the one before.
 
         stamps: in seconds; name: of their column. The message says what to do: of a repeated row, a single
-        row without a time, or a log that starts again.
+        row without a time, or a log that starts again. A stamp that is NaN counts as not later.
         """
         if stamps.size < 2:
             raise ValueError(
@@ -538,7 +577,9 @@ def _split(name: str, values: Any) -> dict[str, Any]:
 
     A matrix (T, C), or (C, T) as of Simulink, is C columns; (T, 1) and (1, T) are vectors. An array of
     records is a column for each field, name.field; lists in cells of text, '[0.1, 0.2]', are as of
-    `columns_in`.
+    `columns_in`. Nothing is refused here: an array of three dimensions, or one with more than `MOST_COLUMNS`
+    on both sides, stays one thing, which `Table._numbers` refuses when it is asked for; cells of text that
+    are no list make no entry in that row.
     """
     if isinstance(values, tuple) and values and _LIST.match(values[0]):
         lists = list[list[str] | None]()

@@ -8,7 +8,9 @@ quantity a unit is and how large. `contradicted_by_loop` compares the numbers of
 of its columns.
 
 Time is converted to seconds; every other signal keeps its unit, which is carried along for display. What no
-rule covers is asked for, never guessed.
+rule covers is asked for, never guessed. Functions that ask whether or which take any text, also an empty one,
+and raise nothing unless they say so. A number in `shown(text, 60)` is how many characters of it a complaint
+quotes; it decides nothing.
 """
 
 from __future__ import annotations
@@ -75,7 +77,8 @@ _UNITS_WITH_WORDS = (
     _SignalUnit("rad", 1.0, "rad radian radians"),
     _SignalUnit("rad", np.pi / 180, "deg degree degrees"),
 )
-# Other units of signals. Counts of each sort stand alone: how large one is only the machine knows.
+# Other units of signals; 0.0254 m are an inch by definition. Counts of each sort stand alone: how large one
+# is only the machine knows.
 _OTHER_UNITS = (
     _SignalUnit("rad", np.pi / 180, "° grad"),
     _SignalUnit("m", 1.0, "m meter metre meters metres"),
@@ -104,7 +107,8 @@ SIGNAL_WORDS = {
     word: unit.spellings.split()[0] for unit in _UNITS_WITH_WORDS for word in unit.spellings.split()[1:]
 }
 """The unit of each word for it, as instruments write them in a line of units: 'V' of 'volts'."""
-# Prefixes of units of signals, and what stands behind one.
+# Prefixes of units of signals as SI has them, and the units that may stand behind one: of deg, rev and counts
+# nobody writes thousandths. G and p are left out, as no machine is logged in them.
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "k": 1e3, "M": 1e6}
 _PREFIXED = re.compile(r"([nuμmckM])(V|A|N|Nm|rad|m|W|Hz|Pa)")
 # A rate: what changes, the sign of 'per', the unit of time, and its power, as in 'rad/s', 'deg_s', 'm/s^2'.
@@ -168,7 +172,8 @@ _COUNTS = re.compile(
     r"ticks?|counts?|cycles?|samples?|frames?|steps?|jiffies|index|idx|sequence|takte?|zykl(?:en|us)|weeks?|"
     r"months?|years?|picosec\w*|[cdkpf]s"
 )
-# Letters of a word that is rather a unit, or its prefix, than a name where it stands behind one for time.
+# Letters, at most, of a word that is rather a unit, or its prefix, than a name where it stands behind one for
+# time: units of time are abbreviated by one letter or two (m, cs, us).
 _SHORT_WORD = 2
 # The last word of a name that may be one of time.
 _ENDS_WITH_TIME = re.compile(r"\w*(time|timestamp|stamp|zeit|clock)")
@@ -191,8 +196,9 @@ _SLOW_POWER = 0.03
 # Lines that these are at least, so that the coherence means something: of unrelated signals it is 1 / 16 in
 # the mean. Doubled or halved, no test of units or records moves.
 _FEWEST_LINES = 8
-# Factor within which an output follows its reference as it stands. Measured and simulated loops follow to a
-# factor of 1.1 there. With 1.15 a slow loop in another unit is no longer seen (test_units).
+# Factor, either way, within which an output follows its reference as it stands. Measured and simulated loops
+# follow to a factor of 1.1 there; units that are confused differ by 57 at least. With 1.15 a slow loop in
+# another unit is no longer seen (test_units).
 _FOLLOWS_WITHIN = 1.3
 # Coherence from which on an output follows at all: that of measured and simulated loops is .9 and more there.
 # Halved, no test of units moves; doubled, only what is computed follows.
@@ -206,9 +212,11 @@ LONG_STEP_S = 0.5
 second."""
 # Shortest step of a machine's log, s: 1 MHz, which no controller of a motion has.
 _SHORTEST_S = 1e-6
-# Longest step, s, of a machine whose motion the samples show.
+# Longest step, s, of a machine whose motion the samples show: at one sample a second a motion of two seconds
+# is the fastest that can be seen, slower than any arm. Chosen.
 _LONGEST_S = 1.0
-# Longest step, s, with the jitter of stamps: a log at 1 Hz is to be seen as one.
+# Longest step, s, with the jitter of stamps, 1 % (that of `time_grid.TIME_TOLERANCE`): a log at 1 Hz is to be
+# seen as one.
 _LONGEST_WITH_JITTER_S = 1.01 * _LONGEST_S
 # Shortest step, s, of a log that is proposed in another unit: 10 kHz, as fast as machines are usually logged.
 _SHORTEST_USUAL_S = 1e2 * _SHORTEST_S
@@ -221,12 +229,14 @@ _SHORTEST_UNSTATED_S = _LONGEST_WITH_JITTER_S / _SECONDS_PER["d"]
 _FIRST_DATE_S = 978_307_200.0
 # Seconds from 1970 to 2100.
 _LAST_DATE_S = 4_102_444_800.0
-# Longest time of a clock, s: none counts 3000 years.
+# Longest time of a clock, s: none counts 3000 years (1e11 s are 3169).
 _NO_CLOCK_S = 1e11
 
 
 def unit_of_time(name: str, beside: str = "") -> tuple[str, str]:
     """The unit of a column of time as a file says it, and what is unclear about it; one of both is empty.
+
+    Any text is taken; of a name without a word both are empty.
 
     Parameters
     ----------
@@ -306,7 +316,10 @@ def unit_of_time(name: str, beside: str = "") -> tuple[str, str]:
 
 
 def in_short(name: str) -> str:
-    """What is read of a name: all but its middle, where it is longer than any name that people read."""
+    """What is read of a name: all but its middle, where it is longer than any name that people read.
+
+    Not longer than `_LONGEST_NAME` characters and a blank; an empty name stays empty.
+    """
     if len(name) <= _LONGEST_NAME:
         return name
     half = _LONGEST_NAME // 2
@@ -314,7 +327,10 @@ def in_short(name: str) -> str:
 
 
 def _time_units_in(words: Sequence[str]) -> list[str]:
-    """The units of time among words in lower case, in their order, each as `KNOWN_TIME_UNITS` spells it."""
+    """The units of time among words in lower case, in their order, each as `KNOWN_TIME_UNITS` spells it.
+
+    Empty where none is.
+    """
     return [TIME_UNITS[word] for word in words if word in TIME_UNITS]
 
 
@@ -322,7 +338,7 @@ def _words(text: str) -> list[str]:
     """The words of a name in lower case, without digits.
 
     Capitals begin a word ('timeMs'), and a unit that is glued to the word for time is one of its own
-    ('elapsedms').
+    ('elapsedms'). Empty for text without letters.
     """
 
     def unit_of_prefix(prefix: re.Match[str]) -> str:
@@ -347,7 +363,10 @@ def _words(text: str) -> list[str]:
 
 @lru_cache(_CACHED_NAMES)
 def says_time(name: str) -> bool:
-    """Whether a name is one of time: 'Zeit', 'timeMs', 'millis', 'us since start'; not 'counts_s'."""
+    """Whether a name is one of time: 'Zeit', 'timeMs', 'millis', 'us since start'; not 'counts_s'.
+
+    False for a name without letters.
+    """
     words = _words(in_short(unicodedata.normalize("NFKC", name)))
     if not words:
         return False
@@ -363,20 +382,29 @@ def says_time(name: str) -> bool:
 
 
 def ends_with_time(name: str) -> bool:
-    """Whether a name may be one of time: 'host_time', 'uptimems', 'bagTimestamp', but also 'cycle_time'."""
+    """Whether a name may be one of time: 'host_time', 'uptimems', 'bagTimestamp', but also 'cycle_time'.
+
+    False for a name without letters.
+    """
     words = [word for word in _words(in_short(name)) if word not in TIME_UNITS]
     return bool(words) and _ENDS_WITH_TIME.fullmatch(words[-1]) is not None
 
 
 def says_counts(name: str) -> bool:
-    """Whether a name speaks of counts, which are whole numbers: 'encoder_counts', 'inc', 'ticks left'."""
+    """Whether a name speaks of counts, which are whole numbers: 'encoder_counts', 'inc', 'ticks left'.
+
+    Per cent are no counts: they need not be whole.
+    """
     sizes = [_SIZES.get(word) for word in _words(in_short(name))]
     kinds = {size.kind for size in sizes if size is not None}
     return not kinds.isdisjoint(COUNTED - {"%"})
 
 
 def begins_with_time_unit(name: str) -> bool:
-    """Whether a name begins with a unit of time, 'ms_since_power_on', and says no other unit at its end."""
+    """Whether a name begins with a unit of time, 'ms_since_power_on', and says no other unit at its end.
+
+    False for a name of one word, and for minutes, hours and days.
+    """
     words = _words(in_short(name))
     if len(words) < 2 or written_unit(name):
         return False
@@ -397,7 +425,8 @@ def stated_time_unit(stated: str) -> str:
 def _unit_of_step(step_s: float) -> str:
     """The unit in which a step that was taken as seconds would be one of a machine: ms, us, or else ns.
 
-    Machines are logged faster than twice a second: steps of 4 are milliseconds, of 4000 microseconds.
+    Machines are logged faster than twice a second: steps of 4 are milliseconds, of 4000 microseconds. step_s:
+    positive; not checked. Steps below half a second give ms as well, which no caller asks for.
     """
     for unit in ("ms", "us"):
         if step_s < LONG_STEP_S * _PER_SECOND[unit]:
@@ -437,13 +466,19 @@ class TimeColumn:
     wraps: int = field(default=0, metadata={"since": 2})
 
     def timer(self, record: str) -> Finding:
-        """The finding on stamps of a record (by its label) that start again and were read as going on."""
+        """The finding on stamps of a record (by its label) that start again and were read as going on.
+
+        period in the column's unit; to be asked for only where `wraps_at` is not 0.
+        """
         return finding(
             FindingKind.TIMER_WRAPS, record=record, name=self.name, period=self.wraps_at, count=self.wraps
         )
 
     def doubt(self, dt_s: float) -> Finding:
-        """The finding on a doubtful column with steps of dt_s seconds; it names the option that mends it."""
+        """The finding on a doubtful column with steps of dt_s seconds; it names the option that mends it.
+
+        dt_s: the step as it was taken; not checked. Whether the column is doubtful is for the caller to see.
+        """
         unit = _unit_of_step(dt_s) if self.unit == "s" else "s"
         return finding(
             FindingKind.TIME_UNIT,
@@ -492,7 +527,10 @@ class TimeColumn:
         """Raise ValueError where stamps (T,), in the unit taken, are no time of any clock or machine.
 
         They are dates of this century in another unit, later than any clock counts, or have steps that are
-        too short. The message proposes units that fit. Nothing is refused where the user stated the unit.
+        too short: below `_SHORTEST_S`, or `_SHORTEST_UNSTATED_S` where no unit is stated. Only the first
+        stamp and the median step are looked at; fewer than three stamps have no usual step, and none at all
+        pass, as do NaN and steps that are not positive (`Table.increasing` refuses those). The message
+        proposes units that fit. Nothing is refused where the user stated the unit.
         """
         if self.stated or not stamps.size:
             return
@@ -528,7 +566,10 @@ class TimeColumn:
         )
 
     def seconds(self, stamps: RealArray) -> RealArray:
-        """Stamps (T,), in the unit taken, in seconds."""
+        """Stamps (T,), in the unit taken, in seconds.
+
+        Nothing is checked: NaN stays NaN; KeyError for a unit that is none of `KNOWN_TIME_UNITS`.
+        """
         if self.unit in _SECONDS_PER:
             return np.asarray(stamps * _SECONDS_PER[self.unit], dtype=np.float64)
         return np.asarray(stamps / _PER_SECOND[self.unit], dtype=np.float64)
@@ -548,6 +589,7 @@ class TimeColumn:
             is_fast = self.seconds(step) < _DOUBTFUL_S
             usual_as_seconds = _SHORTEST_USUAL_S <= step <= _LONGEST_S
             return bool(is_fast and usual_as_seconds)
+        # Three integers 0, 0, 1 are no count; beyond 1 whole seconds are rather milliseconds.
         if np.all(stamps == np.round(stamps)) and stamps[-1] > 1:
             return True
         return bool(step >= LONG_STEP_S and stamps.size > _MANY_SAMPLES)
@@ -561,9 +603,10 @@ def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn |
     label : str
         Of the record, with which the message begins.
     dt_s : float
-        Sampling time, s.
+        Sampling time, s; that it is positive and finite is for the caller to check.
     output : ndarray, shape (T, Y)
-        Outputs of the record: a long step is refused only where their samples show a motion.
+        Outputs of the record: a long step is refused only where their samples show a motion; one sample shows
+        none.
     column : TimeColumn, optional
         Where the time stamps come from; None: the user gave dt_s. Nothing is refused where it is stated.
 
@@ -601,7 +644,8 @@ def refuse_step(label: str, dt_s: float, output: RealArray, column: TimeColumn |
 def size_of(unit: str) -> UnitSize | None:
     """Kind and size of a unit as written: ('rad/s', 0.1047) of 'rpm'; None where it is not known.
 
-    Prefixes of SI, rates with 'per', a slash or an underscore, and squares of seconds are understood.
+    Prefixes of SI, rates with 'per', a slash or an underscore, and squares and cubes of seconds are
+    understood. Not known are an empty text, more than `_LONGEST_UNIT` characters, and products of units.
     """
     if len(unit) > _LONGEST_UNIT:
         return None
@@ -615,7 +659,8 @@ def size_of(unit: str) -> UnitSize | None:
             return UnitSize("s", 1 / _PER_SECOND[time_unit])
         return UnitSize("s", _SECONDS_PER[time_unit])
     known = _SIZES.get(text)
-    # Words may be written in capitals; letters may not: m and M differ.
+    # Words, of three letters and more, may be written in capitals; one or two letters may not: m and M
+    # differ.
     if known is None and len(text) > 2:
         known = _SIZES.get(text.lower())
     if known is not None:
@@ -649,7 +694,10 @@ def kind_of(unit: str) -> str:
 
 
 def per(unit: str, other: str) -> float | None:
-    """How many of the other unit one is: 57.3 of rad and deg; None where they are not of one quantity."""
+    """How many of the other unit one is: 57.3 of rad and deg; None where they are not of one quantity.
+
+    None, too, where a unit is not known; two counts of one sort are 1.
+    """
     unit_size = size_of(unit)
     other_size = size_of(other)
     if unit_size is None or other_size is None or unit_size.kind != other_size.kind:
@@ -663,12 +711,14 @@ def followed_times(reference: RealArray, output: RealArray) -> float | None:
     Parameters
     ----------
     reference, output : ndarray, shape (T,)
-        Of a closed loop, in any units.
+        Of a closed loop, in any units, equally long and finite; not checked. A NaN in the reference gives
+        None, one in the output NaN.
 
     Returns
     -------
     float or None
-        None, too, for short signals and for a reference that stands still.
+        None, too, for signals with fewer than `_FEWEST_LINES` lines (16 samples) and for a reference that
+        stands still.
 
     Notes
     -----
@@ -696,12 +746,18 @@ def followed_times(reference: RealArray, output: RealArray) -> float | None:
 
 
 def follows_as_it_stands(reference: RealArray, output: RealArray) -> bool:
-    """Whether an output (T,) follows its reference (T,) in numbers of one unit."""
+    """Whether an output (T,) follows its reference (T,) in numbers of one unit.
+
+    True within `_FOLLOWS_WITHIN`; False where it does not follow at all (see `followed_times`).
+    """
     return _is_about_one(followed_times(reference, output) or 0.0)
 
 
 def _is_about_one(times: float) -> bool:
-    """Whether a factor between an output and its reference is that of a loop in one unit."""
+    """Whether a factor between an output and its reference is that of a loop in one unit.
+
+    False for zero, negative numbers and NaN.
+    """
     return 1 / _FOLLOWS_WITHIN < times < _FOLLOWS_WITHIN
 
 
@@ -718,16 +774,18 @@ def contradicted_by_loop(
     Parameters
     ----------
     reference, output, command : ndarray, shape (T,)
-        Signals of the loop.
+        Signals of the loop, equally long and finite; not checked. Short ones, or a reference that stands
+        still, contradict nothing.
     names, units : sequence of str
-        Of reference, output and command; a unit may be empty.
+        Of reference, output and command, three each (ValueError else); a unit may be empty.
     scale : mapping of str to float
         Factors that the user stated, by name of a column.
 
     Returns
     -------
     tuple of Finding
-        Empty where nothing is contradicted. Each ends with the options that mend it.
+        Empty where nothing is contradicted. EXCHANGED, or UNIT_OF_LOOP for each of `_CONFUSIONS` that fits;
+        the value `options` is what to type, `times` how many times the output is its reference.
 
     Notes
     -----
@@ -794,7 +852,10 @@ def contradicted_by_loop(
 
 
 def scaled_by(name: str, factor: float, unit: str = "") -> str:
-    """The options that take a column times a factor, and in a unit where one is given, as they are typed."""
+    """The options that take a column times a factor, and in a unit where one is given, as they are typed.
+
+    factor: ten digits of it are written; not checked.
+    """
     options = f"--scale {as_typed(f'{name}={factor:.10g}')}"
     if unit:
         options += f" --unit {as_typed(f'{name}={unit}')}"
@@ -806,7 +867,8 @@ def written_unit(name: str) -> str:
     """The unit in a column's name, as written; empty where there is none.
 
     Brackets at the end hold a unit whatever they say but a number; after 'in', '/' and an underscore only
-    known units count. What stands behind underscores comes with a slash: 'm/s2' of 'acc_m_s2'.
+    known units count. What stands behind underscores comes with a slash: 'm/s2' of 'acc_m_s2'. Of a long name
+    the last `_LONGEST_NAME` characters are read.
     """
     name = unicodedata.normalize("NFKC", name)[-_LONGEST_NAME:]
     bracketed = _BRACKETED.search(name)
@@ -832,7 +894,10 @@ def written_unit(name: str) -> str:
 
 @lru_cache(_CACHED_NAMES)
 def is_unit(text: str) -> bool:
-    """Whether the word is a unit that headers use: of time, or of a signal."""
+    """Whether the word is a unit that headers use: of time, or of a signal.
+
+    False for an empty text, or more than `_LONGEST_UNIT` characters.
+    """
     if len(text) > _LONGEST_UNIT:
         return False
     in_lower_case = text.lower()
