@@ -5,7 +5,8 @@ what is known of how they were read. Whoever makes one is told at once, in one l
 that later code need not check. `Record.from_file` makes one from columns of a log: it chooses a run, unwraps
 and scales signals, finds the sampling time or a uniform grid, and notes what looks doubtful
 (`reading_notes`). `in_one_unit` converts the records of a set to common units. Nothing is corrected without
-being asked for or noted.
+being asked for or noted. A number in `shown(text, 40)` is how many characters of a name a complaint quotes;
+it decides nothing.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ T = TypeVar("T")
 SAME_CLOCK = 1e-3
 # Relative difference up to which the sampling times of a record and of a model are equal: rounding.
 SAME_DT = 1e-9
-# Readings may span this share more than the period at which they wrap: rounding of decimals.
+# Readings may span this share more than the period at which they wrap: rounding of decimals written with
+# seven digits or more.
 BEYOND_PERIOD = 1e-6
 
 
@@ -150,7 +152,10 @@ class Record(Shown):
 
     @property
     def doubts(self) -> tuple[Finding, ...]:
-        """What to know of the record before trusting a frequency: its time base, repairs, and notes."""
+        """What to know of the record before trusting a frequency: its time base, repairs, and notes.
+
+        Empty where nothing is.
+        """
         doubts: list[Finding] = []
         if self.time_column is not None and self.time_column.doubtful:
             doubts.append(self.time_column.doubt(self.dt_s))
@@ -169,7 +174,10 @@ class Record(Shown):
         return np.arange(self.n_samples, dtype=np.float64) * self.dt_s
 
     def sampled_like(self, other: Record) -> bool:
-        """Whether the sampling times of two records are one but for the clocks of hosts, to 0.1 %."""
+        """Whether the sampling times of two records are one but for the clocks of hosts, to 0.1 %.
+
+        Relative to the other's. Both are positive, as records are checked.
+        """
         return abs(self.dt_s - other.dt_s) <= SAME_CLOCK * other.dt_s
 
     def refuse_several(self, dt_s: float | None = None, inputs: int = 1) -> None:
@@ -185,7 +193,7 @@ class Record(Shown):
         Raises
         ------
         ValueError
-            The record does not fit.
+            The record does not fit; a dt_s that is NaN fits none.
         """
         if self.input.shape[1] != inputs or self.output.shape[1] != 1:
             expected = f"{inputs} inputs" if inputs > 1 else "one input"
@@ -198,7 +206,10 @@ class Record(Shown):
             raise ValueError(f"{self.label}: dt_s = {self.dt_s}, the model has {dt_s}")
 
     def only(self, output: int) -> Record:
-        """Return the record with one output alone, given by its index; the inputs stay."""
+        """Return the record with one output alone, given by its index; the inputs stay.
+
+        IndexError for an index that is none; a negative one counts from the end.
+        """
         # A list as the index keeps the column two-dimensional.
         return replace(
             self,
@@ -209,6 +220,8 @@ class Record(Shown):
 
     def siso(self, input_name: str | None = None, output_name: str | None = None) -> Record:
         """Return the record with one input and one output.
+
+        The reference stays as it is, with all its columns.
 
         Parameters
         ----------
@@ -261,12 +274,12 @@ class Record(Shown):
         Parameters
         ----------
         limit : float
-            In units of the inputs.
+            In units of the inputs, one for all of them.
 
         Raises
         ------
         ValueError
-            The limit is not positive.
+            The limit is not positive, or NaN.
         """
         if not limit > 0:
             raise ValueError(f"the limit of the input must be positive; got {limit:g}")
@@ -274,7 +287,11 @@ class Record(Shown):
         return replace(self, input=np.clip(self.input, -limit, limit), cut=n_beyond)
 
     def each(self, change: Callable[[RealArray], RealArray]) -> Record:
-        """Return the record with its input, output and reference, (T, .) each, changed alike."""
+        """Return the record with its input, output and reference, (T, .) each, changed alike.
+
+        change: takes and returns an array of two dimensions, columns kept; what it makes of them is checked
+        as any record is (ValueError).
+        """
         reference = None if self.reference is None else change(self.reference)
         return replace(self, input=change(self.input), output=change(self.output), reference=reference)
 
@@ -317,7 +334,8 @@ class Record(Shown):
         name : str, optional
             Of the record; default: the file's name without its ending, and the run.
         scale, offset : mapping of str to float, optional
-            By column: the quantity is scale * column + offset.
+            By column: the quantity is scale * column + offset. Defaults 1 and 0. That they are finite is not
+            checked here, but samples that are not are refused.
         units : mapping of str to str, optional
             By column: the unit of that quantity.
         repair : bool
@@ -334,7 +352,10 @@ class Record(Shown):
         Raises
         ------
         ValueError
-            In one line naming file and place.
+            In one line that begins with the file: it cannot be read, names of columns are missing or used
+            twice, cells are no finite numbers (with their line), time does not increase or keeps to no grid,
+            no machine has that sampling time, or an option is of a column that is no signal. The message says
+            what helps. `units` are free text and not checked.
         """
         table = path if isinstance(path, Table) else read_table(path)
         table = _one_run(table.with_decimal(decimal), time, run)
@@ -393,7 +414,10 @@ class Record(Shown):
             notes += clock_doubts(stamps, label)
 
         def quantities(names: Sequence[str], *, held: bool) -> RealArray:
-            """Return columns (T, C) in their units, on the grid; held: from row to row, as a command is."""
+            """Return columns (T, C) in their units, on the grid; held: from row to row, as a command is.
+
+            (0, 0) for no names, which `Record` then refuses.
+            """
             if not names:
                 return np.zeros((0, 0))
             signals = []
@@ -457,7 +481,7 @@ def _one_run(table: Table, time: str | None, run: int | None) -> Table:
     """Return a table, or the chosen run of it where time starts again.
 
     time: name of the time column; run: from 0. Raises ValueError where there are several runs and none is
-    chosen, or no such run.
+    chosen, or no such run. A table without time column, or whose stamps cannot be read, is one run.
     """
     # Runs are called by the column that numbers them, 'run 3'; they are chosen by their place.
     runs = table.runs(time)
@@ -480,7 +504,8 @@ def _refuse_roles(
     """Raise ValueError where the names of columns, or of the time column, do not go together.
 
     A string is no list of names, no column is two things, a unit of time needs a time column, and a table
-    whose columns have rows of their own needs one, too.
+    whose columns have rows of their own needs one, too. That the columns are there is not asked here but by
+    `Table.columns`.
     """
     for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
         if isinstance(names, str):
@@ -506,7 +531,7 @@ def _unwrapped(values: RealArray, name: str, period: float, label: str) -> tuple
     it may go the wrong way, else 0 (`wrapping.unwrapped`).
 
     period: in units of the readings; label: the file, for complaints. Raises ValueError where the period is
-    not positive, or the readings span more than it.
+    not positive, or the readings span more than it. values: finite, at least one.
     """
     if not (np.isfinite(period) and period > 0):
         raise ValueError(f"{label}: column {name!r} wraps at a positive number; got {period}")
@@ -532,7 +557,8 @@ def reading_notes(
     table : Table
         Of it matter here: the layout of a text file (rows that were skipped or cut), clocks, cells and units.
     columns : mapping of str to ndarray, shape (T,) each
-        Inputs, outputs and references as they are used, before scale and offset.
+        Inputs, outputs and references as they are used, before scale and offset; finite. KeyError where one
+        is missing.
     inputs, outputs, references : sequence of str
         Names of columns.
 
@@ -609,7 +635,8 @@ def reading_notes(
 def _bookkept(table: Table, name: str) -> Finding | None:
     """Return the finding on a column of text with negative numbers like '(3.25)' and '3.25-', or None.
 
-    Book-keepers write minus signs so. The finding names the first such cell and what it was read as.
+    Book-keepers write minus signs so. The finding names the first such cell and what it was read as. None,
+    too, for a column that is no text; KeyError for a name that is no column.
     """
     cells = table.raw[name]
     if table.layout is None or not isinstance(cells, tuple):
@@ -636,7 +663,8 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
     Parameters
     ----------
     records : sequence of Record
-        Columns of one name are of one quantity. Where a record says no unit, its numbers stay.
+        Columns of one name are of one quantity. Where a record says no unit, its numbers stay. None: none
+        come back.
 
     Returns
     -------
@@ -699,7 +727,11 @@ def in_one_unit(records: Sequence[Record]) -> list[Record]:
 
 
 def in_groups(items: Iterable[T], alike: Callable[[T, T], bool]) -> list[list[T]]:
-    """Return items in groups, in the order they come: each in the first group whose first item it is like."""
+    """Return items in groups, in the order they come: each in the first group whose first item it is like.
+
+    alike: whether two items are; it need not be transitive, as only the first of a group is asked. No items:
+    no groups.
+    """
     groups: list[list[T]] = []
     for item in items:
         for group in groups:

@@ -50,17 +50,21 @@ HDF5_SIGNATURE = b"\x89HDF\r\n"
 SIGNATURE_WITHIN_BYTES = 1024
 
 # A column of text that is filled in at most this share of the rows may have rows of its own: signals logged
-# at half the rate of others have .5, a column in which readings are missing now and then has nearly 1.
+# at half the rate of others have .5, a column in which readings are missing now and then has nearly 1. Chosen
+# between.
 OWN_ROWS_SHARE = 0.8
-# Rows below which no column has rows of its own: a few empty cells are readings that are missing.
+# Rows below which no column has rows of its own: a few empty cells are readings that are missing. Chosen.
 FEWEST_ROWS = 10
 # A sheet that the longest one exceeds by more than this factor, in rows, is no log: some settings in a few
-# rows. Logs of one experiment on several sheets are of like length.
+# rows. Logs of one experiment on several sheets are of like length. Chosen.
 LOG_OVER_SETTINGS = 10
 
 
 def reads(*endings: str) -> Callable[[Reader], Reader]:
     """Return a decorator that registers a reader for files of these endings.
+
+    An ending that is registered already is taken over; endings in capitals are never found. Neither is
+    refused.
 
     Parameters
     ----------
@@ -127,13 +131,19 @@ def read_table(path: str | PathLike[str], *, largest_bytes: int = LARGEST_BYTES)
 
 
 def _ending(file: Path) -> str:
-    """Return the ending of a file's name in lower case, with its point, '.gz' left out: '.csv'."""
+    """Return the ending of a file's name in lower case, with its point, '.gz' left out: '.csv'.
+
+    Empty for a name without one.
+    """
     return Path(file.name.lower().removesuffix(".gz")).suffix
 
 
 def _unpacked(content: bytes, largest_bytes: int) -> bytes:
     """Return what gzip packed. Raises ValueError where it is damaged, or unpacks to more than the largest
-    size, of which no more is unpacked."""
+    size, of which no more is unpacked.
+
+    content: all of the file; largest_bytes: of what it unpacks to.
+    """
     try:
         with gzip.open(io.BytesIO(content)) as stream:
             unpacked = stream.read(largest_bytes + 1)
@@ -163,7 +173,8 @@ def text_table(file: Path, layout: Layout, columns: Mapping[str, tuple[str, ...]
         Of it matter here: the units by name, the stated start and step of the rows, whether lines between the
         rows were skipped, and the line of the first row.
     columns : mapping of str to tuple of str
-        Cells by name, equally long; empty where a cell holds nothing.
+        Cells by name, equally long; empty where a cell holds nothing. At least one column (StopIteration
+        else), as `read_text` gives them.
 
     Returns
     -------
@@ -298,7 +309,8 @@ def _read_json(file: Path, content: bytes) -> Table:
 def _read_bag(file: Path, content: bytes) -> Table:
     """Return the numbers of an MCAP, ROS 1 or ROS 2 bag, called topic.field, each topic with its own clock.
 
-    Signals of several topics hold their last message. Raises ValueError without the path.
+    Signals of several topics hold their last message. Raises ValueError without the path: damaged, no message
+    that can be read, too large, too slow, or a library is not installed.
     """
     # The child writes when a topic's messages were recorded under its name and a tab.
     table = _read_columns(file, content)
@@ -341,7 +353,10 @@ def _read_columns(file: Path, content: bytes) -> Table:
 
 
 def _table_of(file: Path, columns: Sequence[tuple[str, Any, str]]) -> Table:
-    """Return the table of columns, each a name, values and a unit ('' for none); equal names are numbered."""
+    """Return the table of columns, each a name, values and a unit ('' for none); equal names are numbered.
+
+    Raises ValueError with the path for more columns than a table may have; no columns make a table of none.
+    """
     names = distinct([name for name, _, _ in columns])
     raw = {}
     units = {}
@@ -357,7 +372,8 @@ def _flat(name: str, value: Any, unit: str = "") -> list[tuple[str, Any, str]]:
 
     Names are those by which a program would call them, log.signals[0].values. An object that says its name
     beside its data, as recorders write it, gives that name to them; one that says its unit, gives that. Text
-    is no column.
+    is no column. An empty list or object has none. How deep it is nested is for the reader of the file to
+    limit.
     """
     if isinstance(value, str):
         return []

@@ -3,7 +3,8 @@
 A cell may have a decimal point or a decimal comma, digits in groups of three, a minus sign of several kinds,
 and a unit behind the number ('0.005 sec', '30 %'). `is_number` says whether it is a number with a given
 decimal sign, `number` which one; `quantity` and `without_units` take a unit off. Whether '1.500' is one and a
-half or fifteen hundred no cell says by itself: `doubtful_groups` looks at the whole column.
+half or fifteen hundred no cell says by itself: `doubtful_groups` looks at the whole column. `decimal` is '.'
+or ',' everywhere; another sign is not refused here and ends in KeyError or in a cell that is no number.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _LONGEST_QUANTITY = 60
 
 
 def with_plain_minus(text: str) -> str:
-    """The text with '-' wherever another minus sign stands before a number."""
+    """The text with '-' wherever another minus sign stands before a number; between words it stays."""
     # Most texts have none, which is faster to see.
     if not any(sign in text for sign in _MINUS_SIGNS):
         return text
@@ -59,7 +60,10 @@ def _with_leading_sign(text: str) -> str:
 
 
 def is_bookkept(cell: str, decimal: str) -> bool:
-    """Whether the cell is a number whose minus is a pair of brackets, or stands behind it."""
+    """Whether the cell is a number whose minus is a pair of brackets, or stands behind it.
+
+    False for an empty cell.
+    """
     text = cell.strip()
     return _with_leading_sign(text) != text and is_number(cell, decimal)
 
@@ -95,7 +99,8 @@ def is_number(cell: str, decimal: str) -> bool:
 def number(cell: str, decimal: str) -> float:
     """The number in a cell for which `is_number` holds; digits in groups of three are one number.
 
-    Raises ValueError where the cell is none.
+    'nan' and 'inf' give these. Raises ValueError, of `float`, where the cell is none; of one that is a number
+    with the other decimal sign alone a number comes out all the same: ask `is_number` first.
     """
     text = _with_leading_sign(cell.strip())
     grouped = _GROUPED_NUMBER[decimal].fullmatch(text)
@@ -117,7 +122,8 @@ def quantity(cell: str, decimal: str) -> tuple[str, str] | None:
 
     Notes
     -----
-    A unit of signals that follows at once ('3V') counts only behind a decimal sign: '3A' may be a name.
+    A unit of signals that follows at once ('3V') counts only behind a decimal sign: '3A' may be a name. None
+    for an empty cell, a unit that `is_unit` does not know, and more than `_LONGEST_QUANTITY` characters.
     """
     if len(cell) > _LONGEST_QUANTITY:
         return None
@@ -151,7 +157,8 @@ def without_units(cells: Sequence[str], decimal: str) -> tuple[tuple[str, ...], 
     Returns
     -------
     tuple or None
-        A tuple of as many numbers, and the unit. Cells that are empty or a plain 'nan' stay as they are.
+        A tuple of as many numbers, and the unit. Cells that are empty or a plain 'nan' stay as they are. None
+        for a column without a filled cell.
     """
     first_filled = next((cell for cell in cells if cell), "")
     first_quantity = quantity(first_filled, decimal)
@@ -171,7 +178,10 @@ def without_units(cells: Sequence[str], decimal: str) -> tuple[tuple[str, ...], 
 
 
 def shows_decimals(cell: str, decimal: str) -> bool:
-    """Whether the cell leaves no doubt that this sign separates decimals: '0.5', '1.25', not '1.250'."""
+    """Whether the cell leaves no doubt that this sign separates decimals: '0.5', '1.25', not '1.250'.
+
+    False for a cell that is no number.
+    """
     return decimal in cell and is_number(cell, decimal) and not _ONE_GROUP.fullmatch(cell)
 
 
@@ -185,13 +195,14 @@ def doubtful_groups(cells: Sequence[str], decimal: str, *, proven: bool) -> int 
     decimal
         The decimal sign that the table was found to have.
     proven
-        Whether other cells of the table leave no doubt of that sign.
+        Whether other cells of the table leave no doubt of that sign: then only the other sign is looked at.
 
     Returns
     -------
     int or None
         Row, from 0. None where the column itself says which ('1,020.5', '1,020,300', '0,125'), or where
-        whole numbers of four digits and more stand beside: these would be grouped, too.
+        whole numbers of four digits and more stand beside: these would be grouped, too. None, too, where a
+        cell with such a sign is no number: whoever takes the column refuses it.
     """
     # The other sign may separate groups, or it is the decimal sign after all.
     other_sign = "," if decimal == "." else "."

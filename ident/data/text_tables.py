@@ -7,7 +7,8 @@ row (`_Fit.layout`). Then it cuts all lines into cells and leaves out what is no
 the table, a row in which the file ends. The `Layout` says what was found, so that it can be shown.
 
 What cannot be told, such as decimal commas between commas, is refused. Every step takes a time that is linear
-in the length of the text: no regular expression here can match one text in two ways.
+in the length of the text: no regular expression here can match one text in two ways. A majority, here and
+below, is more than half: what most lines or cells are is what the table is.
 """
 
 from __future__ import annotations
@@ -33,8 +34,7 @@ from ident.data.time_stamps import is_stamp
 from ident.data.units import is_unit, says_time
 
 # Lines from the beginning of the file that are looked at to find the layout: preambles of recorders have up
-# to some hundred. Doubled or halved, no test of
-# text logs moves.
+# to some hundred. Doubled or halved, no test of text logs moves.
 _SAMPLE_LINES = 400
 # Lines from the end of these that say how wide a row is and which columns hold numbers: there the preamble is
 # over. Doubled or halved, no test of text logs moves.
@@ -79,9 +79,10 @@ _SAME_STEP = 0.01
 _UNIT_BY_FORM = re.compile(r"[\[(].*[\])]|-|1|sequence", re.IGNORECASE)
 # Signs around a unit that are no part of it.
 _AROUND_UNITS = "[](){} "
-# What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '.
+# What a serial monitor puts before each line: '10:15:30.000 -> ', '[2024-03-01 10:15:30.000] '. Of 4 to 40
+# characters: '1:02' has four, a date and a time with their signs 40 at most.
 _ARRIVED = re.compile(r"\s*(?:\[([^]]{4,40})\]|(\S[^>]{3,40}?)\s*->)(?:\s+|$)")
-# Characters of a line in which that is looked for: a date and a time with their signs have 40 at most.
+# Characters of a line in which that is looked for: three times the longest, for blanks around it.
 _LONGEST_ARRIVAL = 120
 # A number with its name, as plotters of serial ports take it: 'angle:0.01', 'volt = -3.00'. No part matches
 # what the next one begins with, so that time is linear in the length of a line.
@@ -124,7 +125,7 @@ class Layout:
     increment : tuple of float, or None
         Start and step of the rows in seconds, where lines above state them.
     plain : bool
-        A cell leaves no doubt of the decimal sign.
+        Some cell of the table leaves no doubt of the decimal sign, as '0.5' does and '1.500' does not.
     stated : bool
         The user stated the decimal sign.
     cut : int
@@ -148,7 +149,10 @@ class Layout:
     footer: int = 0
 
     def line(self, row: int) -> int:
-        """The line of the file (from 1) of a row, which is counted from 0."""
+        """The line of the file (from 1) of a row, which is counted from 0.
+
+        A row beyond the table is not refused: the lines go on.
+        """
         line = self.first + row
         for skipped in self.skipped:
             if skipped <= line:
@@ -167,7 +171,7 @@ def text_of(content: bytes) -> str:
     Returns
     -------
     str
-        Without the mark.
+        Without the mark; empty for an empty file.
 
     Raises
     ------
@@ -240,7 +244,8 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
     blank = [k for k in range(first, len(lines)) if not lines[k].strip()]
     n_others = len(lines) - first - len(commented)
     skipped = set(commented)
-    # Where half of the lines are blank, but for two, the line ends were written twice.
+    # Where half of the lines are blank, the line ends were written twice; but for two, as the last row, or
+    # one in the middle, may lack its blank line.
     if 2 * len(blank) >= n_others - 2:
         skipped.update(blank)
     numbered_lines = enumerate(lines[first:], first)
@@ -291,7 +296,8 @@ def read_text(text: str) -> tuple[Layout, dict[str, tuple[str, ...]]]:
 def _footer(rows: Sequence[Sequence[str]], decimal: str) -> list[Sequence[str]]:
     """The last rows that hold words and not one value, where enough rows stand above; else none.
 
-    rows: the cells of each. Empty, too, where there are more of them than a footer has.
+    rows: the cells of each, no or several; decimal: '.' or ','. Empty, too, where there are more of them than
+    a footer has: the caller then complains of words in a column of numbers.
     """
     begin = len(rows)
     while begin > _FEWEST_ROWS:
@@ -308,7 +314,7 @@ def _units_of(cells: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     """Units by name, where every cell of a line that is not empty is a unit; else empty.
 
     cells: of the line, which may end before the names do. Empty cells, and columns that the line does not
-    reach, have no unit.
+    reach, have no unit. Empty, too, for no cells and for more cells than names.
     """
     words = [cell.strip(_AROUND_UNITS) for cell in cells]
     if len(words) > len(names):
@@ -322,7 +328,9 @@ def _without_labels(lines: list[str]) -> tuple[list[str], list[str]]:
     """Lines of a serial port as a table has them, and the names of their first columns.
 
     'angle:0.01' becomes 0.01 in a column named angle; the stamp that a monitor puts before each line becomes
-    the first cell, named time. Lines without either come back as they are, without names.
+    the first cell, named time. Lines without either come back as they are, without names. Lines that differ
+    from most are not refused here: they stay as they are, and are complained of when their column is taken.
+    lines: at least one (ValueError else).
     """
     # Most lines of the sample have to begin with a stamp.
     sample = [_arrival(line) for line in lines[:_SAMPLE_LINES]]
@@ -368,7 +376,10 @@ def _without_labels(lines: list[str]) -> tuple[list[str], list[str]]:
 
 
 def _arrival(line: str) -> tuple[str, str]:
-    """The text that a serial monitor may have put before a line, or empty, and the line without it."""
+    """The text that a serial monitor may have put before a line, or empty, and the line without it.
+
+    Whether the text is a time is for the caller to ask (`is_stamp`).
+    """
     head = _ARRIVED.match(line[:_LONGEST_ARRIVAL])
     if head is None:
         return "", line
@@ -394,7 +405,8 @@ def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
     """Whether the last of some rows ends too early, so that the file ends inside of it.
 
     It has fewer cells than any other row, or its last number has fewer digits than any other of that column
-    (behind the decimal sign, where some have one there). False with fewer than `_FEWEST_ROWS` rows.
+    (behind the decimal sign, where some have one there). False with fewer than `_FEWEST_ROWS` rows, and where
+    another cell of that column is no number.
     """
     if len(rows) < _FEWEST_ROWS:
         return False
@@ -416,8 +428,8 @@ def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
 def _layout(lines: Sequence[str], n_lines: int) -> Layout:
     """The layout of the separator and the decimal sign that fit best; the first of equals.
 
-    lines: the first ones of the file; n_lines: how many it has. Raises ValueError where none of them makes
-    numbers, or a line has too many cells.
+    lines: the first ones of the file, at least one; n_lines: how many it has. Raises ValueError where none of
+    them makes numbers, or a line has too many cells.
     """
     separators = dict.fromkeys(separator for separator, _ in _DIALECTS)
     rows = {separator: _rows(lines, separator) for separator in separators}
@@ -553,7 +565,10 @@ class _Fit:
     @property
     def score(self) -> tuple[bool, float, int]:
         """How well it fits, larger is better: whether there are as many names as numbers, then the share of
-        values among the cells, then the number of columns."""
+        values among the cells, then the number of columns.
+
+        Nothing is raised: where the separator makes no table it is (False, 0, 0).
+        """
         above = self._above(self.first_row)
         header = self._header()
         if header is None:
@@ -570,7 +585,8 @@ class _Fit:
     def _above(self, row: int) -> list[int]:
         """Lines above a row in which its names may stand, the nearest first.
 
-        The next `_LINES_ABOVE` that are not blank, and comments between them that are no rows.
+        The next `_LINES_ABOVE` that are not blank, and comments between them that are no rows. Empty for the
+        first line.
         """
         above = list[int]()
         n_lines = 0
@@ -585,7 +601,10 @@ class _Fit:
         return above
 
     def _has_value(self, row: int) -> bool:
-        """Whether a cell of a line is a number, with or without its unit, or a stamp."""
+        """Whether a cell of a line is a number, with or without its unit, or a stamp.
+
+        row: a line from 0 (IndexError beyond the sample).
+        """
         return any(_is_value(cell, self.decimal) for cell in self.rows[row])
 
     def _names_at(self, row: int, numbered: bool = False) -> list[str] | None:
@@ -597,7 +616,7 @@ class _Fit:
         """
         cells = self.rows[row]
         if self.separator == " " and len(cells) > self.n_cells:
-            # Names of several words are two blanks apart.
+            # Names of several words are two blanks apart, or a tab.
             cells = re.split(r"\s{2,}|\t", self._without_sign(row))
         if _is_comment(self.lines[row]) and not self.n_columns <= len(cells) <= self.n_cells:
             for sign in ",;\t|":
@@ -617,6 +636,7 @@ class _Fit:
             is_numeric = any(_is_value(cell, sign) for sign in ".,")
             if cell and not is_numeric:
                 n_words += 1
+        # Numbers of channels have three digits at most; the first column is time and may be called anything.
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             n_words = len(cells)
         if not self.n_columns <= len(cells) <= self.n_cells:
@@ -624,7 +644,10 @@ class _Fit:
         return cells if 2 * n_words > len(cells) else None
 
     def _without_sign(self, row: int) -> str:
-        """A line without the sign of a comment."""
+        """A line without the sign of a comment.
+
+        A line that is no comment comes back without blanks around it.
+        """
         return _COMMENT.sub("", self.lines[row]).strip()
 
     def _header(self) -> int | None:
@@ -775,7 +798,10 @@ class _Fit:
         return columns
 
     def _are_units(self, cells: Sequence[str]) -> bool:
-        """Whether most words of a line are units; numbers are no words (Rigol's start and step)."""
+        """Whether most words of a line are units; numbers are no words (Rigol's start and step).
+
+        False for a line without a word.
+        """
         n_words = 0
         n_units = 0
         for cell in cells:
@@ -789,7 +815,11 @@ class _Fit:
         return 2 * n_units > n_words
 
     def _units_above(self, header: int) -> dict[int, str]:
-        """Units that lines above the names state behind a word for them, by column (from 0)."""
+        """Units that lines above the names state behind a word for them, by column (from 0).
+
+        header: line of the names, from 0. Empty where no line says one; a unit of the first column is taken
+        as it is written, others only where they are known.
+        """
         units = dict[int, str]()
         for row in self.rows[:header]:
             if _UNITS_OF_X.match(row[0]) and len(row) > 1:
@@ -806,7 +836,8 @@ class _Fit:
         """Start and step of the rows in seconds, as oscilloscopes state them; None where no step is stated.
 
         header: line of the names; names: of the columns; units: the cells of the line of units. What is said
-        beside the names counts more than what is said above them. A start that is not stated is 0.
+        beside the names counts more than what is said above them. A start that is not stated is 0; a step
+        that is zero or negative is none.
         """
         # Words and what may be their numbers, in the order in which they count.
         pairs = list(zip(names, units, strict=False))
@@ -839,7 +870,7 @@ class _Fit:
 def _is_statement(cells: Sequence[str]) -> bool:
     """Whether a line of a preamble states something of a word: 'XInc:,5e-3'.
 
-    Where every cell ends with a colon, they may be names.
+    Where every cell ends with a colon, they may be names. False for no cells.
     """
     if not cells or not cells[0].endswith(":"):
         return False
@@ -847,7 +878,7 @@ def _is_statement(cells: Sequence[str]) -> bool:
 
 
 def _is_comment(line: str) -> bool:
-    """Whether a line begins with a sign of a comment."""
+    """Whether a line begins with a sign of a comment. False for an empty line."""
     return line.lstrip()[:1] in _COMMENT_BEGINNINGS and _COMMENT.match(line) is not None
 
 
@@ -875,19 +906,23 @@ def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
 
 
 def _empty_at_end(row: Sequence[str]) -> int:
-    """How many cells at the end of a row are empty."""
+    """How many cells at the end of a row are empty. All of them where none is filled; 0 for no cells."""
     return next((k for k, cell in enumerate(reversed(row)) if cell), len(row))
 
 
 def _is_value(cell: str, decimal: str) -> bool:
-    """Whether a cell holds a number, a number with its unit, a date or a clock time."""
+    """Whether a cell holds a number, a number with its unit, a date or a clock time.
+
+    decimal: '.' or ','. False for an empty cell.
+    """
     return is_number(cell, decimal) or is_stamp(cell) or quantity(cell, decimal) is not None
 
 
 def _ragged(line: int, n_cells: int, header: int, n_names: int, separator: str) -> str:
     """The complaint that a line has more or fewer cells than there are names, beginning with ', line 3:'.
 
-    line: of the row; header: of the names, 0 for none; both from 1.
+    line: of the row; header: of the names, 0 for none; both from 1. Cells and names are counted, n_cells and
+    n_names. KeyError for a separator that is none of `_DIALECTS`.
     """
     names = f"line {header} has {n_names}" if header else f"{n_names} are expected"
     hint = ""

@@ -6,7 +6,8 @@ jitter, or of which single ones were lost, on the grid that fits all stamps best
 `CoarseGrid` makes a coarser grid of stamps that keep to none, with straight lines between readings and means
 of the input. `Repair` says what either did, and up to which frequency the result is faithful to 1 % (of a
 cubic spline: Hall and Meyer, Journal of Approximation Theory 16, 1976). Assumed: stamps say when rows were
-taken.
+taken. A usual step is the median one, which lost rows do not move. Functions that say "increasing" do not
+check it, nor that there are two stamps: their callers have asked `Table.increasing`, which raises ValueError.
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ from ident.data.table import Table
 # How far a step may be from the usual one, as a share of it, where stamps count as uniform: at the Nyquist
 # frequency it is a phase wrong by 0.03 rad, and it is above the jitter of a controller's clock.
 TIME_TOLERANCE = 0.01
-# How far a stamp may be off its instant, in samples, for an interpolation to make it good. Steps are then up
-# to 1.4 samples, and the error of a cubic spline, which grows with their fourth power, 3.8 times that of
-# even ones. From half a sample on nobody knows which sample a stamp is.
+# How far a stamp may be off its instant, in samples, for an interpolation to make it good. Steps between two
+# such stamps are then up to 1.4 samples (`jitter_of` up to 0.4; `sampling_time` compares a step's distance
+# with this number only to choose its words), and the error of a cubic spline, which grows with their fourth
+# power, 3.8 times that of even ones. From half a sample on nobody knows which sample a stamp is.
 LARGEST_JITTER = 0.2
 # Stamps closer than this to their instants, in samples, count as on them: an output changes by a thousandth
 # of its step from row to row.
@@ -45,12 +47,13 @@ FAITHFUL_LINE_RAD = (FAITHFUL_SHARE * 8) ** 0.5
 # 1 - sinc(omega h / 2)^2 = (omega h)^2 / 12.
 FAITHFUL_MEAN_RAD = (FAITHFUL_SHARE * 12) ** 0.5
 # Parts of a log whose mean step is compared with that of the whole, to show how a clock drifts: enough for a
-# clock that warms up, and of two steps each at least.
+# clock that warms up, and of two steps each at least. Chosen; it moves no grid, only
+# whether and with which number a drift is reported.
 CLOCK_PARTS = 10
 # Usual steps of the log in each step of a coarser grid that is proposed: none is without a reading unless two
 # readings in a row are missing.
 READINGS_PER_STEP = 3
-# Multiples of a power of ten that a proposed step is.
+# Multiples of a power of ten that a proposed step is, ascending up to the next power: numbers that one types.
 ROUND_MULTIPLES = (1, 2, 3, 5, 10)
 
 
@@ -62,7 +65,7 @@ def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s
     table : Table
         For complaints: the path, the place of a row, the names of columns.
     stamps : ndarray, shape (T,), or None
-        Time stamps, s; None where the log has no time column.
+        Time stamps, s; None where the log has no time column. Fewer than two are refused.
     name : str or None
         Of the time column, for complaints.
     dt_s : float or None
@@ -111,7 +114,8 @@ def sampling_time(table: Table, stamps: RealArray | None, name: str | None, dt_s
     # Of uniform stamps the mean is the better estimate.
     mean = float((stamps[-1] - stamps[0]) / steps.size)
     if dt_s is None:
-        # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002.
+        # Rounding noise of decimal stamps: 0.0020000000000000005 is 0.002. Twelve digits are ten more than
+        # the stamps are uniform to, and four less than rounding reaches.
         return float(f"{mean:.12g}")
     if not abs(dt_s - mean) <= TIME_TOLERANCE * mean:
         raise ValueError(
@@ -124,19 +128,24 @@ def only_rounded(stamps: RealArray) -> bool:
     """Whether stamps (T,) [s], increasing, are a uniform clock's, rounded: 0.008, 0.016, 0.023 of 1/128 s.
 
     They have a last decimal of at most half a usual step, and lie on a straight line but for rounding: half
-    of that decimal, and a quarter more, as a line through rounded stamps is itself off by part of it.
+    of that decimal, and a quarter more, as a line through rounded stamps is itself off by part of it. False
+    where no decimal up to the ninth is the last one. stamps: at least two, as the median step of one is NaN.
     """
     since_first = stamps - stamps[0]
-    # The last decimal: a power of ten of which all stamps are multiples; 0 where there is none.
+    # The last decimal: a power of ten of which all stamps are multiples; 0 where there is none down to
+    # nanoseconds (1e-9 s), the finest that clocks write. 1e-10 s: a tenth of that, above the rounding of
+    # doubles.
     digit = 0.0
     for decimals in range(10):
         if np.allclose(since_first, np.round(since_first, decimals), 0, 1e-10):
             digit = 10.0**-decimals
             break
+    # Of coarser decimals two rows would have one stamp, or nearly.
     if not 0 < digit <= 0.5 * np.median(np.diff(stamps)):
         return False
     rows = np.arange(since_first.size)
     uniform = np.polyval(np.polyfit(rows, since_first, 1), rows)
+    # Half of the last decimal, and a quarter more.
     return bool(np.max(np.abs(since_first - uniform)) <= 0.75 * digit)
 
 
@@ -158,6 +167,7 @@ def clock_doubts(stamps: RealArray, record: str) -> tuple[Finding, ...]:
         no frequency is known better. `dt_s`: a step to which the log could be resampled.
     """
     steps = np.diff(stamps)
+    # Two steps in each part.
     if steps.size < 2 * CLOCK_PARTS or only_rounded(stamps):
         return ()
     largest_lateness = float(np.max(np.abs(_best_grid(stamps).late)))
@@ -180,7 +190,9 @@ def clock_doubts(stamps: RealArray, record: str) -> tuple[Finding, ...]:
 def jitter_of(stamps: RealArray) -> float:
     """Return the largest distance of a step from a whole number of usual ones, at least one, in usual steps.
 
-    stamps: (T,) [s], increasing; the usual step is the median.
+    stamps: (T,) [s], increasing; the usual step is the median. A step shorter than half a usual one is
+    compared with one, as no step is of no row. Not checked: fewer than two stamps raise ValueError (largest
+    of nothing), repeated ones give NaN or infinity.
     """
     steps = np.diff(stamps)
     in_usual_steps = steps / float(np.median(steps))
@@ -192,12 +204,14 @@ def option_for(stamps: RealArray) -> str:
     """Return the option that takes increasing stamps (T,) [s].
 
     '' where they are uniform; 'split' where more rows are missing at a place than can be filled in;
-    '--repair' where all are close to one grid and few rows are missing; else '--resample-s SECONDS'.
+    '--repair' where all are close to one grid and few rows are missing; else '--resample-s SECONDS'. Two
+    stamps at least; not checked.
     """
     steps = np.diff(stamps)
     median = float(np.median(steps))
     if np.max(np.abs(steps - median)) <= TIME_TOLERANCE * median or only_rounded(stamps):
         return ""
+    # Five lost rows are a step of six; half a step more is the border between six and seven.
     if np.max(steps) > (MOST_LOST_ROWS + 1.5) * median:
         return "split"
     grid = _best_grid(stamps)
@@ -213,6 +227,7 @@ def _advice(stamps: RealArray, options: bool = True) -> str:
     """Return what to do about stamps (T,) [s] that are not uniform, in words.
 
     options: whether who reads it can give options; they are named as on the command line and in Python.
+    Stamps that are uniform would give words without an option: callers ask of refused ones alone.
     """
     option = option_for(stamps)
     if option == "split":
@@ -227,7 +242,7 @@ def _coarser_step(steps: RealArray) -> float:
     """Return a step, s, of a coarser grid for a log with these steps (T - 1,) [s].
 
     It is 1, 2, 3 or 5 times a power of ten, holds three usual steps, and bridges the largest gap with no more
-    steps than may be without a reading.
+    steps than may be without a reading. steps: positive and finite; not checked (the logarithm of 0 is none).
     """
     for_readings = READINGS_PER_STEP * float(np.median(steps))
     for_gap = float(np.max(steps)) / (MOST_LOST_ROWS + 1)
@@ -238,7 +253,10 @@ def _coarser_step(steps: RealArray) -> float:
 
 
 def _usual_steps_in(steps: RealArray) -> IntArray:
-    """Return how many usual (median) steps each step (T - 1,) [s] is, rounded to whole numbers."""
+    """Return how many usual (median) steps each step (T - 1,) [s] is, rounded to whole numbers, (T - 1,).
+
+    0 for a step below half a usual one. steps: at least one, the median positive; not checked.
+    """
     return np.rint(steps / np.median(steps)).astype(np.int64)
 
 
@@ -255,7 +273,11 @@ class _BestGrid(NamedTuple):
 
 
 def _best_grid(stamps: RealArray) -> _BestGrid:
-    """Return the grid that fits increasing stamps (T,) [s] best; each step counts as so many usual ones."""
+    """Return the grid that fits increasing stamps (T,) [s] best, by least squares over all of them.
+
+    A step counts as the nearest whole number of usual ones, 0 where it is below half: then two rows have one
+    sample, which callers refuse. Two stamps at least, of which `polyfit` makes a line; not checked.
+    """
     steps = _usual_steps_in(np.diff(stamps))
     rows = np.concatenate([[0], np.cumsum(steps)])
     step_s, start_s = np.polyfit(rows, stamps - stamps[0], 1)
@@ -296,11 +318,12 @@ class Repair:
         record : str
             How the finding calls the log.
         dt_s : float
-            Step of the grid, s.
+            Step of the grid, s; positive, not checked.
 
         Returns
         -------
         Finding
+            RESAMPLED on a coarser grid, REPAIRED on the log's own.
             `too_narrow`: share by which ellipses shrink if every filled row counts as one more measurement.
             `faithful_rad_s`: above this frequency what stands between the readings is wrong by more than 1 %
             of the motion.
@@ -319,7 +342,7 @@ class Repair:
                 own_s=self.own_s,
                 faithful_rad_s=min(FAITHFUL_LINE_RAD / self.largest_s, FAITHFUL_MEAN_RAD / dt_s),
             )
-        # Two neighbours that stray apart leave a longer step.
+        # Two neighbours that stray apart, each by the jitter, leave a longer step.
         longest_s = (1 + 2 * self.jitter) * dt_s
         return finding(
             FindingKind.REPAIRED,
@@ -405,12 +428,15 @@ class TimeGrid:
 
     @property
     def n_samples(self) -> int:
-        """T, samples of the grid from the first to the last row."""
+        """T, samples of the grid from the first to the last row. At least 2, as `of` refuses less."""
         return int(self.rows[-1]) + 1
 
     @property
     def repair(self) -> Repair | None:
-        """What `sampled` changes; None where the log is on the grid as it is."""
+        """What `sampled` changes; None where the log is on the grid as it is.
+
+        Its samples, how many are missing, and the largest lateness in samples.
+        """
         jitter = float(np.max(np.abs(self.late)))
         if not self.missing and not jitter:
             return None
@@ -428,7 +454,7 @@ class TimeGrid:
         Parameters
         ----------
         values : ndarray, shape (R,) or (R, Y)
-            As they were read at the stamps.
+            As they were read at the stamps, finite; scipy raises ValueError for another length or NaN.
 
         Returns
         -------
@@ -455,7 +481,8 @@ class TimeGrid:
         """Return inputs (T,) at the instants of the grid, from those of the rows (R,).
 
         Each is held from the instant of its sample on, whatever its stamp; on a line between its neighbours
-        where the row is missing.
+        where the row is missing. numpy raises ValueError for another length; NaN spreads to the samples
+        beside it.
         """
         return np.interp(np.arange(self.rows[-1] + 1), self.rows, values)
 
@@ -518,18 +545,22 @@ class CoarseGrid:
     @property
     def _instants(self) -> RealArray:
         """Instants (T,) of the grid, s, from 0 to the last stamp."""
-        # Rounding of the stamps must not cost the last one.
+        # Rounding of the stamps must not cost the last one: a millionth of a step is far above rounding, and
+        # far below what a stamp is off.
         n_samples = int(np.floor(self.stamps[-1] / self.dt_s + 1e-6)) + 1
         return np.asarray(self.dt_s * np.arange(n_samples), dtype=np.float64)
 
     @property
     def n_samples(self) -> int:
-        """T, instants of the grid."""
+        """T, instants of the grid. At least 2, as a step is at most the length of the log."""
         return int(self._instants.size)
 
     @property
     def repair(self) -> Repair:
-        """What became of the log: instants without a reading within half a step, and its own steps."""
+        """What became of the log: instants without a reading within half a step, and its own steps.
+
+        Not asked of a grid that `of` would refuse: without a step inside one of the grid the largest is none.
+        """
         instants = self._instants
         edges = np.append(instants - self.dt_s / 2, instants[-1] + self.dt_s / 2)
         readings_per_instant = np.histogram(self.stamps, edges)[0]
@@ -547,7 +578,8 @@ class CoarseGrid:
     def sampled(self, values: RealArray) -> RealArray:
         """Return outputs (T,) at the instants of the grid, from those of the rows (R,).
 
-        They lie on straight lines between the readings, which never make noise larger.
+        They lie on straight lines between the readings, which never make noise larger. numpy raises
+        ValueError for another length than R.
         """
         return np.interp(self._instants, self.stamps, values)
 
@@ -555,7 +587,8 @@ class CoarseGrid:
         """Return inputs (T,), means over the steps of the grid, from those of the rows (R,).
 
         Each row's input is held from its stamp to the next, the last one to the end of the grid: a mean over
-        a step pushes a machine as far as what was held in it.
+        a step pushes a machine as far as what was held in it. numpy raises ValueError for another length than
+        R.
         """
         instants = self._instants
         edges = np.append(instants, instants[-1] + self.dt_s)

@@ -8,6 +8,8 @@ days ('0 days 00:00:00.005' of pandas, 'PT0.005S') are put into these forms firs
 
 `seconds_since_first` reads all cells of a column as one kind of stamp and counts whole nanoseconds
 (`_nanoseconds`), so that no digit of a date is lost. Zones are offsets from UTC; leap seconds are neglected.
+A match below is always one of `_STAMP`, whose groups are the parts of a stamp, None where a part is not
+there.
 """
 
 from __future__ import annotations
@@ -103,13 +105,16 @@ class StampError(ValueError):
     """
 
     def __init__(self, message: str, row: int) -> None:
-        """The complaint, which goes on after 'column NAME', on a row."""
+        """The complaint, which goes on after 'column NAME', on a row. row: from 0."""
         super().__init__(message)
         self.row = row
 
 
 def is_stamp(cell: str) -> bool:
-    """Whether the text has the form of a date, a clock time, or both; they need not be possible ones."""
+    """Whether the text has the form of a date, a clock time, or both; they need not be possible ones.
+
+    False for an empty cell. Twice `_LONGEST_STAMP` leaves as many blanks as letters.
+    """
     # Blanks around it may make it longer, but not without end.
     if len(cell) > 2 * _LONGEST_STAMP:
         return False
@@ -129,7 +134,7 @@ def seconds_since_first(cells: Sequence[str]) -> RealArray:
     Parameters
     ----------
     cells : sequence of str
-        T stamps.
+        T stamps; an empty cell is none, and refused. No cells give an empty array.
 
     Returns
     -------
@@ -180,14 +185,17 @@ def seconds_since_first(cells: Sequence[str]) -> RealArray:
 def may_be_minutes(cells: Sequence[str]) -> bool:
     """Whether stamps are like '12:30', hours and minutes or minutes and seconds, and none tells which.
 
-    `seconds_since_first` takes hours. Cells that are no stamps are passed over.
+    `seconds_since_first` takes hours. Cells that are no stamps are passed over. False without any stamp.
     """
     matches = [match for match in map(_matched, cells) if match is not None]
     return bool(matches) and all(map(_has_two_parts, matches)) and not _are_minutes(matches)
 
 
 def _number(part: str | None) -> int:
-    """The number that a part of a stamp is; 0 for a part that is not there."""
+    """The number that a part of a stamp is; 0 for a part that is not there.
+
+    ValueError for text that is no number, which no group of `_STAMP` holds.
+    """
     return 0 if part is None else int(part)
 
 
@@ -206,7 +214,7 @@ def _has_two_parts(match: re.Match[str]) -> bool:
 def _are_minutes(matches: Sequence[re.Match[str]]) -> bool:
     """Whether clock times of two parts are minutes and seconds.
 
-    Only seconds have a fraction, and no day has more than 24 hours.
+    Only seconds have a fraction, and no day has more than 24 hours. False for no stamps.
     """
     if not all(map(_has_two_parts, matches)):
         return False
@@ -216,6 +224,7 @@ def _are_minutes(matches: Sequence[re.Match[str]]) -> bool:
 def _matched(cell: str) -> re.Match[str] | None:
     """The parts of a date, a clock time or both, in the groups of `_STAMP`; None where it is none."""
     text = cell.strip()
+    # The shortest stamps, '1:02', have four characters.
     if not 3 < len(text) < _LONGEST_STAMP:
         return None
     match = _STAMP.fullmatch(text)
@@ -228,7 +237,11 @@ def _matched(cell: str) -> re.Match[str] | None:
 
 
 def _in_usual_form(text: str) -> str:
-    """A stamp in one of the rarer forms, as ISO 8601 or a clock time has it; another text as it is."""
+    """A stamp in one of the rarer forms, as ISO 8601 or a clock time has it; another text as it is.
+
+    Whether day and hour are possible ones is not asked: `_nanoseconds` refuses them. A year of two digits is
+    of this century.
+    """
     for form in _NAMED_MONTH:
         named = form.fullmatch(text)
         if named is None:
@@ -259,8 +272,8 @@ def _in_usual_form(text: str) -> str:
 def _month_first(matches: Sequence[re.Match[str]]) -> bool:
     """Whether 3/1/2024 is a day in March, in a log with these stamps.
 
-    A number above 12 is a day. Raises StampError where no stamp tells and it matters; a single date takes
-    the same time from stamp to stamp either way.
+    A number above 12 is a day. Raises StampError where no stamp tells and it matters; a single date takes the
+    same time from stamp to stamp either way. Without dates between slashes: True, which then matters to none.
     """
     dates = {(int(match["one"]), int(match["two"])) for match in matches if match["dot"] == "/"}
     if any(first > 12 for first, _ in dates):
@@ -274,7 +287,8 @@ def _nanoseconds(match: re.Match[str], month_first: bool, ordinals: dict[str, in
     """Nanoseconds of a stamp in UTC: since the day 1 of `date.toordinal`, without a day since midnight.
 
     ordinals: day numbers by the text of the day, which is added to; a log has few days and many stamps.
-    Raises ValueError for what is no possible date or time.
+    month_first, are_minutes: what the whole log tells (`_month_first`, `_are_minutes`). Raises ValueError for
+    what is no possible date or time.
     """
     hour = _number(match["hour"])
     minute = _number(match["minute"])
