@@ -22,13 +22,16 @@ COMPILED: Any = {"cache": True, "no_cfunc_wrapper": True}
 # Options of numba functions that compiled code alone calls: no wrapper for Python either.
 INSIDE: Any = {**COMPILED, "no_cpython_wrapper": True}
 
-# Different values below which a signal is one of few levels, which stands at each of them often.
+# Different values below which a signal is one of few levels, which stands at each of them often. Chosen:
+# steps and random sequences have two or three levels, a sensor's swing many more.
 FEWEST_LEVELS = 10
-# Share of samples at both extremes together above which a signal is binary by design, as a random sequence.
+# Share of samples at both extremes together above which a signal is binary by design, as a random sequence:
+# most of its samples. A sine that is clipped so far is hardly one. Chosen.
 BINARY_SHARE = 0.5
-# An extreme value is clipped where at least this share of the samples stands there,
+# An extreme value is clipped where at least this share of the samples stands there (chosen: what is clipped
+# less hardly moves a fit),
 CLIPPED_SHARE = 0.01
-# ... at least so many samples,
+# ... at least so many samples (chosen: in short records a few equal ones come by chance),
 FEWEST_CLIPPED = 5
 # ... and so many times as many as at the next level: a sine, too, dwells at its extremes, where it has 2.4
 # times as many samples as at the next of many levels, 1 / (sqrt(2) - 1).
@@ -42,13 +45,17 @@ def kernel_array(array: RealArray) -> RealArray:
     """Return the array as compiled code takes it: C-contiguous and writable; a copy only where it is not.
 
     For numba, each layout is a type of its own, and compiled anew: two compilations may round differently.
+    The type of its numbers is not changed, nor checked.
     """
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")
 
 
 def one_signal(values: npt.ArrayLike) -> RealArray:
-    """Return one signal as (T,), which may come as the only column (T, 1) of a record; other shapes stay."""
+    """Return one signal as (T,), which may come as the only column (T, 1) of a record; other shapes stay.
+
+    What cannot be made doubles raises numpy's ValueError or TypeError.
+    """
     signal = np.asarray(values, dtype=np.float64)
     is_one_column = signal.ndim == 2 and signal.shape[1] == 1
     return signal[:, 0] if is_one_column else signal
@@ -57,7 +64,7 @@ def one_signal(values: npt.ArrayLike) -> RealArray:
 def real_rows(values: ComplexArray) -> RealArray:
     """Return complex rows (F, .) as real ones (2 F, .): real parts above imaginary parts.
 
-    F complex equations in real unknowns are these 2 F real ones.
+    F complex equations in real unknowns are these 2 F real ones. A vector (F,) becomes (2 F,).
     """
     return np.concatenate([values.real, values.imag])
 
@@ -65,7 +72,7 @@ def real_rows(values: ComplexArray) -> RealArray:
 def factor_matrices(factor: ComplexArray) -> RealArray:
     """Return matrices (F, 2, 2) that do to (Re, Im) what multiplication by a complex factor (F,) does.
 
-    [[a, -b], [b, a]] for the factor a + j b.
+    [[a, -b], [b, a]] for the factor a + j b. Any shape (...) becomes (..., 2, 2); NaN stays NaN.
     """
     real = factor.real
     imaginary = factor.imag
@@ -75,13 +82,20 @@ def factor_matrices(factor: ComplexArray) -> RealArray:
 
 
 def lock(record: object, *names: str, dtype: npt.DTypeLike = np.float64) -> None:
-    """Replace fields of an instance of a frozen class, given by name, by copies that cannot be written to."""
+    """Replace fields of an instance of a frozen class, given by name, by copies that cannot be written to.
+
+    record: the instance; AttributeError for a field that is not there. Numbers are converted to dtype, not
+    checked.
+    """
     for name in names:
         object.__setattr__(record, name, readonly(getattr(record, name), dtype))
 
 
 def readonly(values: Any, dtype: npt.DTypeLike = np.float64) -> Any:
-    """Return a copy of an array, of this type, that cannot be written to."""
+    """Return a copy of an array, of this type, that cannot be written to.
+
+    What cannot be converted raises numpy's ValueError or TypeError; NaN passes.
+    """
     array = np.array(values, dtype=dtype)
     array.setflags(write=False)
     return array
@@ -93,8 +107,8 @@ def clipped_share(signal: RealArray) -> float:
     Parameters
     ----------
     signal : ndarray, shape (T,)
-        At least one sample. Signals of fewer than ten levels are not judged, nor those mostly at both
-        extremes, which are binary by design.
+        At least one sample, finite; not checked. Signals of fewer than ten levels are not judged, nor those
+        mostly at both extremes, which are binary by design.
 
     Notes
     -----

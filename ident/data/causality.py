@@ -25,7 +25,9 @@ LEAST_F = 10.0
 # A set point that is smooth is predicted by its own past but for its corners, of which a command that answers
 # to it tells something: by this factor less than of the output. Half and double leave the tests as they are.
 FAR_LESS = 20.0
-# Share of its power that a signal's own past leaves; below it is computed (a sum of sines), not measured.
+# Share of its power that a signal's own past leaves; below it is computed (a sum of sines), not measured:
+# rounding of doubles leaves 1e-32, and some decades more where regressors are nearly dependent; a sensor of
+# 20 bits leaves 1e-12. Chosen between.
 COMPUTED_SHARE = 1e-14
 # Samples for each unknown of a prediction, at least; with fewer nothing is said. Chosen: with as many samples
 # as unknowns anything is predicted.
@@ -38,6 +40,7 @@ def leads(first: RealArray, second: RealArray) -> bool | None:
     Parameters
     ----------
     first, second : ndarray, shape (T,)
+        Finite, of one length, two samples at least; not checked (numpy's ValueError for fewer).
 
     Returns
     -------
@@ -52,7 +55,10 @@ def leads(first: RealArray, second: RealArray) -> bool | None:
 
 def _best_lag(first: RealArray, second: RealArray) -> tuple[int, float]:
     """Return by how many samples the second signal (T,) is later than the first (T,) where they correlate
-    best, and that correlation, at most 1."""
+    best, and that correlation, at most 1.
+
+    Negative where the second is earlier; (0, 0.0) where a signal stands still. One length, not checked.
+    """
     first_about_mean = first - np.mean(first)
     second_about_mean = second - np.mean(second)
     size = np.linalg.norm(first_about_mean) * np.linalg.norm(second_about_mean)
@@ -71,7 +77,8 @@ def _best_lag(first: RealArray, second: RealArray) -> tuple[int, float]:
 def is_moved_by(signal: RealArray, command: RealArray) -> bool:
     """Whether a command (T,) moves a signal (T,), as it does a measured position in any loop.
 
-    False where there are too few samples to say.
+    False where there are too few samples to say (fewer than 59), or the signal is computed. Finite, of one
+    length; not checked.
     """
     return _tells(command, signal) > LEAST_F
 
@@ -80,7 +87,8 @@ def is_loop(reference: RealArray, output: RealArray, command: RealArray) -> bool
     """Whether three signals, (T,) each, are those of a closed loop.
 
     The command moves the output and, far less, the reference; and it answers to the reference. Of two
-    measured positions in open loop the command answers to neither.
+    measured positions in open loop the command answers to neither. False with too few samples. Finite, of one
+    length; not checked.
     """
     moved_output = _tells(command, output)
     if not moved_output > LEAST_F:
@@ -127,14 +135,20 @@ def _tells(cause: RealArray, signal: RealArray, beside: RealArray | None = None)
 
 def _past(signal: RealArray, first_lag: int) -> list[RealArray]:
     """Return a signal (T,) about its mean, delayed by each lag from the first one up to `LAGS`, (T - LAGS,)
-    each: cut to the samples that have all lags."""
+    each: cut to the samples that have all lags.
+
+    T more than `LAGS`, else empty arrays; the caller has counted the rows.
+    """
     about_mean = signal - np.mean(signal)
     return [about_mean[LAGS - lag : about_mean.size - lag] for lag in range(first_lag, LAGS + 1)]
 
 
 def _residual(target: RealArray, regressors: list[RealArray]) -> float:
     """Return the sum of squares that the best combination of regressors, (T,) each, leaves of the target
-    (T,)."""
+    (T,).
+
+    At least one regressor, which may be dependent on others; NaN makes numpy raise LinAlgError or gives NaN.
+    """
     matrix = np.column_stack(regressors)
     coefficients = np.linalg.lstsq(matrix, target, rcond=None)[0]
     return float(np.sum((target - matrix @ coefficients) ** 2))

@@ -29,7 +29,7 @@ LARGEST_BYTES = 2**30
 # than `foreign_files` waits, so that the limit here ends the process.
 CPU_SECONDS = 120
 # Address space of this process, bytes: the file, its columns, the archive of them, and copies that the
-# libraries make, each of the largest size.
+# libraries make, each of the largest size. Eight of them, chosen.
 MEMORY_BYTES = 8 * LARGEST_BYTES
 # Largest text of a spreadsheet or of a text table, bytes: cells take several times as much memory. Of XML it
 # is a million rows of four cells.
@@ -40,6 +40,7 @@ MOST_CELLS = 20_000_000
 # is a trap. Chosen so that the refusal comes within seconds.
 MOST_EMPTY_CELLS = 500_000
 # Entries of a vector in a message or a cell that become columns; longer ones are pictures and point clouds.
+# Chosen: more than any arm has joints or gauges.
 LONGEST_FIELD = 256
 # Characters of text that are kept of a cell of parquet: as much as tells one run from another.
 LONGEST_TEXT = 32
@@ -140,7 +141,8 @@ def hdf5_columns(content: bytes) -> list[Column]:
 
 
 def _words(attribute: Any) -> str:
-    """Return an attribute of HDF5 as text; bytes that are no UTF-8 are replaced."""
+    """Return an attribute of HDF5 as text; bytes that are no UTF-8 are replaced, anything else taken by its
+    `str`."""
     return attribute.decode("utf-8", "replace") if isinstance(attribute, bytes) else str(attribute)
 
 
@@ -264,7 +266,8 @@ def _messages(content: bytes, kind: str) -> Iterator[tuple[str, int, Any]]:
     """Yield topic, time of recording [ns] and message of a bag, in its order.
 
     kind: 'mcap', 'bag' (ROS 1) or 'db3' (ROS 2). A message is an object with `__dataclass_fields__`, or a
-    dict (JSON in MCAP). In MCAP those in other encodings than CDR, ROS 1 and JSON are left out.
+    dict (JSON in MCAP). In MCAP those in other encodings than CDR, ROS 1 and JSON are left out. Damaged files
+    raise what their library raises, of many kinds: `main` takes all for a refusal.
     """
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
@@ -306,7 +309,8 @@ def _fields(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """Yield the numbers and short vectors in a message by their names; a time as whole nanoseconds, name_ns.
 
     value: a message (an object with `__dataclass_fields__`, or a dict) or a part of one. Text, matrices and
-    vectors of more than `LONGEST_FIELD` entries are left out.
+    vectors of more than `LONGEST_FIELD` entries are left out. Nothing is raised for kinds that are not known:
+    they are left out.
     """
     import numpy as np
 
@@ -483,7 +487,7 @@ def _shown_cell(cell: Any, scales: dict[int, tuple[int, int]]) -> str:
 
     cell: of openpyxl. 0.3 in the format 0.0 % is '30%', 12500 in the format 0.0, (by thousands) is '12.5'.
     scales: percent signs and thousands by the number of the cell's style, which get filled in here: a sheet
-    has few styles and many cells.
+    has few styles and many cells. A cell without a format is written as it is.
     """
     value = cell.value
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -504,6 +508,7 @@ def _scale_of_format(code: str) -> tuple[int, int]:
 
     Each percent sign shows a hundred times the number, each such comma a thousandth of it (ECMA-376,
     18.8.31). Quoted and escaped characters, colours, and the forms of negative numbers and zero do not count.
+    (0, 0) for an empty format; one that is none is not refused.
     """
     positive_form = re.sub(r'"[^"]*"|\\.|_.|\*.|\[[^]]*\]', "", code).partition(";")[0]
     trailing_commas = re.search(r"[0#?](,+)(?=[^0#?,]*$|\.)", positive_form)
@@ -513,7 +518,10 @@ def _scale_of_format(code: str) -> tuple[int, int]:
 
 def _cell(value: Any) -> str:
     """Return the value of a cell as text on one line: nothing as '', yes and no as 1 and 0, floats with all
-    their digits, durations in seconds, dates in ISO 8601."""
+    their digits, durations in seconds, dates in ISO 8601.
+
+    Anything else by its `str`, runs of blanks and line ends as one blank.
+    """
     if value is None:
         return ""
     if isinstance(value, bool):
@@ -586,7 +594,10 @@ def mat_variables(content: bytes) -> bytes:
 
 
 def _archive(about: Any, arrays: list[Any]) -> bytes:
-    """Return an npz archive of arrays, called 0, 1, ..., and of `about`, anything that JSON can say."""
+    """Return an npz archive of arrays, called 0, 1, ..., and of `about`, anything that JSON can say.
+
+    TypeError for what JSON cannot say.
+    """
     import numpy as np
 
     stream = io.BytesIO()
@@ -597,7 +608,10 @@ def _archive(about: Any, arrays: list[Any]) -> bytes:
 
 
 def _columns_archive(columns: list[Column]) -> bytes:
-    """Return an npz archive of columns; `about` is a list of [name, unit, why there is no array or '']."""
+    """Return an npz archive of columns; `about` is a list of [name, unit, why there is no array or ''].
+
+    Empty columns make an archive of `about` alone.
+    """
     about = []
     arrays = []
     for column in columns:
@@ -612,7 +626,10 @@ def _columns_archive(columns: list[Column]) -> bytes:
 
 def _allow_at_most(limit: int, amount: int) -> None:
     """Lower a limit of this process (`resource.RLIMIT_...`) to an amount, or to what the session allows where
-    that is less: a larger one cannot be had."""
+    that is less: a larger one cannot be had.
+
+    Raises ValueError or OSError where the system refuses the limit.
+    """
     soft, hard = resource.getrlimit(limit)
     allowed = [amount, *(stated for stated in (soft, hard) if stated != resource.RLIM_INFINITY)]
     resource.setrlimit(limit, (min(allowed), hard))

@@ -55,12 +55,14 @@ SAME = 0.02
 # Harmonics to each side over which the power of the noise is averaged, fewer next to zero: with 21 of them
 # it is known to 22 % with one degree of freedom a line. Doubled or halved, no test of distortion moves.
 _SMOOTHING_HARMONICS = 10
-# Rounds of weights and distortion in turns: more of them move it by less than 2 % of its interval.
+# Rounds of weights and distortion in turns: more of them move it by less than 2 % of its interval. It is no
+# test of convergence: none is made.
 _ROUNDS = 6
 # Smallest power that is expected, as a share of the largest one in the band: keeps the weights finite where
 # neither noise nor distortion is, as in exact simulations.
 _SMALLEST_POWER_SHARE = 1e-12
-# Gain that is added before its logarithm is taken: that of a line at which nothing came is finite.
+# Gain that is added before its logarithm is taken: that of a line at which nothing came is finite. Near the
+# smallest double, so that it changes no other gain.
 _SMALLEST_GAIN = 1e-300
 # Share by which the first band begins below the lowest line, and the last one ends above the highest, so
 # that rounding leaves no line out.
@@ -88,7 +90,8 @@ class LineLevels:
 
     Notes
     -----
-    Arrays are locked against writing.
+    Arrays are locked against writing. Shapes and numbers are not checked: `distortion_of` makes them of
+    records that are.
     """
 
     omega_rad_s: RealArray
@@ -107,7 +110,7 @@ class LineLevels:
 
     @property
     def power(self) -> RealArray:
-        """Mean (K,) of `of_each` over the realisations, in units of |G|^2."""
+        """Mean (K,) of `of_each` over the realisations, in units of |G|^2. At least one realisation."""
         return np.asarray(self.of_each.mean(axis=0))
 
     def within(self, low_rad_s: float, high_rad_s: float, level: float = 0.95) -> BandLevel | None:
@@ -118,12 +121,14 @@ class LineLevels:
         low_rad_s, high_rad_s : float
             Ends of the band; a line at the upper one is outside.
         level : float
-            Probability with which the interval holds the distortion.
+            Probability with which the interval holds the distortion; the default of 0.95 is convention. Not
+            checked: outside of 0 to 1 the ends are NaN or infinite.
 
         Returns
         -------
         BandLevel or None
-            None where the band has no line with a gain, or no degree of freedom.
+            None where the band has no line with a gain (also a band whose ends are exchanged or NaN), or no
+            degree of freedom.
 
         Notes
         -----
@@ -266,7 +271,8 @@ class Distortion:
         Parameters
         ----------
         level : float
-            Probability with which an ellipse holds the response at its line.
+            Probability with which an ellipse holds the response at its line; the default of 0.95 is
+            convention. ValueError outside of 0 to 1, of `circular_widening`.
 
         Returns
         -------
@@ -293,6 +299,7 @@ class Distortion:
         """Bands of about half a decade, as (from, to), from the lowest excited line up to the highest."""
         low = self.omega_rad_s[0] * (1 - _BAND_EDGE_SHARE)
         high = self.omega_rad_s[-1] * (1 + _BAND_EDGE_SHARE)
+        # Two bands a decade, at least one. Chosen: a table of them stays short.
         n_bands = max(round(2 * np.log10(high / low)), 1)
         edges = np.geomspace(low, high, n_bands + 1)
         return tuple(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
@@ -304,7 +311,8 @@ def period_of(signal: RealArray) -> int | None:
     Parameters
     ----------
     signal : ndarray, shape (T,)
-        One signal, in any unit.
+        One signal, in any unit, at least one sample. Not checked: with a NaN no lag compares, and the answer
+        is None.
 
     Returns
     -------
@@ -357,7 +365,8 @@ def distortion_of(records: Sequence[Record], *, period_samples: int | None = Non
         With one input and one output each. Realisations of one amplitude share period and lines; records of
         the same input are further periods of one realisation.
     period_samples : int, optional
-        Period that the user states; else that of each input is found, and records without one are left out.
+        Period that the user states, at least 1; else that of each input is found, and records without one are
+        left out.
 
     Returns
     -------
@@ -391,7 +400,8 @@ def _period(record: Record, stated: int | None) -> int | None:
     """Samples of a period of a record's only input; None where it has none and none is stated.
 
     Raises ValueError where the record is shorter than the stated period, or its input differs from itself a
-    period later by more than `_REPEATS_WITHIN_POWER` of its power.
+    period later by more than `_REPEATS_WITHIN_POWER` of its power. A record of just one period cannot
+    contradict it. stated: positive; not checked.
     """
     command = record.input[:, 0]
     if stated is None:
@@ -428,7 +438,9 @@ class _Steady:
     def of(cls, record: Record, period: int) -> _Steady:
         """Spectra of the last whole periods of a record, each of `period` samples.
 
-        Raises ValueError where the output stands still there.
+        Raises ValueError where the output stands still there. period: from 1 to the record's samples, not
+        checked; at least one period is left. An input that stands still gives NaN shares of power, so that no
+        line is excited; `period_of` leaves it out.
         """
         n_samples = record.n_samples
         n_periods = n_samples // period
@@ -468,12 +480,18 @@ class _Steady:
     @property
     def rms(self) -> float:
         """Root mean square of the input about its mean, in its unit (Parseval; a line at half the sampling
-        frequency, if there is one, counts twice)."""
+        frequency, if there is one, counts twice).
+
+        Of the mean over the whole periods, so that noise of a measured input averages away.
+        """
         energy = 2 * np.sum(np.abs(self.input) ** 2)
         return float(np.sqrt(energy) / self.period)
 
     def alike(self, other: _Steady) -> bool:
-        """Whether two records have one period, the same excited lines and, within `SAME`, one amplitude."""
+        """Whether two records have one period, the same excited lines and, within `SAME`, one amplitude.
+
+        The other's rms must not be zero; `period_of` leaves such inputs out.
+        """
         if self.period != other.period:
             return False
         if not np.array_equal(self.excited, other.excited):
@@ -481,7 +499,10 @@ class _Steady:
         return abs(self.rms / other.rms - 1) < SAME
 
     def has_input_of(self, other: _Steady) -> bool:
-        """Whether the inputs of two records of one period agree within `SAME`: one realisation."""
+        """Whether the inputs of two records of one period agree within `SAME`: one realisation.
+
+        Periods are not compared: numpy raises ValueError for spectra of different length.
+        """
         difference = np.linalg.norm(self.input - other.input)
         return bool(difference < SAME * np.linalg.norm(self.input))
 
@@ -489,7 +510,9 @@ class _Steady:
 def _levels(group: Sequence[_Steady]) -> Distortion:
     """Levels of the records of one amplitude, period and set of lines.
 
-    Of F excited lines among H harmonics; M realisations, each with its records' periods together.
+    Of F excited lines among H harmonics; M realisations, each with its records' periods together. group: at
+    least one, alike by `_Steady.alike`, with one excited line at least; not checked, as `distortion_of`
+    groups them.
     """
     first = group[0]
     realisations = in_groups(group, _Steady.has_input_of)

@@ -19,10 +19,10 @@ from scipy.special import fdtri
 
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 
-# Confidence level of ellipses and intervals where nobody says another.
+# Confidence level of ellipses and intervals where nobody says another: convention, 1 in 20 outside.
 LEVEL = 0.95
 # A semi-axis below this multiple of the centre's magnitude is rounding, not knowledge: the sixteenfold
-# precision of doubles is what a few operations leave.
+# precision of doubles is what a few operations leave, each half of it at most. Chosen.
 ROUNDING = 16 * np.finfo(np.float64).eps
 
 
@@ -61,7 +61,11 @@ class EllipseAxes:
 
     def boundary(self, n_points: int = 64) -> ComplexArray:
         """Return complex offsets (F, n_points) of points on the boundary from the centre, anticlockwise from
-        u1."""
+        u1.
+
+        In units of the response. 64 points, the default, are a polygon that lies inside of the ellipse by .1
+        % of an axis, which no drawing shows. 0 points give none; a negative number is numpy's ValueError.
+        """
         angle = np.linspace(0.0, 2 * np.pi, n_points, endpoint=False)
         along_major = self.semi_major[:, None] * np.cos(angle)
         along_minor = 1j * self.semi_minor[:, None] * np.sin(angle)
@@ -103,7 +107,8 @@ def standard_axes(covariance: RealArray) -> StandardAxes:
     Parameters
     ----------
     covariance : ndarray, shape (F, 2, 2)
-        Of (Re, Im); the mean of the two entries beside the diagonal counts.
+        Of (Re, Im); the mean of the two entries beside the diagonal counts. Not checked: matrices that are no
+        covariances have axes cut off at zero, or NaN (`relative_deficit` tells).
 
     Notes
     -----
@@ -139,7 +144,8 @@ def spread_covariance(rows: ComplexArray, triangle: RealArray) -> RealArray:
     rows : ndarray, shape (F, P)
         Complex; row f times the P real numbers is the response at frequency f.
     triangle : ndarray, shape (P, P)
-        Lower triangle L, where L L^T is the covariance of the numbers.
+        Lower triangle L, where L L^T is the covariance of the numbers. What stands above it is not read.
+        Shapes that do not fit raise an error of BLAS or numpy; NaN spreads.
     """
     # In real numbers, as the triangle is: half the products. dtrmm leaves the zeros of the triangle out.
     spread = dtrmm(1.0, triangle, real_rows(rows).T, lower=1, trans_a=1, overwrite_b=1).T
@@ -157,7 +163,8 @@ def spread_covariance(rows: ComplexArray, triangle: RealArray) -> RealArray:
 def relative_deficit(covariance: RealArray) -> RealArray:
     """Return by how much symmetric (F, 2, 2) matrices fail to be covariances, (F,); positive where they do.
 
-    It is the smallest eigenvalue with its sign turned, over the largest entry; 0 for a matrix of zeros.
+    It is the smallest eigenvalue with its sign turned, over the largest entry; 0 for a matrix of zeros. Only
+    the mean of the entries beside the diagonal counts; NaN gives NaN, which no comparison refuses.
     """
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]
     cross = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
@@ -173,9 +180,9 @@ def ellipse_distance(offset: ComplexArray, ellipses: EllipseAxes, magnitude: Rea
     Parameters
     ----------
     offset : ndarray, shape (F,)
-        Complex.
+        Complex, response less centre. Finite; not checked.
     ellipses : EllipseAxes
-        F of them.
+        F of them: half-axes in units of the response, and the direction of the major one.
     magnitude : ndarray, shape (F,)
         Size of the numbers whose difference the offset is. Axes below their rounding count as that rounding,
         so that an exact point holds itself.
@@ -198,9 +205,10 @@ def hotelling_widening(freedom: npt.ArrayLike, level: float) -> npt.NDArray[np.f
     Parameters
     ----------
     freedom : array-like
-        Degrees of freedom f > 1 of the estimate, of any shape.
+        Degrees of freedom f > 1 of the estimate, of any shape. Not checked: f = 1 or less gives NaN or
+        infinity.
     level : float
-        Confidence level.
+        Confidence level; ValueError outside of 0 to 1.
 
     Returns
     -------
@@ -220,9 +228,9 @@ def circular_widening(freedom: int, level: float) -> float:
     Parameters
     ----------
     freedom : int
-        Complex degrees of freedom f > 0 of the estimate.
+        Complex degrees of freedom f > 0 of the estimate. Not checked: 0 gives NaN.
     level : float
-        Confidence level.
+        Confidence level; ValueError outside of 0 to 1.
 
     Returns
     -------

@@ -23,7 +23,7 @@ Value = float | bool | int | str
 # .95 a user with a few statements would often be told that a right one is wrong.
 TEST_LEVEL = 0.99
 # Lags at which residuals are tested for whiteness: 25 samples, a few periods of what a sampled model can
-# follow. A test over so many lags takes more than twice as many samples.
+# follow; chosen. A test over so many lags takes more than twice as many samples.
 WHITE_LAGS = 25
 
 
@@ -140,7 +140,11 @@ class Finding(Shown):
 
 
 def finding(kind: FindingKind, **values: Value | np.generic) -> Finding:
-    """Return a finding of a kind with these values; numbers of numpy become plain ones, as JSON has them."""
+    """Return a finding of a kind with these values; numbers of numpy become plain ones, as JSON has them.
+
+    Which values a kind needs is not checked here: its sentence fails where one is missing. Arrays are kept as
+    they are.
+    """
     plain_values: dict[str, Value] = {}
     for name, value in values.items():
         plain_values[name] = value.item() if isinstance(value, np.generic) else value
@@ -180,7 +184,10 @@ class PriorTest:
 
     @property
     def finding(self) -> Finding:
-        """The verdict as a finding of its kind, with the level of the test and the details."""
+        """The verdict as a finding of its kind, with the level of the test and the details.
+
+        TypeError where a key of `details` is one of the names above.
+        """
         return finding(
             self.kind,
             prior=self.prior,
@@ -196,7 +203,8 @@ class PriorTest:
 def distinct(findings: Sequence[Finding]) -> tuple[Finding, ...]:
     """Return each of some findings once: those of one kind with equal values are the same.
 
-    They stay in the order in which each comes first.
+    They stay in the order in which each comes first. Of equal ones the last is kept, in the place of the
+    first. Empty for none.
     """
     by_content = {}
     for item in findings:

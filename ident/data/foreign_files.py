@@ -31,7 +31,8 @@ MOST_COLUMNS = 4096
 
 CHILD_SCRIPT = Path(__file__).with_name("child_reader.py")
 """The script that reads compiled formats."""
-# Time that is waited for the child, s: its limit of processor time, and time for starting on a busy machine.
+# Time that is waited for the child, s: its limit of processor time, and half a minute for starting on a busy
+# machine, chosen.
 LONGEST_WAIT_S = CPU_SECONDS + 30
 # Bit 0 of the flags of a zip entry: it is encrypted (PKWARE's APPNOTE, 4.4.4).
 ENCRYPTED_FLAG = 0x1
@@ -63,7 +64,7 @@ def shown(value: object, longest: int = 80) -> str:
     value : object
         Text is taken as it is, anything else by its `repr`.
     longest : int
-        Characters, at least 3; a longer text ends in '...'.
+        Characters, at least 3 (not checked); a longer text ends in '...'. 80, the default, are a line.
 
     Returns
     -------
@@ -71,7 +72,7 @@ def shown(value: object, longest: int = 80) -> str:
         Runs of blanks and line ends are one blank, characters that cannot be printed are escaped.
     """
     text = value if isinstance(value, str) else repr(value)
-    # Enough is kept that blanks may shrink; a text of a gigabyte is not gone through.
+    # Enough is kept that blanks may shrink, four times the length; a text of a gigabyte is not gone through.
     one_line = " ".join(text[: 4 * longest].split())
     # Control characters in a file's names would act on the terminal that shows the message.
     printable = ""
@@ -106,7 +107,11 @@ def as_typed(value: object) -> str:
 
 
 def _escape(character: str) -> str:
-    """Return a character by its number, in as many hexadecimal digits as it needs: '\\x20', '\\u00a0'."""
+    """Return a character by its number, in as many hexadecimal digits as it needs: '\\x20', '\\u00a0'.
+
+    Two digits below 0x80 (ASCII), and for a byte that is no UTF-8; four below 0x10000, else eight. TypeError
+    for more than one character.
+    """
     code = ord(character)
     if FIRST_SURROGATE + 0x80 <= code <= FIRST_SURROGATE + 0xFF:
         return f"\\x{code - FIRST_SURROGATE:02x}"
@@ -119,7 +124,10 @@ def _escape(character: str) -> str:
 
 def path_as_typed(path: object) -> str:
     """Return a path as a shell takes it, with './' before one that begins with a dash, which programs would
-    take for an option."""
+    take for an option.
+
+    Any object is taken by its `str`; whether the path is there is not asked.
+    """
     text = str(path)
     return as_typed(f"./{text}" if text.startswith("-") else text)
 
@@ -131,7 +139,7 @@ def content_of(file: Path, largest_bytes: int = LARGEST_BYTES) -> bytes:
     ----------
     file : Path
     largest_bytes : int
-        Size above which it is refused.
+        Size above which it is refused; default 1 GiB (`child_reader.LARGEST_BYTES`).
 
     Raises
     ------
@@ -149,7 +157,10 @@ def content_of(file: Path, largest_bytes: int = LARGEST_BYTES) -> bytes:
 
 
 def distinct(names: Sequence[str]) -> list[str]:
-    """Return names of columns, in their order, those that are there several times numbered: '#1 angle'."""
+    """Return names of columns, in their order, those that are there several times numbered: '#1 angle'.
+
+    Empty for none. A name that looks like a numbered one, '#1 angle', is not told apart from it.
+    """
     times = Counter(names)
     times_so_far = Counter[str]()
     numbered = []

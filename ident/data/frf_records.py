@@ -5,7 +5,8 @@ and a label for the condition (date, amplitude). `FrfRepeats` reads and chooses 
 point, and averages the repeats of each frequency with a covariance from their scatter (`FrfRepeats.mean`),
 widened by Hotelling's T-squared for the few repeats there are (T. W. Anderson, An Introduction to
 Multivariate Statistical Analysis, chapter 5). Assumed: repeats are independent and Gaussian.
-`measured_response` takes whatever a user has: a table with variances, repeated sweeps, or a single one.
+`measured_response` takes whatever a user has: a table with variances, repeated sweeps, or a single one. The
+default level of 0.95 is convention: 1 in 20 outside.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
 
 # Neighbours on either side that a hint may propose to pool: beyond, what is pooled is no neighbourhood.
+# Chosen; it decides only which advice a complaint ends with.
 MOST_NEIGHBOURS = 50
 # Degrees of freedom that a 2x2 covariance needs to be more than a line: three repeats.
 FEWEST_DEGREES = 2
@@ -86,7 +88,9 @@ class FrfRepeats:
         Raises
         ------
         ValueError
-            In one line naming file, line and column; where a unit is not said, it asks for it.
+            In one line that begins with the path: no column `label`, no frequency or response (`DoubtError`
+            where one is there in part, or a unit has to be asked for), or a cell that is no finite number,
+            with line and column.
         """
         table = read_table(path)
         if label is not None and label not in table.names:
@@ -103,14 +107,20 @@ class FrfRepeats:
         return tuple(dict.fromkeys(self.label))
 
     def only(self, *labels: str) -> FrfRepeats:
-        """Return the points of some conditions. Raises ValueError if one does not occur."""
+        """Return the points of some conditions. Raises ValueError if one does not occur.
+
+        With no label: ValueError, as no point is left.
+        """
         for wanted in labels:
             if wanted not in self.label:
                 raise ValueError(f"no point is labelled {wanted!r}; there are {list(self.labels)}")
         return self._chosen(np.array([label in labels for label in self.label]))
 
     def band(self, omega_min_rad_s: float, omega_max_rad_s: float) -> FrfRepeats:
-        """Return the points with omega_min <= omega <= omega_max. Raises ValueError if there is none."""
+        """Return the points with omega_min <= omega <= omega_max. Raises ValueError if there is none.
+
+        Ends in rad/s; a NaN leaves none.
+        """
         is_above = self.omega_rad_s >= omega_min_rad_s
         is_below = self.omega_rad_s <= omega_max_rad_s
         return self._chosen(is_above & is_below)
@@ -121,7 +131,8 @@ class FrfRepeats:
         Parameters
         ----------
         reference_gain, feedback_gain : float
-            a and g of the loop's law u = a r - g y.
+            a and g of the loop's law u = a r - g y; a in units of u per r, g of u per y. That they are finite
+            is not checked, but a response that is not finite is refused.
 
         Returns
         -------
@@ -154,9 +165,9 @@ class FrfRepeats:
         Parameters
         ----------
         dt_s : float
-            Sampling time of the controller, s.
+            Sampling time of the controller, s; every frequency has to be at most pi / dt_s.
         level : float
-            Confidence level of the ellipses.
+            Confidence level of the ellipses, between 0 and 1.
         pool_neighbours : int
             m: relative covariances are averaged over m frequencies on either side first, which few repeats
             need. 0: each frequency by itself.
@@ -169,17 +180,21 @@ class FrfRepeats:
         Returns
         -------
         FrequencyUncertainty
-            One frequency for each different one, ascending.
+            One frequency for each different one, ascending. Where all repeats are equal it has a covariance
+            of zero.
 
         Raises
         ------
         ValueError
-            A frequency is left with too few repeats (the message says what helps), or an option is negative.
+            A frequency is left with too few repeats (the message says what helps), an option is negative, a
+            mean is zero where neighbours are pooled, or `FrequencyUncertainty` refuses the frequencies or the
+            level.
 
         Notes
         -----
         The covariance is widened until the ellipse of the chi-square quantile at `level` equals Hotelling's:
-        variance times 1.7 with 10 repeats, 9.5 with 4, 133 with 3.
+        variance times 1.7 with 10 repeats, 9.5 with 4, 133 with 3 (at 0.95). `of` is not checked: any other
+        text than 'mean' is one more run.
         """
         if pool_neighbours < 0:
             raise ValueError(f"pool_neighbours must not be negative; got {pool_neighbours}")
@@ -222,7 +237,10 @@ class FrfRepeats:
         return FrequencyUncertainty(grid, centre, covariance, dt_s, level, method)
 
     def _chosen(self, is_chosen: BoolArray) -> FrfRepeats:
-        """Return the points for which an array (K,) is true. Raises ValueError where none is."""
+        """Return the points for which an array (K,) is true. Raises ValueError where none is.
+
+        is_chosen: (K,) of bool; numpy raises IndexError for another length.
+        """
         if not np.any(is_chosen):
             raise ValueError("no measured point is left")
         return FrfRepeats(
@@ -233,7 +251,10 @@ class FrfRepeats:
 
 
 def is_response(*paths: Path) -> bool:
-    """Whether the files are frequency responses; False where one cannot be read, which others will say."""
+    """Whether the files are frequency responses; False where one cannot be read, which others will say.
+
+    True for no file.
+    """
     try:
         return all(has_response(read_table(path)) for path in paths)
     except ValueError:
@@ -253,13 +274,15 @@ def measured_response(
     Parameters
     ----------
     paths : sequence of Path
-        One table that states variances, or tables of points: sweeps of one response.
+        One table that states variances, or tables of points: sweeps of one response. At least one (numpy's
+        ValueError else).
     dt_s : float
         Sampling time of the controller, s.
     level : float
         Confidence level of the ellipses.
     pool_neighbours, outlier_threshold
-        Of repeats, see `FrfRepeats.mean`.
+        Of repeats, see `FrfRepeats.mean`: neighbours that share their scatter, and robust standard deviations
+        beyond which a point is left out. Not looked at where variances are stated.
 
     Returns
     -------
@@ -270,6 +293,7 @@ def measured_response(
     ------
     ValueError
         Naming the file: what cannot be read, or a column that seems to state the spread under another name.
+        Without a file's name: too few repeats at a frequency.
     """
     if len(paths) == 1:
         names = read_table(paths[0]).names
@@ -329,7 +353,9 @@ def inliers(points: ComplexArray, threshold: float) -> ComplexArray:
     Returns
     -------
     ndarray, shape (L,)
-        All points where half of them are equal. In one pass: repeated, the cloud shrinks by chance.
+        All points where half of them are equal, and then for any threshold. In one pass: repeated, the cloud
+        shrinks by chance. Not checked: no points come back as none, with a warning of numpy; a threshold
+        below the median distance leaves few points or none.
     """
     median = np.median(points.real) + 1j * np.median(points.imag)
     distance = np.abs(points - median)
@@ -348,7 +374,8 @@ def _pooled(
 
     scatter: sums of squares and products about each centre (F,), complex. They are added up relative to the
     response, as a gain error scatters it everywhere alike, and turned back to each centre. neighbours: on
-    either side; fewer at the ends. Raises ValueError where a centre is zero.
+    either side, at least 1 (0 leaves all as it is); fewer at the ends. Raises ValueError where a centre is
+    zero.
     """
     if np.any(centre == 0):
         raise ValueError("pooling uses relative scatter, but a mean response is exactly zero")

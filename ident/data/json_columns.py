@@ -135,7 +135,8 @@ def _lists(name: str, value: Any) -> dict[str, list[Any]]:
     """Lists by name in an object of columns, each with a cell for every row; empty for another value.
 
     An object may hold a column by the numbers of its rows, '0', '1', ..., as pandas writes them. A matrix of
-    C lists of T numbers, C < T, is turned into T rows.
+    C lists of T numbers, C < T, is turned into T rows. Empty for a number or text, which the caller refuses
+    as no columns.
     """
     if isinstance(value, list):
         widths = {len(row) if isinstance(row, list) else 0 for row in value}
@@ -156,7 +157,8 @@ def _lists(name: str, value: Any) -> dict[str, list[Any]]:
 def _column(values: Sequence[Any]) -> Any:
     """The column of values of one kind: an array (T,), or a tuple of T texts; else `Unread`.
 
-    None becomes NaN, or an empty text. An integer of hundreds of digits becomes infinite.
+    None becomes NaN, or an empty text. An integer of hundreds of digits becomes infinite. No values, or
+    nothing but None: an array of NaN.
     """
     kinds = {type(value) for value in values if value is not None}
     if kinds == {str}:

@@ -12,8 +12,8 @@ from typing import Any
 
 MOST_LEVELS = 40
 """Levels of nesting: what looks at a value level by level, or prints it, calls itself once or a few times for
-each, and Python allows a thousand calls within each other."""
-# Characters of a name that a complaint shows.
+each, and Python allows a thousand calls within each other. Chosen with room for both."""
+# Characters of a name that a complaint shows: a line's worth.
 _LONGEST_SHOWN = 80
 
 

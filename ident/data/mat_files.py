@@ -30,6 +30,13 @@ def mat_bytes(variables: dict[str, Any], what: str, *, oned_as: Literal["row", "
         Said in the first line of the file, in ASCII, after 'MATLAB 5.0 MAT-file, '.
     oned_as : {'row', 'column'}
         What a vector (T,) becomes.
+
+    Raises
+    ------
+    ValueError, TypeError
+        Of scipy, for what MATLAB cannot hold or a name of more than 31 letters; of Python
+        (UnicodeEncodeError) where `what` is not ASCII. A text of more than 95 characters would shift the
+        header: not checked.
     """
     import scipy.io  # here: few write such files, and every command would wait for it
 
@@ -62,7 +69,8 @@ def mat_variables(content: bytes, source: object) -> dict[str, Any]:
     ValueError
         One line: another kind of file (also one of version 7.3), or a damaged one.
     """
-    if b"\x89HDF\r\n" in content[:1024]:  # the signature of HDF5
+    # The signature of HDF5, before which up to 512 bytes of text stand.
+    if b"\x89HDF\r\n" in content[:1024]:
         raise ValueError(
             f"{source}: a version 7.3 .mat file where one of version 7 is expected: save it with '-v7'"
         )
@@ -72,7 +80,10 @@ def mat_variables(content: bytes, source: object) -> dict[str, Any]:
         raise ValueError(f"{source}{error}") from None
 
     def value(tree: dict[str, Any]) -> Any:
-        """Return the value of a tree of one key, which says its kind (`child_reader.mat_variables`)."""
+        """Return the value of a tree of one key, which says its kind (`child_reader.mat_variables`).
+
+        Trees come from our own script and are not checked; a kind that is not listed is text.
+        """
         ((kind, inner),) = tree.items()
         if kind == "struct":
             return {name: value(item) for name, item in inner.items()}

@@ -4,7 +4,8 @@
 the ratio leaves of the same lines; `coherence` says which share of the output's power is linear in the input.
 Both average over neighbouring spectral lines and over records (Ljung, System Identification, 2nd ed.,
 sections 6.3 and 6.4). Assumed: the response hardly changes over an averaging width, and the noise is
-independent from line to line. `spectra_of` makes the transforms, also for `repeats`.
+independent from line to line. `spectra_of` makes the transforms, also for `repeats`. The default level of
+0.95 is convention: 1 in 20 outside.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
-# Lines over which `over_lines` averages a power spectrum. The power of white noise in one line has a
-# relative standard deviation of 1, its mean over 25 lines one of a fifth; of 50, one of a seventh.
+# Lines over which `over_lines` averages a power spectrum. The power of white noise in one line has a relative
+# standard deviation of 1, its mean over 25 lines one of a fifth; of 50, one of a seventh. Odd, so that a line
+# has as many neighbours on either side.
 SMOOTHED_LINES = 25
-# Lines on either side of the middle one where the caller states none, and too few records for one line each.
+# Lines on either side of the middle one where the caller states none, and too few records for one line each:
+# five lines, of which four degrees of freedom are left. More smear resonances; chosen.
 USUAL_HALF_WIDTH_LINES = 2
 # Terms (lines times records) from which a ratio and its variance are estimated: one parameter is fitted, so
 # that two degrees of freedom are left. From this many records on a single line each is enough.
@@ -53,12 +56,12 @@ def empirical_frf(
     periodic : bool
         The records are whole periods in steady state. Else a straight line is taken off every signal.
     level : float
-        Confidence level of the ellipses.
+        Confidence level of the ellipses; ValueError outside of 0 to 1.
 
     Returns
     -------
     FrequencyUncertainty
-        One frequency for each averaging width, the mean of its lines.
+        One frequency for each averaging width, the mean of its lines; circles, in units of output per input.
 
     Raises
     ------
@@ -118,7 +121,8 @@ def coherence(
     Raises
     ------
     ValueError
-        As `empirical_frf` raises it for the records and the half width.
+        Records that do not fit together (`spectra_of`), a half width that is negative or leaves fewer than
+        three terms, or fewer lines than one averaging width.
     """
     spectra = spectra_of(records, periodic=False)
     width = 2 * _half_width(half_width_lines, len(records)) + 1
@@ -166,10 +170,10 @@ def spectra_of(records: Sequence[Record], periodic: bool) -> Spectra:
     Parameters
     ----------
     records : sequence of Record
-        One input and one output each.
+        One input and one output each, and at least two samples, as one has no line.
     periodic : bool
-        The records are whole periods in steady state. Else a straight line is taken off every signal, so that
-        drift does not leak into the lines.
+        The records are whole periods in steady state; not checked. Else a straight line is taken off every
+        signal, so that drift does not leak into the lines.
 
     Returns
     -------
@@ -261,8 +265,9 @@ def _groups(
 def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[ComplexArray, RealArray]:
     """Return the response (F,) at each averaging width and its variance E abs(G_hat - G)^2 (F,).
 
-    groups: line indices (F, width). The variance is widened so that a chi-square ellipse at `level` holds the
-    response at that level in spite of few terms. Raises ValueError where a width is not excited.
+    groups: line indices (F, width), width times records at least `FEWEST_TERMS`; not checked. The variance is
+    widened so that a chi-square ellipse at `level` holds the response at that level in spite of few terms.
+    Raises ValueError where a width is not excited.
     """
     u = spectra.input[:, groups]
     y = spectra.output[:, groups]
@@ -277,6 +282,8 @@ def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[Comp
     # Terms (R, F, width) whose sum over records and lines is the error of the ratio's numerator. Records
     # with one instrument have the same distortion in a line: over them it is added, not averaged away.
     terms = (y - centre[:, None] * u) * w.conj()
+    # One instrument but for rounding of logs with six digits and more; beside lines that hardly count (1e-9
+    # of the largest) nothing is compared.
     several_lines = terms.shape[2] > 1
     smallest_difference = 1e-9 * float(np.abs(w).max())
     if several_lines and np.allclose(w, w[:1], rtol=1e-6, atol=smallest_difference):
@@ -292,6 +299,7 @@ def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[Comp
 def over_lines(power: RealArray) -> RealArray:
     """Return the mean of every line of a power spectrum (F,) and its 24 neighbours, (F,).
 
-    Lines beyond the ends count as zero, so that the mean falls off within 12 lines of them.
+    Lines beyond the ends count as zero, so that the mean falls off within 12 lines of them. Fewer than 25
+    lines give 25 values, not F; not checked.
     """
     return np.convolve(power, np.full(SMOOTHED_LINES, 1 / SMOOTHED_LINES), "same")

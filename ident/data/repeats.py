@@ -35,7 +35,7 @@ BANDS_PER_DECADE = 8
 # Frequencies that a band needs: with fewer, a mean and a slope describe the change exactly, and nothing is
 # left to judge them by.
 FEWEST_FREQUENCIES = 3
-# Averaging widths that an experiment needs, so that it has one band at least.
+# Averaging widths that an experiment needs, so that one band can have `FEWEST_FREQUENCIES`.
 FEWEST_WIDTHS = 3
 
 
@@ -106,7 +106,11 @@ class Repeats:
         Parameters
         ----------
         amplitude : int
-            Index into `rms`.
+            Index into `rms`; IndexError beyond.
+
+        Notes
+        -----
+        No unit. A mean response of zero gives infinity or NaN there, with a warning of numpy.
         """
         repeats = self.responses[amplitude]
         deviation = repeats.std(axis=0, ddof=1)
@@ -120,7 +124,7 @@ class Repeats:
         The level of 99 % holds for all bands together, as each is tested at its share of the error
         (Bonferroni). Bands are eighths of a decade. Empty with one amplitude.
         """
-        # The first and the last frequency belong to the bands in spite of rounding.
+        # The first and the last frequency belong to the bands in spite of rounding, far below 1e-9.
         low = self.omega_rad_s[0] * (1 - 1e-9)
         high = self.omega_rad_s[-1] * (1 + 1e-9)
         n_bands = max(round(BANDS_PER_DECADE * np.log10(high / low)), 1)
@@ -140,7 +144,7 @@ class Repeats:
         Parameters
         ----------
         low_rad_s, high_rad_s : float
-            Ends of the band, rad/s.
+            Ends of the band, rad/s; exchanged or NaN they hold no frequency.
 
         Returns
         -------
@@ -214,6 +218,9 @@ class Repeats:
 def _independent_errors(deviations: ComplexArray, freedom: int) -> float:
     """Return how many independent errors neighbouring frequencies have among them, between 1 and F.
 
+    Deviations that are all zero have F; freedom 1 divides by zero, which two amplitudes of two records
+    exclude.
+
     Parameters
     ----------
     deviations : ndarray, shape (K, F)
@@ -239,6 +246,8 @@ def _independent_errors(deviations: ComplexArray, freedom: int) -> float:
 
 def repeats_of(records: Sequence[Record]) -> tuple[Repeats, ...]:
     """Return every experiment among records that has an amplitude with two records or more.
+
+    Empty for no records.
 
     Parameters
     ----------
@@ -278,7 +287,8 @@ def _alike(first: tuple[Record, RealArray], second: tuple[Record, RealArray]) ->
     """Whether two records, each with its excitation (T,) about its mean, were excited alike but for the size.
 
     They have one length, one sampling time, and courses that differ by less than 2 % (`SAME`) in root mean
-    square once their sizes are divided out.
+    square once their sizes are divided out. Excitations that stand still, whose norm is zero, were left out
+    before.
     """
     first_record, first_course = first
     second_record, second_course = second

@@ -50,7 +50,10 @@ class Settings(BaseModel, metaclass=_Fields):
 
     @classmethod
     def __pydantic_init_subclass__(cls, **_: Any) -> None:
-        """Write the fields with their defaults into the docstring, and plain types into the signature."""
+        """Write the fields with their defaults into the docstring, and plain types into the signature.
+
+        NameError where an annotation names what its module does not have.
+        """
         lines = [(cls.__doc__ or "").rstrip(), "", "Fields", "------"]
         for name, field in cls.model_fields.items():
             default = ""
@@ -71,6 +74,8 @@ class Settings(BaseModel, metaclass=_Fields):
 
 def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     """The gravest complaint of a validation in one line: dotted key, what was expected, what came.
+
+    The error holds one complaint at least, as pydantic makes it.
 
     Parameters
     ----------
@@ -98,6 +103,8 @@ def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
 def meant(word: str, known: Sequence[str], what: str) -> str:
     """What to write in place of a word that nobody knows: the known one that looks like it, else all.
 
+    Without known words: the list in the answer is empty.
+
     Parameters
     ----------
     word : str
@@ -112,7 +119,11 @@ def meant(word: str, known: Sequence[str], what: str) -> str:
 
 
 def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
-    """One complaint of pydantic about a model in one line; detail: its kind, place, message and input."""
+    """One complaint of pydantic about a model in one line; detail: its kind, place, message and input.
+
+    A kind that is not listed here gets pydantic's own message. Of what came 80 characters are shown, a line's
+    worth.
+    """
     kind = detail["type"]
     key, known_keys = _walk(model, detail["loc"])
 
@@ -157,7 +168,7 @@ def _walk(model: type[BaseModel], location: Iterable[int | str]) -> _Place:
     """The place in a model that pydantic calls by keys and indices.
 
     pydantic puts the tag of a discriminated union into the location; the user never wrote it, so it is left
-    out.
+    out. A key that no model has ends the walk of models, and is part of the dotted key all the same.
     """
     key_parts: list[str] = []
     # Models that may stand at the place so far: of a union there are several.
@@ -192,12 +203,15 @@ def _walk(model: type[BaseModel], location: Iterable[int | str]) -> _Place:
 
 
 def _keys(models: Iterable[type[BaseModel]]) -> list[str]:
-    """Keys of the fields of some models as a user writes them, sorted."""
+    """Keys of the fields of some models as a user writes them, sorted. Empty for no models."""
     return sorted({field.alias or name for model in models for name, field in model.model_fields.items()})
 
 
 def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Models in the type of a field: itself, or those in its union, tuple or list."""
+    """Models in the type of a field: itself, or those in its union, tuple or list.
+
+    Empty where none is in it, as in the type of a number.
+    """
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     models = list[type[BaseModel]]()

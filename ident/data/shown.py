@@ -35,13 +35,22 @@ class Shown:
         return str(self.front.shown.text(self))
 
     def _repr_html_(self) -> str:
-        """The result as HTML, which notebooks ask for by this name."""
+        """The result as HTML, which notebooks ask for by this name.
+
+        AttributeError where the front door is not loaded.
+        """
         return str(self.front.shown.html_text(self))
 
     def plot(self) -> Any:
-        """Draw the result; see `flexlink.plot`."""
+        """Draw the result; see `flexlink.plot`.
+
+        AttributeError where the front door is not loaded; else what it raises.
+        """
         return self.front.plot(self)
 
     def table(self) -> Any:
-        """Return the result as a `pandas.DataFrame`; see `flexlink.table`."""
+        """Return the result as a `pandas.DataFrame`; see `flexlink.table`.
+
+        AttributeError where the front door is not loaded; else what it raises.
+        """
         return self.front.table(self)

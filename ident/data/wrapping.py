@@ -6,6 +6,8 @@ such as -9999 or 9.9e37 where they have no reading (`no_reading`), and single sa
 (`spikes_in`). All of it is found by the numbers alone: jumps against usual steps, and numbers that programs
 are known to use. Assumed: a moving machine changes little from sample to sample against its whole range. A
 sawtooth that was meant looks like a reading that wraps; what is found is therefore reported, not corrected.
+Functions take finite numbers (T,), as `Table.columns` gives them; unless they say so NaN is not checked, and
+compares as false.
 """
 
 from __future__ import annotations
@@ -17,10 +19,11 @@ from ident.data.arrays import IntArray, RealArray
 
 def _usual_periods() -> tuple[float, ...]:
     """Return the periods at which readings of sensors wrap, ascending, in units of the reading."""
-    counters = [2.0**bits for bits in range(8, 33)]
+    counters = [2.0**bits for bits in range(8, 33)]  # encoders and counters of 8 to 32 bits
     degrees = [360.0, 3600.0, 36000.0, 21600.0]  # and their tenths and hundredths; minutes of arc
     other_turns = [400.0, 6400.0, np.pi, 2 * np.pi, 1.0]  # gon, artillery mils, rad, turns
     encoder_lines = []
+    # Lines or counts a turn that makers of encoders list, 100 to 800,000.
     for digits in (1, 1.2, 1.44, 1.8, 2, 2.4, 2.5, 3, 4, 5, 6, 7.2, 8):
         for exponent in (2, 3, 4, 5):
             encoder_lines.append(float(f"{digits}e{exponent}"))
@@ -42,6 +45,7 @@ def _ends_of_integers() -> frozenset[float]:
     """Return the largest and smallest signed and unsigned integers of 16, 32 and 64 bits, and their
     neighbours, which programs write for no reading."""
     ends = []
+    # A signed integer of n bits ends at 2^(n - 1).
     for bits in (15, 16, 31, 32, 63):
         ends += [2.0**bits, 2.0**bits - 1, -(2.0**bits), -(2.0**bits - 1)]
     return frozenset(ends)
@@ -139,7 +143,8 @@ def wraps_at(values: RealArray) -> float:
         return 0.0
 
     # The readings next to a jump are within a step of both ends, so the period is at most two steps more
-    # than the range.
+    # than the range. The usual step is one that nine in ten do not exceed, as the fastest motion leaves the
+    # largest gap; at least a thousandth of the range, for readings that hardly move. 1e-9: rounding.
     usual_share = float(np.quantile(step_share[~jumps], 0.9)) if not jumps.all() else 0.0
     largest_period = (1 + 2 * max(usual_share, 1e-3)) * span
     fitting_periods = [period for period in USUAL_PERIODS if span < period * (1 + 1e-9) <= largest_period]
@@ -147,16 +152,19 @@ def wraps_at(values: RealArray) -> float:
     if fitting_periods:
         period = fitting_periods[0]
     elif holds_whole_numbers:
+        # Six digits: the range is not known to more, and a user reads it.
         period = float(f"{span + 1:.6g}")
     else:
         period = float(f"{span:.6g}")
     going_on = np.unwrap(values, period=period)
 
+    # The middle 60 % of the range (`SELDOM_BETWEEN`).
     low = float(values.min())
     is_between = (values > low + 0.2 * span) & (values < low + 0.8 * span)
     if float(np.mean(is_between)) < SELDOM_BETWEEN:
         # Only a swing about a usual place of wrapping, 0 or half a period, passes: it moves on both sides of
-        # the range, and it is no noise.
+        # the range, and it is no noise. The range begins at that place but for two usual steps, or a
+        # thousandth of the period, as above.
         if not fitting_periods:
             return 0.0
         distance_to_usual_place = min(abs(low), abs(low + period / 2))
@@ -197,6 +205,7 @@ def timer_period(stamps: RealArray) -> float:
         return 0.0
     forward = steps[~goes_back]
     usual_step = float(np.median(forward))
+    # Half a step more than usual is jitter: from there on a row would be missing.
     longest_step = max(1.5 * usual_step, float(np.max(forward)))
     longest_seam = min(longest_step, LONGEST_SEAM * usual_step)
     span = float(np.ptp(stamps))
@@ -213,6 +222,7 @@ def no_reading(values: RealArray, *, command: bool = False) -> IntArray:
     Parameters
     ----------
     values : ndarray, shape (T,)
+        Finite; none of no samples.
     command : bool
         The signal is a command. Then single values that are a hundred times beyond the range of all others
         count as well; a smaller pulse may be meant.
@@ -248,7 +258,8 @@ def _stands_for_nothing(value: float) -> bool:
     """Whether programs write this number where there is no reading.
 
     Such numbers are three nines and more, another digit four times and more, an end of an integer's range
-    (`ENDS_OF_INTEGERS`), and more than any meter shows.
+    (`ENDS_OF_INTEGERS`), and more than any meter shows. Ten digits are looked at. False for 0; infinity
+    counts.
     """
     digits = f"{abs(value):.10g}".replace(".", "").rstrip("0")
     fewest_digits = 3 if digits.startswith("9") else 4
