@@ -45,7 +45,7 @@ def kernel_array(array: RealArray) -> RealArray:
     """Return the array as compiled code takes it: C-contiguous and writable; a copy only where it is not.
 
     For numba, each layout is a type of its own, and compiled anew: two compilations may round differently.
-    The type of its numbers is not changed, nor checked.
+    The type of its numbers is not changed, nor checked. array: of any shape.
     """
     flags = array.flags
     return array if flags.c_contiguous and flags.writeable else array.copy(order="C")

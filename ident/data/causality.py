@@ -103,7 +103,8 @@ def _tells(cause: RealArray, signal: RealArray, beside: RealArray | None = None)
     """Return how much a cause (T,) tells of the next sample of a signal (T,): 1 where it tells nothing.
 
     beside: another signal (T,) whose samples are known as well. Where it is given, the samples of it and of
-    the cause at the time of the predicted sample count, too: a controller answers at once.
+    the cause at the time of the predicted sample count, too: a controller answers at once. Signals of one
+    length, finite; not checked.
 
     Notes
     -----

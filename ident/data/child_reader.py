@@ -102,7 +102,10 @@ def hdf5_columns(content: bytes) -> list[Column]:
         datasets: list[tuple[str, Any]] = []
 
         def collect(name: str, item: Any) -> None:
-            """Keep an item if it is a dataset; the walk over the file stops at any answer but None."""
+            """Keep an item if it is a dataset; the walk over the file stops at any answer but None.
+
+            name: its path in the file.
+            """
             if isinstance(item, h5py.Dataset):
                 datasets.append((name, item))
 
@@ -157,7 +160,10 @@ def _unpacked(path: str, values: Any, attributes: Any) -> Any:
     import numpy as np
 
     def number(key: str, usual: float) -> Any:
-        """Return an attribute as a number without dimensions, or the usual one where it is not there."""
+        """Return an attribute as a number without dimensions, or the usual one where it is not there.
+
+        Raises RefusedError where it is no number.
+        """
         try:
             return np.asarray(attributes.get(key, usual), dtype=np.float64).reshape(())
         except (ValueError, TypeError):
@@ -207,7 +213,7 @@ def parquet_columns(content: bytes) -> list[Column]:
     about = file.metadata
     packed_bytes = sum(about.row_group(k).total_byte_size for k in range(about.num_row_groups))
     # Columns of one repeated value take no room in the file, but they do as doubles. The largest size is
-    # allowed four times here, half of the memory: most columns are of types of fewer bytes.
+    # allowed four times here, half of the memory: most columns are of types of fewer bytes. A double has 8.
     bytes_as_doubles = 8 * about.num_rows * about.num_columns
     if packed_bytes > LARGEST_BYTES or bytes_as_doubles > 4 * LARGEST_BYTES:
         raise RefusedError(f"unpacks to more than {LARGEST_BYTES >> 20} MiB: split the file")
@@ -366,6 +372,7 @@ def bag_columns(content: bytes, kind: str) -> list[Column]:
     if not messages:
         raise RefusedError("no messages that can be read; expected CDR, ROS 1 or JSON, and numbers in them")
 
+    # Times are in whole nanoseconds until the first one is taken off: 1e-9 s each.
     begin_ns = min(of_topic[0][0] for of_topic in messages.values())
     columns: list[Column] = []
     for topic, of_topic in messages.items():
@@ -563,7 +570,10 @@ def mat_variables(content: bytes) -> bytes:
     arrays: list[Any] = []
 
     def tree(value: Any) -> dict[str, Any]:
-        """Return the tree of a value as scipy gives it; its arrays are appended to `arrays`."""
+        """Return the tree of a value as scipy gives it; its arrays are appended to `arrays`.
+
+        What is no numbers, text, struct or cell array becomes 'unread'; nothing is refused here.
+        """
         if isinstance(value, mat_struct):
             names = vars(value)["_fieldnames"]
             return {"struct": {name: tree(getattr(value, name)) for name in names}}
@@ -646,7 +656,8 @@ def main(kind: str) -> int:
     Returns
     -------
     int
-        Exit code: 0, 2 (refused or damaged; standard error may say why) or 3 (no library).
+        Exit code: 0, 2 (refused or damaged; standard error may say why) or 3 (no library). A kind that is not
+        listed is refused like a damaged bag. Past the limit of processor time the system ends the process.
     """
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _allow_at_most(resource.RLIMIT_CPU, CPU_SECONDS)

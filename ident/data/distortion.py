@@ -16,7 +16,8 @@ line for P = 2, falling with the line's square. The input is taken as known.
 
 `distortion_of` finds the period of each record (`period_of`), takes the spectra of its whole periods, puts
 records of one amplitude into a group and makes a `Distortion` of each group. Its `LineLevels` say the powers
-line by line, and `LineLevels.within` one number with its interval for a band.
+line by line, and `LineLevels.within` one number with its interval for a band. Of a `Record` matter here input
+and output (T, 1), dt_s [s] and name; its numbers are finite.
 """
 
 from __future__ import annotations
@@ -102,7 +103,7 @@ class LineLevels:
     gain: RealArray
 
     def __post_init__(self) -> None:
-        """Lock the arrays against writing."""
+        """Lock the arrays against writing. Nothing is checked."""
         for entry in fields(self):
             array = getattr(self, entry.name)
             if isinstance(array, np.ndarray):
@@ -215,7 +216,7 @@ class BandLevel:
 
     @property
     def significant(self) -> bool:
-        """Whether the interval of the distortion begins above zero."""
+        """Whether the interval of the distortion begins above zero. False where an end is NaN."""
         return self.interval[0] > 0
 
 
@@ -296,7 +297,11 @@ class Distortion:
 
     @cached_property
     def bands_rad_s(self) -> tuple[tuple[float, float], ...]:
-        """Bands of about half a decade, as (from, to), from the lowest excited line up to the highest."""
+        """Bands of about half a decade, as (from, to), from the lowest excited line up to the highest.
+
+        In rad/s, side by side; one band where there is one line only. At least one line, which
+        `distortion_of` has.
+        """
         low = self.omega_rad_s[0] * (1 - _BAND_EDGE_SHARE)
         high = self.omega_rad_s[-1] * (1 + _BAND_EDGE_SHARE)
         # Two bands a decade, at least one. Chosen: a table of them stays short.

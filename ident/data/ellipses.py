@@ -48,7 +48,11 @@ class EllipseAxes:
     direction: ComplexArray
 
     def __post_init__(self) -> None:
-        """Check shapes and order, and lock the arrays."""
+        """Check shapes and order, and lock the arrays.
+
+        Raises ValueError for other shapes, or axes that are NaN, negative or in the wrong order. The arrays
+        themselves are locked, no copies.
+        """
         if not (self.semi_major.shape == self.semi_minor.shape == self.direction.shape):
             raise ValueError(
                 f"need three (F,) arrays; got {self.semi_major.shape}, {self.semi_minor.shape}, "

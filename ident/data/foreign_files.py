@@ -112,6 +112,7 @@ def _escape(character: str) -> str:
     Two digits below 0x80 (ASCII), and for a byte that is no UTF-8; four below 0x10000, else eight. TypeError
     for more than one character.
     """
+    # Bytes that are no UTF-8 are 0x80 to 0xFF.
     code = ord(character)
     if FIRST_SURROGATE + 0x80 <= code <= FIRST_SURROGATE + 0xFF:
         return f"\\x{code - FIRST_SURROGATE:02x}"

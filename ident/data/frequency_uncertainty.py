@@ -68,7 +68,10 @@ class FrequencyUncertainty:
     method: str = "given"
 
     def __post_init__(self) -> None:
-        """Lock the arrays, check them, and make the covariance exactly symmetric."""
+        """Lock the arrays, check them, and make the covariance exactly symmetric.
+
+        Raises ValueError where a shape or a number does not fit, naming the first frequency at fault.
+        """
         lock(self, "omega_rad_s")
         lock(self, "centre", dtype=np.complex128)
         omega = self.omega_rad_s

@@ -60,7 +60,11 @@ class FrfRepeats:
     label: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Lock the arrays and check them."""
+        """Lock the arrays and check them.
+
+        Raises ValueError for other shapes, no point, or numbers that are not finite; negative frequencies
+        pass, and are refused by `mean`.
+        """
         lock(self, "omega_rad_s")
         lock(self, "response", dtype=np.complex128)
         size = self.omega_rad_s.size
@@ -103,7 +107,7 @@ class FrfRepeats:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """The different labels, in the order they come."""
+        """The different labels, in the order they come. ('',) where no condition is given."""
         return tuple(dict.fromkeys(self.label))
 
     def only(self, *labels: str) -> FrfRepeats:
@@ -323,6 +327,7 @@ def _too_few(grid: RealArray, count: IntArray, freedom: IntArray) -> str:
     """Return what is missing for a covariance at every frequency, and only what mends it.
 
     grid: frequencies (F,), rad/s; count: repeats (F,); freedom: degrees of freedom (F,), somewhere below 2.
+    Nothing is raised here: `FrfRepeats.mean` does.
     """
     state_spread = "give variance_real, variance_imag or a stated uncertainty"
     if np.all(count == 1):

@@ -4,8 +4,9 @@
 the ratio leaves of the same lines; `coherence` says which share of the output's power is linear in the input.
 Both average over neighbouring spectral lines and over records (Ljung, System Identification, 2nd ed.,
 sections 6.3 and 6.4). Assumed: the response hardly changes over an averaging width, and the noise is
-independent from line to line. `spectra_of` makes the transforms, also for `repeats`. The default level of
-0.95 is convention: 1 in 20 outside.
+independent from line to line. `spectra_of` makes the transforms, also for `repeats`. Of a `Record` matter
+here input and output (T, 1), reference (T, R) or None, and dt_s [s]; its numbers are finite. The default
+level of 0.95 is convention: 1 in 20 outside.
 """
 
 from __future__ import annotations
@@ -196,7 +197,10 @@ def spectra_of(records: Sequence[Record], periodic: bool) -> Spectra:
             )
 
     def transform(signals: list[RealArray]) -> ComplexArray:
-        """Return the transforms (R, F) of R signals, (T,) each, without the line at zero."""
+        """Return the transforms (R, F) of R signals, (T,) each, without the line at zero.
+
+        F = T // 2 lines; signals of one length, which is checked above.
+        """
         stacked = np.stack(signals)
         if not periodic:
             stacked = detrend(stacked, axis=1, type="linear")

@@ -98,7 +98,7 @@ class Record(Shown):
     own_units: Mapping[str, str] = field(default_factory=dict, metadata={"since": 2})
 
     def __post_init__(self) -> None:
-        """Lock the arrays and check that everything fits together."""
+        """Lock the arrays and check that everything fits together. Raises ValueError as the class says."""
         # Fields of a frozen class are set through `object`. Names may come as lists.
         for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
             object.__setattr__(self, key, tuple(getattr(self, key)))
@@ -147,7 +147,10 @@ class Record(Shown):
 
     @property
     def label(self) -> str:
-        """How error messages call this record: the file if there is one, else the name."""
+        """How error messages call this record: the file if there is one, else the name.
+
+        Neither has to be there: '' is quoted as it is.
+        """
         return self.source or f"record '{self.name}'"
 
     @property

@@ -6,6 +6,9 @@ and estimates a frequency response from each record, without a model. The respon
 depend on the amplitude, so `Repeats.amplitude_effects` compares the largest with the smallest amplitude, band
 by band, by Dempster's test of two samples of many variables (Annals of Mathematical Statistics 29(4), 1958).
 Assumed: repeats differ by noise and by random changes from run to run, which are independent between records.
+Of a `Record` matter here input and output (T, 1), reference (T, R) or None, dt_s [s] and name; its numbers
+are finite. TEST_LEVEL is 99 %, SAME 2 % (one form, one amplitude), EXCITED a hundredth of the strongest
+line's power.
 """
 
 from __future__ import annotations

@@ -3,9 +3,11 @@
 A column is a frequency, a gain, a phase, a real or an imaginary part by a word of its name, or by its unit
 where no word says it (`response_columns`). `read_response` converts the columns to rad/s and complex numbers;
 where a file has real and imaginary parts beside gain and phase, they have to agree. A unit that is not
-stated, or not known, is asked for: dB and a factor, rad and degrees are never guessed. Functions that take
-the name of a column take any text, and raise nothing unless they say so. A number in `shown(text, 60)` is how
-many characters of it a complaint quotes; it decides nothing.
+stated, or not known, is asked for: dB and a factor, rad and degrees are never guessed. Of a `Table` matter
+here `names`, `units` (by name, as the file has them beside the names), `place(row)` in words, and
+`columns(names)`: finite numbers (K,) by name, or ValueError. Functions that take the name of a column take
+any text, and raise nothing unless they say so. A number in `shown(text, 60)` is how many characters of it a
+complaint quotes; it decides nothing.
 """
 
 from __future__ import annotations

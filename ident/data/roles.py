@@ -9,9 +9,11 @@ test in `ident.data.causality`).
 What remains in doubt is asked for: every complaint ends with a command that works as it is typed (`_ask`). It
 proposes columns by weaker signs, as whether a command moves them; these decide nothing by themselves.
 
-Every name that functions here take is a column of the table; another one ends in KeyError where its cells are
-asked for. A number in `shown(text, 30)` is how many characters of a name a complaint quotes, so that it stays
-within 300 characters with its command; it decides nothing.
+Of a `Table` matter here `names`, the cells by name (`raw`: text or arrays), `unit(name)` ('' for none) and
+`columns(names)`: finite numbers (T,) by name, or ValueError. Every name that functions take is a column of
+the table; another one ends in KeyError where its cells are asked for. A number in `shown(text, 30)` is how
+many characters of a name a complaint quotes, so that it stays within 300 characters with its command; it
+decides nothing.
 """
 
 from __future__ import annotations
@@ -250,7 +252,7 @@ def _with_reference(table: Table, roles: Roles, wished: Sequence[str], typed: st
     # The only one is in another unit: its numbers have to be scaled; or its header is wrong, where they agree
     # as they stand.
     is_same = False
-    with suppress(ValueError):  # cells that hold no number are somebody else's to say
+    with suppress(ValueError):  # no numbers: whoever uses the column complains of it
         is_same = follows_as_it_stands(*table.columns([only_candidate, roles.output]).values())
     factor = per(unit, output_unit)
     if is_same:
@@ -352,7 +354,7 @@ def _is_loop(table: Table, loop: _Loop) -> bool:
 
     False, too, for columns that `Table.columns` refuses.
     """
-    with suppress(ValueError):  # cells that hold no number are somebody else's to say
+    with suppress(ValueError):  # no numbers: whoever uses the column complains of it
         return is_loop(*table.columns([loop.reference, loop.output, loop.command]).values())
     return False
 
@@ -488,7 +490,7 @@ def _led_and_follower(table: Table, names: list[str]) -> _Pair | None:
     drives = [any(word[1] for word in _WORD.finditer(in_short(name))) for name in names]
     if drives[0] != drives[1]:
         return _Pair(first, second) if drives[0] else _Pair(second, first)
-    with suppress(ValueError):  # cells that hold no number are somebody else's to say
+    with suppress(ValueError):  # no numbers: whoever uses the column complains of it
         first_leads = leads(*table.columns(names).values())
         if first_leads is not None:
             return _Pair(first, second) if first_leads else _Pair(second, first)

@@ -153,7 +153,7 @@ def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
 
 
 def _without_quotes(text: object) -> str:
-    """A word without the quotes that pydantic puts around it."""
+    """A word without the quotes that pydantic puts around it. Text without quotes stays."""
     return str(text).strip("'")
 
 

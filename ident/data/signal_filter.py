@@ -4,7 +4,8 @@ A linear plant and a linear filter commute, so that a record whose signals all w
 same response; noise, drift and dynamics outside of the band count less in a fit of it (Ljung, System
 Identification, 2nd ed., section 14.4). `band_limited` applies a Butterworth filter, `increments` takes
 differences, which whitens slow noise. `band_edges` checks a band, `settling_time_s` says how long the
-filter's own start is seen. Assumed: that start is skipped, or the fit has an unknown initial state.
+filter's own start is seen. Assumed: that start is skipped, or the fit has an unknown initial state. Of a
+`Record` matter here its signals (T, .), finite, and dt_s [s].
 """
 
 from __future__ import annotations
@@ -80,7 +81,10 @@ def band_limited(
     steady_state_of_one = scipy.signal.sosfilt_zi(sections)
 
     def filtered(signals: RealArray) -> RealArray:
-        """Return filtered signals, columns of (T, C), without the samples that are skipped."""
+        """Return filtered signals, columns of (T, C), without the samples that are skipped.
+
+        (T - n_skipped, C) in the units of the signals; finite, as of a record, with one column at least.
+        """
         columns = []
         for signal in signals.T:
             column, _ = scipy.signal.sosfilt(sections, signal, zi=steady_state_of_one * signal[0])

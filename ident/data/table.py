@@ -97,7 +97,7 @@ class Table:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the columns, in the order of the file."""
+        """Names of the columns, in the order of the file. Empty for a file without columns."""
         return tuple(self.raw)
 
     def place(self, row: int, name: str | None = None) -> str:
@@ -264,7 +264,8 @@ class Table:
         """Names of columns in a line for a complaint: all, or those that are meant by a name.
 
         wanted: the name of a matrix or struct, whose columns are listed, or one that several columns have. A
-        name that nothing begins with lists all. Names beyond `_MOST_LISTED` are counted, not listed.
+        name that nothing begins with lists all. Names beyond `_MOST_LISTED` are counted, not listed. 'no
+        columns' where there is none.
         """
         names = self._alike(wanted)
         if not names and wanted:

@@ -51,7 +51,10 @@ def with_plain_minus(text: str) -> str:
 
 
 def _with_leading_sign(text: str) -> str:
-    """'-3.25' of '(3.25)' and of '3.25-', as bookkeeping writes what is negative; else the text as it is."""
+    """'-3.25' of '(3.25)' and of '3.25-', as bookkeeping writes what is negative; else the text as it is.
+
+    Whether it is a number is not asked; an empty text stays.
+    """
     if text[:1] == "(" and text[-1:] == ")" and text[1:2].isdigit():
         return f"-{text[1:-1]}"
     if text[-1:] == "-" and text[:1].isdigit():

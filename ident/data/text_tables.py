@@ -854,7 +854,7 @@ class _Fit:
                 numbers.append((word.strip(), value.strip()))
 
         def first_of(pattern: re.Pattern[str]) -> float | None:
-            """The number behind the first word that the pattern matches."""
+            """The number behind the first word that the pattern matches. None without such a word."""
             for word, value in numbers:
                 if pattern.match(word):
                     return number(value, self.decimal)

@@ -6,8 +6,9 @@ jitter, or of which single ones were lost, on the grid that fits all stamps best
 `CoarseGrid` makes a coarser grid of stamps that keep to none, with straight lines between readings and means
 of the input. `Repair` says what either did, and up to which frequency the result is faithful to 1 % (of a
 cubic spline: Hall and Meyer, Journal of Approximation Theory 16, 1976). Assumed: stamps say when rows were
-taken. A usual step is the median one, which lost rows do not move. Functions that say "increasing" do not
-check it, nor that there are two stamps: their callers have asked `Table.increasing`, which raises ValueError.
+taken. A usual step is the median one, which lost rows do not move. Of a `Table` only its path and the place
+of a row, in words, matter here: complaints name them. Functions that say "increasing" do not check it, nor
+that there are two stamps: their callers have asked `Table.increasing`, which raises ValueError.
 """
 
 from __future__ import annotations
@@ -544,7 +545,10 @@ class CoarseGrid:
 
     @property
     def _instants(self) -> RealArray:
-        """Instants (T,) of the grid, s, from 0 to the last stamp."""
+        """Instants (T,) of the grid, s, from 0 to the last stamp.
+
+        The last one is at or before the last stamp. Positive step and increasing stamps, as `of` has checked.
+        """
         # Rounding of the stamps must not cost the last one: a millionth of a step is far above rounding, and
         # far below what a stamp is off.
         n_samples = int(np.floor(self.stamps[-1] / self.dt_s + 1e-6)) + 1

@@ -122,6 +122,7 @@ def is_stamp(cell: str) -> bool:
     has_sign = any(sign in cell for sign in ":./") or "-" in cell[1:]
     if not has_sign:
         text = cell.lstrip()
+        # '20240301T100000': the sign stands behind eight digits.
         may_be_basic = text[8:9] in ("T", " ", "_")
         if text[:1] != "P" and not may_be_basic:
             return False
@@ -179,6 +180,7 @@ def seconds_since_first(cells: Sequence[str]) -> RealArray:
                 passed_ns += period_ns
             going_on.append(now + passed_ns)
         nanoseconds = going_on
+    # Whole nanoseconds, of which a second has 1e9.
     return np.array([now - nanoseconds[0] for now in nanoseconds], dtype=np.float64) / 1e9
 
 
@@ -200,7 +202,7 @@ def _number(part: str | None) -> int:
 
 
 def _has_day(match: re.Match[str]) -> bool:
-    """Whether a stamp has a day."""
+    """Whether a stamp has a day. A zone or an empty match has none."""
     return match["year_first"] is not None or match["year_last"] is not None
 
 

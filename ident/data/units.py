@@ -201,7 +201,7 @@ _FEWEST_LINES = 8
 # another unit is no longer seen (test_units).
 _FOLLOWS_WITHIN = 1.3
 # Coherence from which on an output follows at all: that of measured and simulated loops is .9 and more there.
-# Halved, no test of units moves; doubled, only what is computed follows.
+# Halved, no test of units moves; doubled it would be 1, which only computed signals reach.
 _COHERENT = 0.5
 
 # Samples from which on a log with long steps is rather one in milliseconds: a thousand steps of half a second
@@ -342,7 +342,10 @@ def _words(text: str) -> list[str]:
     """
 
     def unit_of_prefix(prefix: re.Match[str]) -> str:
-        """The unit of a prefix of the second that stands apart."""
+        """The unit of a prefix of the second that stands apart.
+
+        prefix: a match of `_APART`, which holds no other prefixes.
+        """
         return _UNIT_OF_PREFIX[prefix[1].lower()]
 
     words = list[str]()
@@ -520,7 +523,7 @@ class TimeColumn:
 
     @property
     def unit_in_words(self) -> str:
-        """What the file says of the unit, as complaints have it."""
+        """What the file says of the unit, as complaints have it; also where it says none."""
         return f"its unit is said to be {self.in_header}" if self.in_header else "no unit is stated"
 
     def refuse_stamps(self, stamps: RealArray) -> None:
@@ -582,6 +585,7 @@ class TimeColumn:
         sampled faster than 100 kHz, and as seconds like machines are. False where the user stated the unit,
         or with fewer than three stamps.
         """
+        # Two stamps have one step, of which nobody knows whether it is usual.
         if self.stated or stamps.size < 3:
             return False
         step = (stamps[-1] - stamps[0]) / (stamps.size - 1)

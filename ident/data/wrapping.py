@@ -33,6 +33,7 @@ def _usual_periods() -> tuple[float, ...]:
 def _timer_periods() -> tuple[float, ...]:
     """Return the periods at which timers start again, ascending, in s, ms or us: 16, 24, 31 or 32 bits of
     ticks, or midnight."""
+    # A day has 86,400 s; in s, ms and us.
     midnights = [86_400.0 * ticks_per_s for ticks_per_s in (1.0, 1e3, 1e6)]
     overflows = []
     for bits in (16, 24, 31, 32):
@@ -261,6 +262,7 @@ def _stands_for_nothing(value: float) -> bool:
     (`ENDS_OF_INTEGERS`), and more than any meter shows. Ten digits are looked at. False for 0; infinity
     counts.
     """
+    # 999 is written more often than 777: the other digits have to come four times.
     digits = f"{abs(value):.10g}".replace(".", "").rstrip("0")
     fewest_digits = 3 if digits.startswith("9") else 4
     repeats_one_digit = len(set(digits)) == 1 and len(digits) >= fewest_digits
