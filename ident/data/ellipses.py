@@ -168,7 +168,8 @@ def relative_deficit(covariance: RealArray) -> RealArray:
     """Return by how much symmetric (F, 2, 2) matrices fail to be covariances, (F,); positive where they do.
 
     It is the smallest eigenvalue with its sign turned, over the largest entry; 0 for a matrix of zeros. Only
-    the mean of the entries beside the diagonal counts; NaN gives NaN, which no comparison refuses.
+    the mean of the entries beside the diagonal counts; NaN gives 0, so that the caller has to ask whether
+    numbers are finite.
     """
     trace = covariance[:, 0, 0] + covariance[:, 1, 1]
     cross = 0.5 * (covariance[:, 0, 1] + covariance[:, 1, 0])
@@ -209,8 +210,7 @@ def hotelling_widening(freedom: npt.ArrayLike, level: float) -> npt.NDArray[np.f
     Parameters
     ----------
     freedom : array-like
-        Degrees of freedom f > 1 of the estimate, of any shape. Not checked: f = 1 or less gives NaN or
-        infinity.
+        Degrees of freedom f > 1 of the estimate, of any shape. Not checked: f = 1 or less gives NaN.
     level : float
         Confidence level; ValueError outside of 0 to 1.
 

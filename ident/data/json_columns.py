@@ -18,12 +18,14 @@ import numpy as np
 from ident.data.foreign_files import MOST_COLUMNS, Unread
 from ident.data.json_text import json_value
 
-# Names may be missing in rows: so many cells for each value that is there, beside `_FEW_CELLS`, are made.
-# In a table that has more each row has names of its own.
+# Names may be missing in rows: so many cells for each value that is there, beside `_FEW_CELLS`, are made. In
+# a table that has more each row has names of its own. Chosen: signals at a fiftieth of the fastest rate are
+# still rows of one log.
 _MOST_CELLS_A_VALUE = 50
 # Cells that are made in any case: they take about a tenth of a second.
 _FEW_CELLS = 1_000_000
-# Integers up to this size, exclusive, are kept as integers of 64 bits; larger ones as doubles.
+# Integers up to this size, exclusive, are kept as integers of 64 bits, which end there; larger ones as
+# doubles.
 _END_OF_INTEGERS = 2**63
 # Words for the kinds of values in complaints; null has none.
 _KIND_WORDS = {bool: "true or false", int: "numbers", float: "numbers", str: "text", list: "lists"}

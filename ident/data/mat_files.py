@@ -34,7 +34,7 @@ def mat_bytes(variables: dict[str, Any], what: str, *, oned_as: Literal["row", "
     Raises
     ------
     ValueError, TypeError
-        Of scipy, for what MATLAB cannot hold or a name of more than 31 letters; of Python
+        Of scipy, for what MATLAB cannot hold or a field of a struct with more than 31 letters; of Python
         (UnicodeEncodeError) where `what` is not ASCII. A text of more than 95 characters would shift the
         header: not checked.
     """

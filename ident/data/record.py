@@ -50,12 +50,15 @@ class Record(Shown):
     name : str
         Shown to the user.
     input : ndarray, shape (T, U)
+        In the units of `input_units`; U at least 1.
     output : ndarray, shape (T, Y)
+        In the units of `output_units`; Y at least 1.
     dt_s : float
         Sampling time, s.
     input_names, output_names : tuple of str
         Of the columns, distinct.
     reference : ndarray, shape (T, R), or None
+        Set points of a closed loop, in their units, which are not kept.
     reference_names : tuple of str
         Empty without a reference.
     input_units, output_units : tuple of str
@@ -63,15 +66,16 @@ class Record(Shown):
     source : str
         The file, named in error messages; '' where there is none.
     time_column : TimeColumn or None
-        What time stamps were taken for; None where dt_s was given without.
+        What time stamps were taken for (its `unit`, and whether that is `doubtful`); None where dt_s was
+        given without.
     repair : Repair or None
-        What was done to rows that jittered or were missing.
+        What was done to rows that jittered or were missing: how many samples, and how far off stamps were.
     cut : int
         Samples of the commanded input beyond what the amplifier gives (`limited`).
     notes : tuple of Finding
-        What is to be known of the way the file was read.
+        What is to be known of the way the file was read: a kind and the values of its sentence, each.
     own_units : mapping of str to str
-        By column, what the file says, before anything is stated.
+        By column, the unit that the file says, before anything is stated; with a scale, '0.1 * deg'.
 
     Raises
     ------

@@ -40,8 +40,7 @@ def band_limited(
         Edges of the band, rad/s (3 dB); None leaves a side open.
     filter_order : int
         Of a low-pass or high-pass filter; a band-pass filter has twice as many poles. 2 by default: 40 dB a
-        decade, while it settles soon. Not checked: below 1, or very high, scipy raises ValueError or the
-        filter is inaccurate.
+        decade, while it settles soon. Not checked: 0 is no filter, and very high orders are inaccurate.
     skip_s : float
         Time that is left out at the start, s, rounded to samples; `settling_time_s` says how much is needed.
 

@@ -213,7 +213,7 @@ class Table:
         Parameters
         ----------
         wanted : sequence of str
-            Names, at least one; a name that is there twice counts once.
+            Names; one that is there twice counts once. None give {}, but with clocks StopIteration.
         rows_of : str, optional
             Column whose rows count, where columns have rows of their own (KeyError for one without); default:
             the first wanted one. Ignored in a table without clocks.

@@ -130,7 +130,7 @@ def only_rounded(stamps: RealArray) -> bool:
 
     They have a last decimal of at most half a usual step, and lie on a straight line but for rounding: half
     of that decimal, and a quarter more, as a line through rounded stamps is itself off by part of it. False
-    where no decimal up to the ninth is the last one. stamps: at least two, as the median step of one is NaN.
+    where no decimal up to the ninth is the last one. False, too, for a single stamp.
     """
     since_first = stamps - stamps[0]
     # The last decimal: a power of ten of which all stamps are multiples; 0 where there is none down to

@@ -343,9 +343,9 @@ def unwrapped(values: RealArray, period: float) -> tuple[RealArray, float]:
     Parameters
     ----------
     values : ndarray, shape (T,)
-        Readings, in their unit.
+        Readings, in their unit; none or one come back as they are.
     period : float
-        At which they wrap, in the same unit.
+        At which they wrap, in the same unit. Positive and finite; not checked, `Record.from_file` does.
 
     Returns
     -------
