@@ -620,7 +620,7 @@ def _archive(about: Any, arrays: list[Any]) -> bytes:
 def _columns_archive(columns: list[Column]) -> bytes:
     """Return an npz archive of columns; `about` is a list of [name, unit, why there is no array or ''].
 
-    Empty columns make an archive of `about` alone.
+    No columns make an archive of `about` alone.
     """
     about = []
     arrays = []

@@ -448,7 +448,10 @@ class Record(Shown):
                 own_units[column] = unit_of[column]
 
         def units_of(names: Sequence[str]) -> tuple[str, ...]:
-            """Return the units of columns; none where no column has one."""
+            """Return the units of columns; none where no column has one.
+
+            names: of columns that are used (KeyError else); a column without a unit has ''.
+            """
             stated = tuple(unit_of[column] for column in names)
             return stated if any(stated) else ()
 

@@ -79,7 +79,7 @@ def reads(*endings: str) -> Callable[[Reader], Reader]:
     """
 
     def register(reader: Reader) -> Reader:
-        """Register the reader and return it as it is."""
+        """Register the reader and return it as it is. It is not called here, nor checked."""
         READERS.update(dict.fromkeys(endings, reader))
         return reader
 

@@ -171,7 +171,10 @@ def response_columns(table: Table) -> dict[str, list[str]] | None:
 
 
 def has_response(table: Table) -> bool:
-    """Whether the table is a frequency response, understood or not. Cells are not looked at."""
+    """Whether the table is a frequency response, understood or not. Cells are not looked at.
+
+    False for a table without columns.
+    """
     try:
         return response_columns(table) is not None
     except DoubtError:
@@ -286,7 +289,8 @@ def _role(name: str, unit: str) -> str | None:
     """What a column is by the words of its name, a key of `_WORDS`; None where it is none of these.
 
     unit: as written, which decides between words of several roles. Units in the name count where no other
-    word says what it is.
+    word says what it is. An empty unit decides nothing. None, too, for a name without letters, unless it
+    stands in bars.
     """
     words = _words(name)
     if words & _OTHER:

@@ -614,7 +614,10 @@ class _Quantity(NamedTuple):
 
 
 def _quantity(table: Table, name: str) -> _Quantity:
-    """The unit of a column, which may be empty, and whether it is a position."""
+    """The unit of a column, which may be empty, and whether it is a position.
+
+    The unit counts as it is written: columns in deg and in rad differ.
+    """
     unit = table.unit(name)
     return _Quantity(unit, is_position(name, unit))
 

@@ -388,7 +388,10 @@ def _arrival(line: str) -> tuple[str, str]:
 
 def _labelled(line: str) -> list[tuple[str, str, str]]:
     """Name, number and separator (or empty) of each number with a name in a line; empty where the line holds
-    anything else."""
+    anything else.
+
+    A blank line holds none. Name, number and separator are text; a number is taken by its form, also nan.
+    """
     numbers = list[tuple[str, str, str]]()
     position = len(line) - len(line.lstrip())
     while position < len(line):
@@ -541,7 +544,10 @@ class _Fit:
         numeric = [j for j in range(n_cells) if 2 * value_cells[j] > filled_cells[j]]
 
         def is_row(k: int) -> bool:
-            """Whether a line looks like a row and has no word in a column of numbers."""
+            """Whether a line looks like a row and has no word in a column of numbers.
+
+            k: from 0; a line that is blank or a comment is none.
+            """
             return k in alike and all(is_value[k][j] or not rows[k][j] for j in numeric)
 
         first_row = first_alike
@@ -586,7 +592,7 @@ class _Fit:
         """Lines above a row in which its names may stand, the nearest first.
 
         The next `_LINES_ABOVE` that are not blank, and comments between them that are no rows. Empty for the
-        first line.
+        first line. row and the lines are counted from 0.
         """
         above = list[int]()
         n_lines = 0
@@ -654,7 +660,7 @@ class _Fit:
         """The line of the names; None where no line above can be it.
 
         The nearest that is no comment; but a comment nearer to the rows that says time, or any comment where
-        that line holds a value, as a faulty row does.
+        that line holds a value, as a faulty row does. Lines are counted from 0.
         """
         candidates = [k for k in self._above(self.first_row) if self._names_at(k) is not None]
         plain_lines = [k for k in candidates if not _is_comment(self.lines[k])]
@@ -760,6 +766,7 @@ class _Fit:
 
         Lines above the rows then state something of each channel: 'Name, drive, Name, hub'. None for another
         table. The unit of the times is that of a stated step with which the first two stamps agree, else
+        empty. Fewer lines, cells that are no numbers, or no stated step are not refused: the unit is then
         empty.
         """
         # A table of an odd number of cells has no pairs.

@@ -445,7 +445,7 @@ class TimeGrid:
 
     @property
     def missing(self) -> tuple[int, ...]:
-        """Samples that the log has no row for, ascending."""
+        """Samples that the log has no row for, ascending. Empty where each has one."""
         samples = np.arange(self.rows[-1] + 1)
         return tuple(int(sample) for sample in np.setdiff1d(samples, self.rows))
 

@@ -207,7 +207,10 @@ def _has_day(match: re.Match[str]) -> bool:
 
 
 def _has_two_parts(match: re.Match[str]) -> bool:
-    """Whether a stamp is two numbers with a colon between, perhaps with a fraction, and nothing else."""
+    """Whether a stamp is two numbers with a colon between, perhaps with a fraction, and nothing else.
+
+    False for a day alone.
+    """
     if match["hour"] is None or match["second"] is not None:
         return False
     return match["half"] is None and not _has_day(match)
@@ -224,7 +227,10 @@ def _are_minutes(matches: Sequence[re.Match[str]]) -> bool:
 
 
 def _matched(cell: str) -> re.Match[str] | None:
-    """The parts of a date, a clock time or both, in the groups of `_STAMP`; None where it is none."""
+    """The parts of a date, a clock time or both, in the groups of `_STAMP`; None where it is none.
+
+    None, too, for an empty cell; whether the numbers are possible ones is not asked.
+    """
     text = cell.strip()
     # The shortest stamps, '1:02', have four characters.
     if not 3 < len(text) < _LONGEST_STAMP:

@@ -692,7 +692,10 @@ def size_of(unit: str) -> UnitSize | None:
 
 
 def kind_of(unit: str) -> str:
-    """The kind of a unit, 'rad' of degrees (see `UnitSize`); empty where it is not known."""
+    """The kind of a unit, 'rad' of degrees (see `UnitSize`); empty where it is not known.
+
+    Of an empty unit, too.
+    """
     size = size_of(unit)
     return "" if size is None else size.kind
 

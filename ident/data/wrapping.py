@@ -55,7 +55,9 @@ def _ends_of_integers() -> frozenset[float]:
 # Where readings start again: powers of two, turns in several units, round numbers of an encoder's lines. A
 # period of this list is believed on weaker evidence than any other number.
 USUAL_PERIODS = _usual_periods()
+# Periods of timers in s, ms or us, by which a column of time that starts again is read on.
 TIMER_PERIODS = _timer_periods()
+# Numbers that are taken for no reading where nothing else in the signal is as large (`FAR`).
 ENDS_OF_INTEGERS = _ends_of_integers()
 
 # Samples below which nothing is said of wrapping: a range and a usual step are hardly known from fewer.
@@ -272,7 +274,7 @@ def _stands_for_nothing(value: float) -> bool:
 def counts_rows(values: RealArray) -> bool:
     """Whether readings (T,) only count: they go on by one, but for a few places where they start again.
 
-    False for a single reading.
+    False for a single reading. False, too, where a step is NaN.
     """
     steps = np.diff(values)
     if not steps.size:
