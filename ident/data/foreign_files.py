@@ -26,8 +26,9 @@ import numpy as np
 
 from ident.data.child_reader import CPU_SECONDS, LARGEST_BYTES as LARGEST_BYTES, NO_LIBRARY, REFUSED
 
+# Columns of a table, at most: each is looked at, and a line of it printed. More is a table that lies on its
+# side. Chosen: machines log some hundred signals.
 MOST_COLUMNS = 4096
-"""Columns of a table: each is looked at, and a line of it printed. More is a table that lies on its side."""
 
 CHILD_SCRIPT = Path(__file__).with_name("child_reader.py")
 """The script that reads compiled formats."""

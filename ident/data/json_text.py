@@ -10,9 +10,9 @@ import json
 from collections import Counter
 from typing import Any
 
+# Levels of nesting: what looks at a value level by level, or prints it, calls itself once or a few times for
+# each, and Python allows a thousand calls within each other. Chosen with room for both.
 MOST_LEVELS = 40
-"""Levels of nesting: what looks at a value level by level, or prints it, calls itself once or a few times for
-each, and Python allows a thousand calls within each other. Chosen with room for both."""
 # Characters of a name that a complaint shows: a line's worth.
 _LONGEST_SHOWN = 80
 

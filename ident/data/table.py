@@ -32,9 +32,9 @@ from ident.data.time_stamps import StampError, is_stamp, may_be_minutes, seconds
 from ident.data.units import COUNTED, SIGNAL_WORDS, TimeColumn, kind_of, says_counts, size_of, written_unit
 from ident.data.wrapping import timer_period
 
+# Largest size of a sample: sums of squares of larger ones, and products of those with coefficients, leave the
+# range of doubles (1e308).
 LARGEST = 1e100
-"""Largest size of a sample: sums of squares of larger ones, and products of those with coefficients, leave
-the range of doubles (1e308)."""
 # A list in a cell of text, as Python and numpy print it: '[0.1, 0.2]', 'array([0.1, ...'.
 _LIST = re.compile(r"(?:array\()?\[[\s\[]*(?:np\.\w+\()?[-+.\d]")
 _NUMPY_WORDS = re.compile(r"np\.\w+|array")

@@ -207,9 +207,8 @@ _COHERENT = 0.5
 # Samples from which on a log with long steps is rather one in milliseconds: a thousand steps of half a second
 # are eight minutes, longer than a machine is excited. Doubled or halved, a test of doubted steps fails.
 _MANY_SAMPLES = 1000
+# Step, s, from which on a log is doubted to be in seconds: machines are logged faster than twice a second.
 LONG_STEP_S = 0.5
-"""Step, s, from which on a log is doubted to be in seconds: machines are logged faster than twice a
-second."""
 # Shortest step of a machine's log, s: 1 MHz, which no controller of a motion has.
 _SHORTEST_S = 1e-6
 # Longest step, s, of a machine whose motion the samples show: at one sample a second a motion of two seconds
