@@ -37,6 +37,8 @@ ROWS_PER_UNKNOWN = 3
 def leads(first: RealArray, second: RealArray) -> bool | None:
     """Return whether the first signal leads the second, by the largest correlation of their changes.
 
+    A signal that stands still leads nothing: None.
+
     Parameters
     ----------
     first, second : ndarray, shape (T,)

@@ -364,6 +364,8 @@ def period_of(signal: RealArray) -> int | None:
 def distortion_of(records: Sequence[Record], *, period_samples: int | None = None) -> tuple[Distortion, ...]:
     """Levels of noise and distortion at every amplitude among records, lowest amplitude first.
 
+    Without a record: empty. The output of a record may not hold NaN, which `Record` refuses.
+
     Parameters
     ----------
     records : sequence of Record

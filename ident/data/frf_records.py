@@ -132,6 +132,9 @@ class FrfRepeats:
     def open_loop(self, reference_gain: float, feedback_gain: float) -> FrfRepeats:
         """Return plant responses from those of a closed loop r -> y, point by point.
 
+        G = T / (a - g T) is T = a G / (1 + g G) solved for G; noise grows where a - g T is small, which is
+        not looked at.
+
         Parameters
         ----------
         reference_gain, feedback_gain : float

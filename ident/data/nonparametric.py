@@ -255,7 +255,8 @@ def _groups(
     """Return the line indices (F, width) of averaging widths that lie side by side in a band.
 
     width: lines in each; omega_min_rad_s, omega_max_rad_s: ends of the band, rad/s, None where it is open.
-    Lines at the upper end that do not fill a width are left out. Raises ValueError where not one fits.
+    Lines at the upper end that do not fill a width are left out. Raises ValueError where not one fits. Ends
+    that are exchanged or NaN hold no line.
     """
     low = 0.0 if omega_min_rad_s is None else omega_min_rad_s
     high = np.inf if omega_max_rad_s is None else omega_max_rad_s

@@ -157,7 +157,10 @@ def _unpacked(content: bytes, largest_bytes: int) -> bytes:
 @reads(".csv", ".tsv", ".txt", ".dat", ".asc", ".lvm")
 def _read_text(file: Path, content: bytes) -> Table:
     """Return a text table, whose layout is found from its lines (`text_tables`). Raises ValueError without
-    the path where it has none."""
+    the path where it has none.
+
+    content: the bytes, unpacked.
+    """
     layout, columns = read_text(text_of(content))
     return text_table(file, layout, columns)
 

@@ -307,6 +307,7 @@ def _experiment(group: Sequence[tuple[Record, RealArray]]) -> Repeats | None:
 
     group: records, each with its excitation (T,) about its mean. None where no amplitude has two records,
     where the excitation has fewer lines than three averaging widths, or where the input stands still at one.
+    At least one record, as `repeats_of` groups them.
     """
     # Records within 2 % of the smallest one of an amplitude belong to it.
     sized = [(float(np.std(course)), record) for record, course in group]

@@ -295,7 +295,8 @@ def _loop_of_twins(
     such loops, or more columns than `_MOST_TWINS`.
 
     free: columns without a role; role: of each by its name, as of `_role_by_name`; beside: columns that
-    neither drive nor move; stated: by the user.
+    neither drive nor move; stated: by the user. Columns that hold no numbers, or too few, make no loop and
+    are not refused. Twelve motions are 66 pairs.
     """
     signals = list[str]()
     for name in free:

@@ -469,7 +469,7 @@ class Table:
 
         stamps: in seconds, where '12:30' was taken for hours and minutes. unit: stated by the user, 'h' or
         'min' for what stands first in such a stamp. Raises ValueError where it has to be stated, and where
-        another unit is.
+        another unit is. The column comes back as stated in seconds, never doubtful; NaN cannot come here.
         """
         cells = self.raw[name]
         is_unclear = isinstance(cells, tuple) and may_be_minutes(cells)

@@ -409,7 +409,8 @@ def _is_cut(rows: Sequence[Sequence[str]], decimal: str) -> bool:
 
     It has fewer cells than any other row, or its last number has fewer digits than any other of that column
     (behind the decimal sign, where some have one there). False with fewer than `_FEWEST_ROWS` rows, and where
-    another cell of that column is no number.
+    another cell of that column is no number. Digits, not sizes, are compared: 1.25 behind 1.250 is cut, as
+    loggers write a fixed number of decimals.
     """
     if len(rows) < _FEWEST_ROWS:
         return False
@@ -618,7 +619,8 @@ class _Fit:
 
         There has to be a cell for each column of numbers, and most have to be words. numbered: names may be
         the numbers of channels, too. A comment may separate its names otherwise than the rows their numbers,
-        as numpy.savetxt(header="t [s], u [V]") does.
+        as numpy.savetxt(header="t [s], u [V]") does. row: a line from 0. A line that has no cell, or fewer
+        than there are columns, gives None.
         """
         cells = self.rows[row]
         if self.separator == " " and len(cells) > self.n_cells:
@@ -739,7 +741,8 @@ class _Fit:
     def _layout_without_names(self) -> Layout:
         """The layout of a table without a line of names: its columns are numbered.
 
-        Raises ValueError where words stand above the rows that are too few or too many for names.
+        Raises ValueError where words stand above the rows that are too few or too many for names. 'column 1',
+        'column 2', ...; rows begin at the first line that looks like one.
         """
         for k in self._above(self.first_row):
             cells = self.rows[k]
@@ -893,7 +896,8 @@ def _rows(lines: Sequence[str], separator: str) -> list[list[str]]:
     """The cells of every line, without blanks around them; of comment lines without the sign.
 
     Cells in quotation marks may hold the separator. An empty line is one empty cell. Raises ValueError where
-    a quotation mark is not closed.
+    a quotation mark is not closed. separator: one of `_DIALECTS`, a blank for any run of them. No lines: no
+    rows.
     """
     if separator == " ":
         words = [re.findall(r'"[^"]*"|\S+', _COMMENT.sub("", line)) for line in lines]

@@ -204,7 +204,7 @@ _FOLLOWS_WITHIN = 1.3
 # Halved, no test of units moves; doubled it would be 1, which only computed signals reach.
 _COHERENT = 0.5
 
-# Samples from which on a log with long steps is rather one in milliseconds: a thousand steps of half a second
+# Samples beyond which a log with long steps is rather one in milliseconds: a thousand steps of half a second
 # are eight minutes, longer than a machine is excited. Doubled or halved, a test of doubted steps fails.
 _MANY_SAMPLES = 1000
 # Step, s, from which on a log is doubted to be in seconds: machines are logged faster than twice a second.
