@@ -444,7 +444,7 @@ def bound_all_frequencies(
         extra += asked.requirement.band or ()
     edges = starting_edges(plant, modes, extra)
     difference = _model_error(loop, controller, edges[1:])
-    if difference > _MODEL_ERROR:
+    if not difference <= _MODEL_ERROR:
         return AllFrequencies.ended_by(Obstacle.INEXACT, difference)
 
     # Targets of the bounds, then intervals that meet them.
@@ -471,10 +471,10 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
     Compared are the controller's response, and centre and shape matrix of the ellipses of the plant and of
     independent channels: the centre by its size, the shape by its trace and the size of the centre.
 
-    No unit. Not checked: a nan counts as no difference; controllers and `Ellipses` are finite.
+    No unit; nan if an expansion of an uncertainty of one's own is nan somewhere.
     """
     law = frequency_response(controller.to_control(), omega)
-    largest = _difference(loop.controller.at(omega), law)
+    differences = [_difference(loop.controller.at(omega), law)]
     sets: list[tuple[Expand, PlantChannel]] = [(loop.members, loop.plant.channel)]
     for asked in loop.asked:
         if asked.channel is not None and asked.requirement.channel is not None:
@@ -486,7 +486,7 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
             continue
         ellipses = channel.at(omega)
         expansion = members(points, 0)
-        largest = max(largest, _difference(expansion.centre.value, ellipses.centre))
+        differences.append(_difference(expansion.centre.value, ellipses.centre))
         major = ellipses.direction * ellipses.semi_major
         minor = 1j * ellipses.direction * ellipses.semi_minor
         rows = np.stack([[major.real, minor.real], [major.imag, minor.imag]]).transpose(2, 0, 1)
@@ -494,8 +494,9 @@ def _model_error(loop: _Loop, controller: Controller, omega: Real) -> float:
         trace = np.trace(shape, axis1=1, axis2=2)
         size = trace + _SMALLEST_SHAPE * np.abs(ellipses.centre) ** 2 + _TINY
         shape_difference = np.max(np.abs(expansion.gram() - shape), axis=(1, 2))
-        largest = max(largest, float(np.max(shape_difference / size)))
-    return largest
+        differences.append(float(np.max(shape_difference / size)))
+    # The maximum of Python passes over a nan, that of numpy does not.
+    return float(np.max(differences))
 
 
 def _difference(form: Complex, value: Complex) -> float:

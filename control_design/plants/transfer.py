@@ -33,9 +33,8 @@ def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: f
     Raises
     ------
     ValueError
-        If there are more zeros than poles. A nan is LinAlgError of numpy in the numerator; in the denominator
-        it is not seen and makes all poles integrators. A numerator of zeros alone gives a system that answers
-        nothing.
+        If there are more zeros than poles. A nan is LinAlgError of numpy. A numerator of zeros alone gives a
+        system that answers nothing.
     """
     zeros_polynomial = np.trim_zeros(np.atleast_1d(numerator), "f")
     poles_polynomial = np.trim_zeros(np.atleast_1d(denominator), "f")
@@ -53,7 +52,8 @@ def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: f
     while remaining.size > 1:
         # Rounding of a sum of so many terms: one unit of the last digit each.
         rounding = remaining.size * np.finfo(float).eps * np.sum(np.abs(remaining))
-        if abs(np.sum(remaining)) > rounding:
+        # Also where a coefficient is nan: the roots then refuse it.
+        if not abs(np.sum(remaining)) <= rounding:
             break
         n_integrators += 1
         remaining = np.cumsum(remaining)[:-1]

@@ -212,11 +212,12 @@ def test_what_cannot_be_bounded_says_so_and_stands_on_the_grid():
     assert assumed.gamma * (1 - 1e-12) <= proof.gamma
 
 
-def test_generators_that_are_not_those_of_the_ellipses_are_refused():
+@pytest.mark.parametrize(("of_centre", "of_generators"), [(1.0, 0.9), (np.nan, 1.0), (1.0, np.nan)])
+def test_an_expansion_that_is_not_that_of_the_ellipses_is_refused(of_centre, of_generators):
     class Wrong(RationalDisc):
         def first_order(self, intervals: FrequencyIntervals, cleared: int) -> tuple[FirstOrder, FirstOrder]:
             centre, generators = super().first_order(intervals, cleared)
-            return centre, generators.scaled(0.9)
+            return centre.scaled(of_centre), generators.scaled(of_generators)
 
     system = hub_arm()
     plant = UncertainPlant("wrong", system, Wrong(system, 1, 0.02, 60.0))
@@ -224,7 +225,7 @@ def test_generators_that_are_not_those_of_the_ellipses_are_refused():
     proof = certificate.plants[0].all_frequencies
     assert not proof.possible
     assert proof.obstacle is Obstacle.INEXACT
-    assert proof.obstacle_at > 1e-3
+    assert not proof.obstacle_at <= 1e-3
 
 
 def test_exact_plants_are_bounded_and_unstable_loops_are_refuted():
