@@ -12,7 +12,8 @@ again to the records that it opened (`two_stage`, `two_stage_several`). Where no
 known controller makes one (`with_controller`). Assumed: a linear loop, and references without noise.
 
 A `Record` has an input (T, U), an output (T, Y) and where it was logged a reference (T, R), with their names,
-and its sampling time dt_s.
+and its sampling time dt_s; its samples are finite, or it could not be made. An empty list of records is
+refused nowhere here: it ends in an IndexError.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from ident.several_outputs import identify_mimo
 from ident.uncertainty.embedding import tangent
 from ident.unstable import quick_poles
 
-# Percent of a command that the first stage has to explain. Below half, most of what the command does comes
-# from noise, or from a reference that is not the one that was recorded; a case that leaves the way of
-# identification to the data is then not fitted in two stages.
+# Percent of a command (`TwoStage.fit_percent`) that the first stage has to explain. Below half, most of what
+# the command does comes from noise, or from a reference that is not the one that was recorded; a case that
+# leaves the way of identification to the data is then not fitted in two stages.
 EXPLAINED_PERCENT = 50.0
 # Percent of the commands that the first stage has to explain for balls of several inputs and outputs. Where
 # it explained 89 %, 95 % balls held the true response at 90 % of the frequencies, at 70 % at 40 % of them.
@@ -50,7 +51,8 @@ EXPLAINED_PERCENT_FOR_BALLS = 90.0
 # noise, and u_hat is further from the true one than a test allows. One tap is the fewest there may be; with
 # 20 no test of two stages moves.
 FIRST_STAGE = EmbeddingOptions(coloured_noise=True, prior_missed_mode=0.0, fir_length=1)
-# Standard deviation of a command that stands still, in place of zero.
+# Standard deviation of a command that stands still, in place of zero, which could not be divided by: near the
+# smallest double.
 TINY = 1e-300
 
 
@@ -77,14 +79,21 @@ class TwoStage:
 
     @property
     def finding(self) -> Finding:
-        """What the references explain of the commands, least and most of all records."""
+        """What the references explain of the commands, least and most of all records, per cent.
+
+        Raises ValueError without records.
+        """
         return finding(
             FindingKind.TWO_STAGE, least_percent=min(self.fit_percent), most_percent=max(self.fit_percent)
         )
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """A finding where the references explain too little of the commands of some record; else empty."""
+        """One finding UNEXPLAINED_INPUT where some record has a `fit_percent` below `enough_percent`; else
+        empty.
+
+        Raises ValueError without records; a percentage of nan gives the finding.
+        """
         explained = min(self.fit_percent)
         if explained >= self.enough_percent:
             return ()
@@ -112,7 +121,9 @@ def two_stage(
     Raises
     ------
     ValueError
-        A record has not exactly one reference and one input, or the records excite few frequencies.
+        A record has not exactly one reference and one input, or the records excite few frequencies; below
+        (`identify`): an output that is constant, several outputs, other sampling times, too few samples.
+        Whether each command moves is not checked before the first fit.
 
     Notes
     -----
@@ -175,12 +186,14 @@ def two_stage_several(
     Returns
     -------
     TwoStage
-        For `identify_mimo` and `matrix_posterior`.
+        What `identify_mimo` and `matrix_posterior` take as records of the open loop.
 
     Raises
     ------
     ValueError
-        Fewer references move than there are inputs, or as `identify_mimo`.
+        Fewer references move than there are inputs (asked only where every record has references), or what
+        `identify_mimo` refuses: outputs that are dependent, inputs that differ between records, too few
+        samples.
 
     Notes
     -----
@@ -206,11 +219,13 @@ def two_stage_several(
     options = options or IdentOptions()
     unexplained = []
     for number, record in enumerate(records):
+        # Half of the bar, chosen: a fit of each record here, three of all of them below.
         progress(0.5 * number / len(records), "from references to inputs")
         unexplained.append(_unexplained(record))
 
     # The plant, three times: of the logs as they are, then of records that the plant before has opened. The
     # second fit sees as noise what feedback did, so it may choose another order; the third one keeps that.
+    # The numbers are places on the bar of progress; the first marks the fit whose order is not kept.
     opened = list(records)
     for share in (0.5, 0.7, 0.9):
         progress(share, "without what the loop fed back")
@@ -241,6 +256,8 @@ def _unexplained(record: Record) -> RealArray:
     """Inputs (T, U) of a record less what its moving references explain of them, in their units.
 
     Zero in the open loop, where nothing was fed back; the inputs about their means where no reference moves.
+    Raises ValueError where `identify_mimo` refuses the fit: inputs that are dependent, too few samples,
+    moving references that are one signal.
     """
     if record.reference is None:
         return np.zeros_like(record.input)
@@ -281,7 +298,9 @@ def with_controller(record: Record, numerator: Sequence[float], denominator: Seq
     Raises
     ------
     ValueError
-        The controller is not proper, or zero, or the record has several inputs or outputs.
+        The controller is not proper, or zero, or the record has several inputs or outputs; below
+        (`Record.slice`, `Record`): no more rows than the controller's order, or a coefficient that is not
+        finite.
 
     Notes
     -----
@@ -311,7 +330,8 @@ def with_controller(record: Record, numerator: Sequence[float], denominator: Seq
 def _opened(records: Sequence[Record], unexplained: Sequence[RealArray], plant: GobfModel) -> list[Record]:
     """Open-loop records: inputs without their unexplained part, outputs without what the plant makes of it.
 
-    `unexplained` : of each record, (T,), units of the input; `plant` : G0, which may be unstable.
+    `unexplained` : of each record, (T,), units of the input; `plant` : G0, which may be unstable. Raises
+    ValueError where the numbers of both differ; that they are equally long, the caller has seen to.
     """
     opened = []
     for record, remainder in zip(records, unexplained, strict=True):

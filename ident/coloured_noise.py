@@ -6,7 +6,9 @@ mode which a first fit has missed is not taken for noise. `identify_in_noise` fi
 decides which to keep: behind the filter the fast modes are found, without it the output itself is fitted
 better.
 
-Neglected: a filter that differs from record to record.
+Neglected: a filter that differs from record to record. A `Record` has an input (T, 1), an output (T, 1),
+finite numbers, and a sampling time dt_s; `Identification` is a fit with its model, its residuals (T - delay,)
+and rss.
 """
 
 from __future__ import annotations
@@ -34,18 +36,19 @@ Identify = Callable[[Sequence[Record], IdentOptions, float, float], Identificati
 """Records, options, and the part of the progress (from, to): a fit that takes the noise as white."""
 
 # Orders of the ARX model that are tried, one chosen by BIC. They have to hold the memory of the noise and
-# that of the arm: two rows for each mode.
+# that of the arm: two rows for each mode. Chosen: steps of four, wider at the end, up to what ten modes and
+# some noise take.
 _ARX_ORDERS = (4, 8, 12, 16, 20, 24, 30)
 # Rows of the shortest record per order of the ARX model, which has two coefficients an order: six rows for
-# each.
+# each. Chosen.
 _ROWS_PER_ORDER = 13
 # Largest order of the noise model of the residuals that are reported. BIC takes 1 to 6 of it for drift and
 # friction beside sensor noise.
 _RESIDUAL_ORDER = 12
 # Level over the median of a smoothed spectrum from which on a line is no white noise: a mean over twelve
 # independent lines, as many as there are among 25 of a spectrum padded to twice its length, exceeds twice its
-# median in 0.4 % of places. Halved or
-# doubled, both modes are still found under dry friction (tests/ident/test_coloured_noise.py).
+# median in 0.4 % of places. Halved or doubled, both modes are still found under dry friction
+# (tests/ident/test_coloured_noise.py).
 _FLOOR_OVER_MEDIAN = 2
 
 
@@ -65,8 +68,15 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     -------
     Identification
         The fit in white noise if its residuals are white, or unless more than half of what they have beyond a
-        white floor lies below the lowest mode found behind a noise model; else the fit behind that model.
+        white floor lies below the lowest mode found behind a noise model; else the fit behind that model,
+        with a verdict COLOURED_NOISE.
+
+    Raises
+    ------
+    ValueError
+        What `identify` refuses; below (`whiteness_test`): residuals of 50 samples or fewer.
     """
+    # Each of both fits takes half of the bar of progress.
     plain = identify(records, options, 0.0, 0.5)
     options = options.model_copy(update={"input_delay_samples": plain.model.input_delay_samples})
     noise = long_arx_filter(records, options)
@@ -93,8 +103,9 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
 def prewhitened(record: Record, noise: NoiseModel) -> Record:
     """The record with input and output through the filter that whitens the noise, without a reference.
 
-    The first `noise.n_start` rows, which have no recorded past, are left out. White noise gives back the
-    record itself.
+    The first `noise.n_start` rows, which have no recorded past, are left out: of a record without further
+    rows nothing would be left, which `Record` refuses with ValueError. White noise gives back the record
+    itself.
     """
     if noise.is_white:
         return record
@@ -122,6 +133,11 @@ def long_arx_filter(records: Sequence[Record], options: IdentOptions) -> Autoreg
     AutoregressiveNoise
         A(q) of A y = B u + c + white by least squares, c a constant of each record; white noise where the
         records are too short for the least order.
+
+    Raises
+    ------
+    ValueError
+        Without records. That input and output move is not checked: the caller's fit has refused still ones.
     """
     part, _ = thinned(records, options.search_samples)
     delay = options.input_delay_samples
@@ -176,7 +192,10 @@ def _on_records(
 ) -> Identification:
     """The model found behind the filter, with residuals, fit and noise on the records as they are.
 
-    behind: the fit to the filtered records; its model and verdicts stay, and a verdict on the noise is added.
+    behind: the fit to the filtered records; its model and verdicts stay, and a verdict COLOURED_NOISE is
+    added: half_power_Hz, order of the noise model, and the share 0 .. 1 of the residuals' variance that their
+    past does not predict. Raises ValueError where `fit_on_fresh_data` does: a constant output, no rows behind
+    the delay.
     """
     fits = [fit_on_fresh_data(behind.model, record) for record in records]
     residuals = tuple(fit.residual for fit in fits)
@@ -212,8 +231,13 @@ def _on_records(
 
 
 def _half_power_Hz(fit: Identification) -> float:
-    """Frequency, Hz, below which lies half of what the longest residual has beyond a white floor."""
+    """Frequency, Hz, below which lies half of what the longest residual has beyond a white floor.
+
+    0 Hz where nothing is beyond the floor. `fit` : its residuals, of at least one sample, and its model's
+    dt_s.
+    """
     longest = max(fit.residuals, key=len)
+    # Twice the length: lines lie half a resolution apart, so that a peak is not missed between two.
     n_fft = 2 * longest.size
     power = np.abs(np.fft.rfft(longest - longest.mean(), n_fft)) ** 2
     # Lines of white noise scatter by as much as their mean: means over neighbours show what stands out.

@@ -15,6 +15,11 @@ law that made every command (`ident.recorded_law`). `with_equivalent_command` co
 known, `with_unknown_timing` widens the ellipses for what is not.
 
 Neglected: what the command has above the Nyquist frequency of the log, which the rows do not show.
+
+A `Record` has an input (T, U) (the command), an output (T, Y), where it was logged a reference, finite
+samples, at least one row, and its step dt_s. `RecordedLaw` is a linear law of a controller: `repeats_command`
+says that it explains the command but for rounding, `tells_period` that a faster controller would have left
+more.
 """
 
 from __future__ import annotations
@@ -40,17 +45,21 @@ ROWS_BESIDE = 4
 FITTED_UP_TO_RAD = 2.0
 # Highest frequency times step at which an ellipse is fitted, rad: the Nyquist frequency but for rounding.
 HIGHEST_ANGLE_RAD = 3.14
-# Taps by which an ellipse follows a phase that grows with frequency.
+# Taps by which an ellipse follows a phase that grows with frequency, beside the basis. Chosen: about as many
+# as the filter of a command has.
 TAPS = 8
-# Frequencies at which the filter of the command is fitted: forty for each of its taps.
+# Frequencies at which the filter of the command is fitted: forty for each of its taps, so that the fit is one
+# of the curve and not of its points. Chosen.
 FILTER_POINTS = 400
-# Lowest frequency times step at which an ellipse is fitted, rad: a motion of two hours in a log at 100 Hz.
+# Lowest frequency times step at which an ellipse is fitted, rad: a motion of two hours in a log at 100 Hz,
+# longer than most logs.
 LOWEST_ANGLE_RAD = 1e-5
-# Frequencies of a logarithmic grid from the lowest to the highest: ninety in a decade.
+# Frequencies of a logarithmic grid from the lowest to the highest: ninety in a decade, 2.6 % apart. Chosen.
 SLOW_POINTS = 500
-# Frequencies of a linear grid beside those for the taps.
+# Frequencies of a linear grid beside those for the taps. Chosen: enough without any tap.
 EVEN_POINTS = 200
-# Further ones of that grid for each tap: the last tap then has eight of them in each of its turns.
+# Further ones of that grid for each tap: the last tap, which turns round half as often as there are taps up
+# to the Nyquist frequency, then has eight of them in each of its turns.
 EVEN_POINTS_PER_TAP = 4
 # Ellipses of noise and timing add as variances, but an interval of the timing has ends that are as likely as
 # its middle: with 1.5 times its half width the sum of both is held while the noise is up to .6 of it.
@@ -61,15 +70,16 @@ SMALLEST_RESPONSE = 1e-14
 # Ellipses are at least so wide along the gain, as a share of their width along the phase: twice the error
 # with which the basis follows a fraction of a step.
 GAIN_OF_PHASE = 0.1
-# Of the gaps between changes of a command that repeats, this share is a multiple of its period, and of the
-# changes this share keeps to one phase: the rest are commands that happen to stay.
+# Of the gaps between changes of a command that repeats, more than this share is a multiple of its period, and
+# of the changes more than this share keeps to one phase: the rest are rows that were lost. Chosen.
 NEARLY_ALL = 0.99
-# Gaps between changes of a command from which its period is read.
+# Gaps between changes of a command from which its period is read, at least. Chosen: fewer, as of a command of
+# a few steps, may share a divisor by chance.
 FEWEST_GAPS = 10
 # Up to so many commands in a step a stated period need not be a whole part of it. Chosen; with 1, so that
 # every period is checked, no test of the timing moves.
 MOST_UNCHECKED = 2
-# A stated period agrees with whole rows within this share.
+# A stated period agrees with whole rows within this share: periods are stated with three digits or more.
 SAME_PERIOD = 1e-3
 
 
@@ -108,7 +118,8 @@ class Hold:
     def response(self, angle_rad: RealArray) -> ComplexArray:
         """Response (F,) of the command's own hold over that of a hold for the whole step: 1 / S.
 
-        `angle_rad` : w T (F,), 0 < w T <= pi. The square of 1 / S where averaged.
+        `angle_rad` : w T (F,), 0 < w T <= pi. The square of 1 / S where averaged. Angles are not checked: nan
+        at zero. A share below zero counts as zero.
         """
         step = -np.expm1(-1j * angle_rad)
         if self.share > 0:
@@ -122,17 +133,19 @@ class Hold:
         return np.asarray(mean**power, dtype=np.complex128)
 
 
-# A command that is held from row to row.
+# A command that is held from row to row: the period of the controller is the whole step of the log.
 HELD = Hold(1.0)
 
 
 @dataclass(frozen=True)
 class CommandTiming:
-    """What the command does between two rows, as far as it is known.
+    """What the command does between two rows, as far as it is known. Nothing is checked: `timing_of` makes
+    it.
 
     Attributes
     ----------
     source : TimingSource
+        How the period is known.
     row_step_s : float
         Step of the rows, s.
     period_s : float or None
@@ -146,7 +159,8 @@ class CommandTiming:
     rows_per_command : int
         Rows that were logged for each command; above 1 only the rows at which it changes are used.
     first_row : tuple of int
-        First of these rows, per record.
+        First of these rows, for each record that `timing_of` was given, in their order; empty where every row
+        is used.
     law : RecordedLaw or None
         Read off the records; None where there is none, or where it does not repeat the command.
     """
@@ -175,6 +189,7 @@ class CommandTiming:
         used_step_s = self.row_step_s * self.rows_per_command
         if self.period_s is None:
             return used_step_s
+        # A period of zero, which nobody can state (`timing_of`), would divide by zero.
         parts = used_step_s / self.period_s
         is_whole = abs(parts - round(parts)) <= SAME_PERIOD * parts
         return self.period_s if is_whole else used_step_s
@@ -213,7 +228,8 @@ def timing_of(
     ------
     ValueError
         The log contradicts the stated period, or the mean of commands was logged in open loop and their
-        period is not stated.
+        period is not stated. Not checked: that there are records (IndexError without), that their steps
+        agree, and that the stated period is above zero (the options of a case refuse others).
     """
     step_s = records[0].dt_s
     rows_per_command = rows_per_command_of(records)
@@ -268,6 +284,7 @@ def timing_of(
         return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=delays, middle=Hold(0.0))
     if law.tells_period:
         return CommandTiming(TimingSource.LAW, step_s, step_s, law=law)
+    # Held from row to row, or changed all the time; the middle is half of both: two commands in a step.
     possible = (HELD, Hold(0.0))
     return CommandTiming(TimingSource.UNKNOWN, step_s, None, possible=possible, middle=Hold(0.5), law=law)
 
@@ -284,7 +301,8 @@ def rows_per_command_of(records: Sequence[Record]) -> int:
     -------
     int
         1 where it changes from row to row, or where the changes do not keep to one phase: rows were lost, or
-        two clocks drift apart. Held from row to row is then what the rows say.
+        two clocks drift apart. Held from row to row is then what the rows say. 1 also without records, and
+        where all commands stand still.
     """
     gaps = _usual_gaps(records)
     smallest_gap = min(gaps, default=1)
@@ -301,7 +319,8 @@ def rows_per_command_of(records: Sequence[Record]) -> int:
 def _usual_gaps(records: Sequence[Record]) -> list[int]:
     """Usual number of rows between changes of the command, of each record where it changes often.
 
-    1 where the gaps are no multiples of one number. Records with few changes are left out.
+    1 where the gaps are no multiples of one number. Records with fewer than `FEWEST_GAPS` gaps are left out,
+    so that the list may be empty.
     """
     usual_gaps = []
     for record in records:
@@ -317,7 +336,8 @@ def _usual_gaps(records: Sequence[Record]) -> list[int]:
 
 
 def _changes(record: Record) -> IntArray:
-    """Indices (N,) of the rows whose command is another than that of the row before."""
+    """Indices (N,) of the rows whose command is another than that of the row before; empty where it stands
+    still."""
     is_new = np.any(np.diff(record.input, axis=0) != 0, axis=1)
     return 1 + np.flatnonzero(is_new)
 
@@ -325,13 +345,17 @@ def _changes(record: Record) -> IntArray:
 def _phase(changes: IntArray, rows: int) -> int:
     """Index 0 .. rows - 1 at which a command that stands for `rows` rows usually changes.
 
-    `changes` (N,) : indices of the rows at which it changed.
+    `changes` (N,) : indices of the rows at which it changed; 0 where it never did. `rows` is at least 1.
     """
     return int(np.bincount(changes % rows, minlength=rows).argmax())
 
 
 def _with_rows(timing: CommandTiming, records: Sequence[Record], rows: int) -> CommandTiming:
-    """Timing with the rows that are used and with their law, of a command that stands for `rows` rows."""
+    """Timing with the rows that are used and with their law, of a command that stands for `rows` rows, at
+    least 1.
+
+    The law is None where the rows that are used show none that repeats the command.
+    """
     first = tuple(_phase(_changes(record), rows) for record in records)
     used = [_every(record, start, rows) for record, start in zip(records, first, strict=True)]
     law = law_of(used)
@@ -341,13 +365,20 @@ def _with_rows(timing: CommandTiming, records: Sequence[Record], rows: int) -> C
 
 
 def _every(record: Record, start: int, rows: int) -> Record:
-    """Record of every `rows`-th row, from the row `start` on."""
+    """Record of every `rows`-th row, from the row `start` on, with `rows` times the step.
+
+    Raises ValueError (`Record`) where there is no row from `start` on.
+    """
     thinned = record.each(lambda signal: signal[start::rows])
     return replace(thinned, dt_s=record.dt_s * rows)
 
 
 def _refuse_contradiction(record: Record, period_s: float, usual_gap: int) -> None:
-    """Raise ValueError where the log shows that the stated period is not that of its controller."""
+    """Raise ValueError where the log shows that the stated period is not that of its controller.
+
+    The period is no whole part of the log's step though it is shorter than half of it, or it is longer than
+    `usual_gap` rows, after which the command usually changes. `period_s` above zero is not checked.
+    """
     step_s = record.dt_s
     option = "controller_period_s, --controller-period"
     commands_per_step = step_s / period_s
@@ -367,7 +398,11 @@ def _refuse_contradiction(record: Record, period_s: float, usual_gap: int) -> No
 
 
 def _refuse_law_at_rows(record: Record, period_s: float, used_step_s: float, law: RecordedLaw | None) -> None:
-    """Raise ValueError where the rows show the law that made them, and a faster one would have left more."""
+    """Raise ValueError where the rows show the law that made them, and a faster one would have left more.
+
+    `used_step_s` : step of the rows of which the law was read, s; `period_s` : the stated, shorter one.
+    Without a law, or with one that does not tell its period, nothing is raised.
+    """
     if law is not None and law.tells_period:
         raise ValueError(
             f"{record.label}: a linear law makes every command from rows {used_step_s:.6g} s apart, which no "
@@ -382,19 +417,30 @@ def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) ->
     Parameters
     ----------
     records : sequence of Record
-        As logged, of the sampling time of the timing; those that `timing_of` saw first.
+        As logged, of the sampling time of the timing (not checked). The list begins with the records that
+        `timing_of` was given, in their order; further ones, as of a validation, may follow.
     timing : CommandTiming
+        What the command does: rows to use, and the hold to correct for.
 
     Returns
     -------
     list of Record
-        With the rows at which the command changes, where it stands for several; filtered with 1 / S
-        (module's docstring) where the controller was faster than the log. A note says what is not known.
+        With the rows at which the command changes, where it stands for several; filtered with 1 / S (module's
+        docstring) where the controller was faster than the log. Where the timing is not known, the first
+        record alone gets a note CONTROLLER_PERIOD: the step of the rows, whether a law repeats the command,
+        and whether there is a reference.
+
+    Raises
+    ------
+    ValueError
+        A record has no row from its first used one on (`Record`). IndexError without records, where the
+        timing is not known.
     """
     changed = []
     for index, record in enumerate(records):
         if timing.rows_per_command > 1:
-            # Records that the timing has not seen, as of a validation, begin at their first row.
+            # Records that the timing has not seen, as of a validation, begin at their first row, also where
+            # their command changes at another one: their phase is not looked for.
             start = timing.first_row[index] if index < len(timing.first_row) else 0
             record = _every(record, start, timing.rows_per_command)
         if timing.taken != HELD:
@@ -414,7 +460,8 @@ def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) ->
 def filtered(command: RealArray, hold: Hold) -> RealArray:
     """Commands (T, U) filtered with the response 1 / S of a hold, which looks forwards and backwards in time.
 
-    `command` (T, U) : as logged; its first and last values are repeated before and after.
+    `command` (T, U) : as logged; its first and last values are repeated before and after. At least one row;
+    nan would spread to `ROWS_BESIDE` rows around it. (T, U) comes out.
     """
     angle = np.linspace(0.0, FITTED_UP_TO_RAD, FILTER_POINTS)[1:]
     lags = np.arange(-ROWS_BESIDE, ROWS_BESIDE + 1)
@@ -435,15 +482,18 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     Parameters
     ----------
     posterior : ResponsePosterior
-        Of records whose command was taken as held from row to row.
+        Of records whose command was taken as held from row to row: mean (P,) and covariance factor (P, P') of
+        coefficients (poles, taps, unstable poles last), dt_s.
     timing : CommandTiming
+        Its `possible` holds and their `middle`.
 
     Returns
     -------
     ResponsePosterior
         About the response of `timing.middle`, with two more directions of its covariance, along the phase and
         along the gain. Each is as wide as the largest difference between the middle and what is possible,
-        times `BEYOND_ENDS`. The posterior itself where the timing is known.
+        times `BEYOND_ENDS`. The posterior itself where the timing is known, or where its mean is zero. That
+        the timing is of the posterior's records is not checked.
 
     Notes
     -----
@@ -486,7 +536,8 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
     # A response may be zero somewhere, where no share of it is an error.
     size = np.maximum(np.abs(centre), SMALLEST_RESPONSE * np.max(np.abs(centre)))
 
-    # Errors count as a share of what they are held against, and less above the data.
+    # Errors count as a share of what they are held against, and less above the data: the fourth power,
+    # chosen, leaves a twentieth of the weight at twice the frequency.
     count = 1 / (1 + (angle / FITTED_UP_TO_RAD) ** 4)
     through_middle = middle[:, None] * rows
     mean_response = through_middle @ wider.mean[:n_fitted, None]

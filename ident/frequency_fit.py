@@ -39,12 +39,13 @@ from ident.uncertainty.embedding import embed_response
 __all__ = ["FrfIdentification", "identify_frf"]
 
 # Frequencies at which the model is looked at over two decades below the measured band: 2.3 % apart, so that
-# the peak of a mode of damping .01 is not missed.
+# the peak of a mode of damping .01 (2 % wide) is not missed.
 POINTS_BELOW = 200
 # Frequencies from the last measured one to the Nyquist frequency: .12 % apart over a decade, so that the peak
 # of a mode of damping .001 is not missed.
 POINTS_ABOVE = 2000
-# Share of the Nyquist frequency from which the look below begins at least, where frequency zero was measured.
+# Share of the Nyquist frequency from which the look below begins at least, where frequency zero was measured:
+# six decades, more than any measurement spans. Chosen.
 LOWEST_SHARE = 1e-6
 # Eigenvalues of the normal matrix, columns scaled to one length, below this share of the largest are
 # rounding: the data do not show these directions, which get no variance.
@@ -114,7 +115,8 @@ class FrfIdentification(Shown):
 
     @property
     def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the model."""
+        """What to look at before trusting the model: poles at a bound, or outside the measured band; often
+        empty."""
         return self.search.warnings
 
     @property
@@ -161,7 +163,8 @@ def identify_frf(
     ------
     ValueError
         A frequency has no covariance, there are too few frequencies for the given order, or an option asks
-        for an offset, an initial state or a relative degree.
+        for an offset, an initial state or a relative degree. That frequencies increase and numbers are
+        finite, `FrequencyUncertainty` has seen to.
 
     Notes
     -----
@@ -189,6 +192,7 @@ def identify_frf(
     if not data.n_samples > needed:
         raise ValueError(
             f"{response.omega_rad_s.size} frequencies are too few for order {order}, which "
+            # A frequency gives two real numbers, and one number has to be left.
             f"has {needed} unknowns; expected at least {needed // 2 + 1}"
         )
 
@@ -301,8 +305,9 @@ class _OrderFit:
     ) -> _OrderFit:
         """Order and poles from the data.
 
-        `measured_rad` : (K, 2) bands, radians per sample, that limit the poles (`Bounds.shown_by`). `start` :
-        poles to go on from; None: a global search.
+        `measured_rad` : (K, 2) bands, radians per sample; poles need one within their half-power width
+        (`Bounds.shown_by`). `start` : poles to go on from, fixed ones first; None: a global search. Neither
+        is checked here: the caller made them of a measured response and of an earlier fit.
         """
         bounds = None
         if measured_rad is not None:
@@ -333,7 +338,8 @@ def _limited_to_data(
     without data; one with more unknowns than the given fit has to be better.
 
     `also_direct_term` : limited fits with a direct term compete, too, which does what poles near pi/dt do for
-    a response without the half sample of a hold.
+    a response without the half sample of a hold. Nothing is raised beyond what `identify_frf` has asked of
+    `response` and `options`; a fit all of whose poles are shown is returned as it is.
     """
     unshown_poles = poles_without_data(fit.end.poles, fit.search.fixed, measured_rad)
     if unshown_poles.order == 0:
@@ -371,11 +377,13 @@ def _assumed_outside(model: GobfModel, band_rad_s: tuple[float, float]) -> Findi
     """Finding on the gains of the model below and above the measured band, where nothing was measured.
 
     `band_rad_s` : first and last measured frequency. The finding has the gains at both ends of the band and
-    at the Nyquist frequency, and the largest ones below and above with the frequency of the one above.
+    at the Nyquist frequency, and the largest ones below and above with the frequency of the one above, in
+    units of the response. The band, ascending and above zero or from zero on, is that of a measurement: not
+    checked.
     """
     low_rad_s, high_rad_s = band_rad_s
     nyquist_rad_s = np.pi / model.dt_s
-    # Two decades below the first frequency a model without integrators has its gain at rest.
+    # Two decades (100) below the first frequency a model without integrators has its gain at rest.
     start_rad_s = max(low_rad_s, LOWEST_SHARE * nyquist_rad_s)
     below_rad_s = np.geomspace(start_rad_s / 100, start_rad_s, POINTS_BELOW)
     above_rad_s = np.geomspace(min(high_rad_s, nyquist_rad_s), nyquist_rad_s, POINTS_ABOVE)
@@ -411,7 +419,9 @@ def _pole_deviations(
     """Standard deviations of the poles from the Kaufman Jacobian, to first order; 0 for the fixed ones.
 
     `variance_factor` : by which the covariances of the measurement are too small. The unknowns of the
-    Jacobian are 1 - a of a real pole a, and decay s and angle f per sample of a pair.
+    Jacobian are 1 - a of a real pole a, and decay s and angle f per sample of a pair. `fixed` : known poles,
+    first of each type in `poles` (not checked). Directions that the data do not show get 0; the decay of a
+    real pole at zero gets infinity.
     """
     n_fixed_real, n_fixed_pairs = fixed.counts
     deviations = _PoleDeviations(

@@ -3,6 +3,10 @@
 `FittedRecords` holds what all fits to records have; `Identification` adds a model of one input and one
 output, `MimoIdentification` one of several. They are made by `ident.one_input` and `ident.several_outputs`,
 stored in files, and shown in tables by `ident.data.shown`; nothing is computed here but the list of warnings.
+
+Types of other files: `Structure`, integrators, delay, direct term and nuisances of a fit; `OrderStep`,
+numbers of poles with their residual sum of squares; `SearchTrace`, what a search did; `Finding`, a kind and
+its values; `PriorTest`, a verdict on one thing that was stated as known; `Record`, one experiment.
 """
 
 from __future__ import annotations
@@ -65,6 +69,12 @@ class FittedRecords(Shown):
         What it was made from; not stored.
     order_given : bool
         Nobody left the order to the data; not stored.
+
+    Raises
+    ------
+    ValueError
+        Not one residual, name and fit per record, or a sum is negative or nan; shapes of the residuals and
+        lengths of the other fields are not checked.
     """
 
     table_in_notebook = True
@@ -101,12 +111,18 @@ class FittedRecords(Shown):
 
     @property
     def noise(self) -> AutoregressiveNoise:
-        """Model of the noise behind which everything was fitted, of `noise_filter`."""
+        """Model of the noise behind which everything was fitted, of `noise_filter`.
+
+        Raises ValueError where that is no vector of finite numbers that begins with 1.
+        """
         return AutoregressiveNoise(self.noise_filter)
 
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the model: warnings of the search, then advice; each once."""
+        """What to look at before trusting the model: warnings of the search, then advice; each once.
+
+        Computed when first asked for: `advise` may raise what its checks of the records raise.
+        """
         return distinct((*self.search.warnings, *self.advise()))
 
 

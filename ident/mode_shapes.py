@@ -14,7 +14,8 @@ poles that differ, and outputs whitened to independent noise of power 1.
 
 `OutputRegressions`, of another file, holds a regression for each output (`each`) of the same inputs u (U, N),
 with `y` (N,), `segments` (rows of each record) and `take_out_local`, which projects rows off nuisance
-columns.
+columns. `Poles` has real poles and of each pair the one above the axis, all inside the unit circle; B of
+them.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ HIGHEST_LOG_DECAY = 6.0
 # Singular values of Jacobian columns of one length below this share of the largest are not seen by the data:
 # they get no variance instead of an infinite one. Rounding leaves about 1e-15 of a column.
 SMALLEST_SEEN = 1e-12
-# Smallest double that still can be divided by, in place of a length of zero.
+# Nearly the smallest double that still can be divided by, in place of a length of zero.
 TINY = 1e-300
 
 # Whether a fit that leaves a residual sum of squares with so many free numbers fewer is refused.
@@ -63,15 +64,18 @@ Refused = Callable[[float, int], bool]
 
 @dataclass(frozen=True, eq=False)
 class Shaped:
-    """A fit in which some modes have one shape.
+    """A fit in which some modes have one shape. Nothing is checked: `ModalFit.shaped` makes it.
 
     Attributes
     ----------
     poles : Poles
+        Those at zero, which stand for integrators, first; then those of the modes, pairs apart.
     coefficients : ndarray, shape (Y, U, B)
         Of the basis functions of these poles.
     direct : ndarray, shape (Y, U)
+        Direct terms; zero where there are none.
     residual : ndarray, shape (Y, N)
+        What the fit leaves of the whitened outputs.
     rss : float
         Its sum of squares.
     rank_one : tuple of bool
@@ -104,7 +108,10 @@ class _ModeValue(NamedTuple):
     residue_slopes: list[ComplexArray]
 
     def pole_slopes(self) -> list[complex]:
-        """Change of the pole with the logarithm of its decay, and with the logistic number of its angle."""
+        """Change of the pole with the logarithm of its decay, and with the logistic number of its angle.
+
+        One number for a real pole, two for a pair; zero for a pole at zero.
+        """
         # With |p| = exp(-exp(x)) the slope is p ln|p|, which is zero at p = 0.
         with_log_decay = 0j
         if self.pole:
@@ -133,7 +140,7 @@ class ShapedMode:
     Its free numbers, in this order: where it moves, the logarithm of its decay per sample and, for a pair,
     the logistic number of its angle over pi; then those of the residue, for a pair first all real and then
     all imaginary parts. The residue has either Y U entries, row by row, or as c b the Y of c and the U - 1 of
-    b without its largest, which is one.
+    b without its largest, which is one. Nothing is checked: `modes_of` makes it of poles inside the circle.
 
     Attributes
     ----------
@@ -183,7 +190,8 @@ class ShapedMode:
         """Free numbers (P,) of pole and residue as they are.
 
         A residue of higher rank than a shape may have is replaced by the nearest one of rank one, where
-        `input_sizes` (U,) weigh the inputs by how strongly they drive the mode.
+        `input_sizes` (U,), above zero, weigh the inputs by how strongly they drive the mode. A pole at zero
+        that moves, and a mode without any residue, give infinity or nan: neither is a mode (`modes_of`).
         """
         pole_numbers = []
         if self.moves:
@@ -206,7 +214,8 @@ class ShapedMode:
     def at(self, numbers: RealArray) -> _ModeValue:
         """Pole, residue and the residue's slopes at free numbers (P,), laid out as `pack` does.
 
-        Which entry of b is one, and the sign of a real pole, are those of the start.
+        Which entry of b is one, and the sign of a real pole, are those of the start. Too few numbers are an
+        IndexError or ValueError of NumPy; a decay beyond its bounds counts as the bound.
         """
         pole = self.pole
         if self.moves:
@@ -277,7 +286,8 @@ def one_shape_each(
     -------
     Shaped or None
         None with one input or output, where a residue has one shape anyway; where poles repeat; and where
-        every mode was refused.
+        every mode was refused. Shapes are not checked; an input that drives no mode at all is one that the
+        caller has refused.
     """
     if min(direct.shape) < 2:
         return None
@@ -317,7 +327,9 @@ def modes_of(
     Parameters
     ----------
     poles : Poles
+        Of the basis, B of them.
     coefficients : ndarray, shape (Y, U, B)
+        Of its functions, for each output and input.
     n_fixed : tuple of int
         Real poles and pairs, first of each type, that do not move.
     rank_one : sequence of bool, optional
@@ -331,7 +343,8 @@ def modes_of(
     Raises
     ------
     ValueError
-        Poles repeat, so that they have no residue each.
+        Poles repeat, so that they have no residue each (`residue_columns`), or `rank_one` has not one entry
+        per mode.
     """
     values, columns = residue_columns(poles)
     residues = np.einsum("yub,bm->myu", coefficients, columns)
@@ -375,7 +388,11 @@ class ModalFit:
     """
 
     def __init__(self, data: OutputRegressions, modes: Sequence[ShapedMode]) -> None:
-        """Take the modes as they are, and the residual and Jacobian there."""
+        """Take the modes as they are, and the residual and Jacobian there.
+
+        Raises ValueError without modes; their shapes (Y, U) are to be those of the data, which is not
+        checked.
+        """
         first = data.each[0]
         self.data = data
         self.modes = modes
@@ -394,7 +411,8 @@ class ModalFit:
         self._set(np.concatenate([mode.pack(self.input_sizes(mode)) for mode in modes]))
 
     def _set(self, x: RealArray) -> None:
-        """Take free numbers (P,), and the residual and Jacobian there."""
+        """Take free numbers (P,), and the residual (Y, N) and Jacobian (Y N, P) there; the length is not
+        checked."""
         residual, jacobian = self._linearised(x)
         self.x = x
         self.residual = residual.reshape(self.y.shape)
@@ -402,7 +420,10 @@ class ModalFit:
         self._jacobian = jacobian
 
     def _filtered(self, pole: complex, rows: RealArray | ComplexArray) -> RealArray | ComplexArray:
-        """Rows (R, N) through 1/(z - pole), record by record from rest, (R, N)."""
+        """Rows (R, N) through 1/(z - pole), record by record from rest, (R, N).
+
+        A pole outside the circle is not refused: the rows then grow.
+        """
         # A real pole leaves real rows real, which is half the work.
         kind: np.dtype[Any] = rows.dtype
         denominator: list[complex] = [1.0, -np.real(pole)]
@@ -415,23 +436,27 @@ class ModalFit:
         return filtered
 
     def solve(self) -> None:
-        """Move the free numbers to the least residual, by Levenberg and Marquardt from where they are."""
+        """Move the free numbers to the least residual, by Levenberg and Marquardt from where they are.
+
+        After `MOST_EVALUATIONS` it stops where it is, without a word. SciPy raises ValueError where there are
+        fewer samples of all outputs than free numbers, or where the residual is not finite.
+        """
         # SciPy asks for the residual and then for the Jacobian at the same numbers: both come from one pass.
         last: dict[bytes, tuple[RealArray, RealArray]] = {}
 
         def linearised(x: RealArray) -> tuple[RealArray, RealArray]:
-            """Residual and Jacobian at x, from memory where they were asked for last."""
+            """Residual (Y N,) and Jacobian (Y N, P) at x (P,), from memory where they were asked for last."""
             if x.tobytes() not in last:
                 last.clear()
                 last[x.tobytes()] = self._linearised(x)
             return last[x.tobytes()]
 
         def residual_at(x: RealArray) -> RealArray:
-            """Residual (Y N,) at x."""
+            """Residual (Y N,) at x (P,)."""
             return linearised(x)[0]
 
         def jacobian_at(x: RealArray) -> RealArray:
-            """Jacobian (Y N, P) at x."""
+            """Jacobian (Y N, P) at x (P,)."""
             return linearised(x)[1]
 
         solution = least_squares(
@@ -447,13 +472,17 @@ class ModalFit:
         self._set(solution.x)
 
     def input_sizes(self, mode: ShapedMode) -> RealArray:
-        """How strongly each input drives a mode, (U,): length of the state that it makes of the input."""
+        """How strongly each input drives a mode, (U,): length of the state that it makes of the input.
+
+        Zero for an input that stands at zero.
+        """
         return np.asarray(np.linalg.norm(self._filtered(mode.pole, self.u), axis=1))
 
     def _linearised(self, x: RealArray, *, linear: bool = True) -> tuple[RealArray, RealArray]:
         """Residual (Y N,) and its Jacobian (Y N, P) at free numbers (P,), projected off the nuisances.
 
-        `linear` : off the linear rows of every output, too.
+        `linear` : off the linear rows of every output, too. `x` is laid out as the modes' `pack` does, one
+        after the other: not checked.
         """
         model = np.zeros_like(self.y)
         columns: list[RealArray] = []
@@ -477,7 +506,8 @@ class ModalFit:
         """Nuisance columns (Ql, N), orthonormal within each record.
 
         Polynomials (offset, drift of integrators), and free responses of the poles where records may begin in
-        motion.
+        motion. Raises ValueError (`Poles`) for a pole that is not inside the circle; the lower pole of a pair
+        is not to be among `poles`.
         """
         first = self.data.each[0]
         if not self.structure.estimate_initial_state:
@@ -490,7 +520,11 @@ class ModalFit:
         return project(first, NO_POLES, Poles(np.array(real), pairs)).local_q
 
     def _take_out(self, rows: RealArray, poles: Sequence[complex], *, linear: bool = True) -> None:
-        """Project rows (R, N) off the nuisances and, with `linear`, off the linear rows, in place."""
+        """Project rows (R, N) off the nuisances and, with `linear`, off the linear rows, in place.
+
+        `poles` : of the free responses, where records may begin in motion. Rows of another length are a
+        ValueError of NumPy.
+        """
         first = self.data.each[0]
         local_q = self._local_q(poles)
         first.take_out_local(local_q, rows)
@@ -511,7 +545,13 @@ class ModalFit:
         Returns
         -------
         ndarray, shape (P, P')
-            Numbers of the modes, then of every output the coefficients of the linear rows.
+            Numbers of the modes, then of every output the coefficients of the linear rows. What the data do
+            not show gets zero.
+
+        Raises
+        ------
+        ValueError
+            Noise models of another number than outputs, where one is not white.
 
         Notes
         -----
@@ -550,7 +590,8 @@ class ModalFit:
         return np.asarray(factor @ factor.T @ triangle.T)
 
     def _linear_columns(self) -> RealArray:
-        """Linear columns of all outputs, off the nuisances, (Y N, Y Q): output after output."""
+        """Linear columns of all outputs, off the nuisances, (Y N, Y Q): output after output; (Y N, 0) without
+        any."""
         n_outputs = self.y.shape[0]
         n_linear = len(self.linear_rows)
         columns = np.zeros((n_outputs * n_linear, *self.y.shape))
@@ -565,7 +606,8 @@ class ModalFit:
     def response_columns(self, omega_rad_s: RealArray) -> ComplexArray:
         """Change of the response with each number of `covariance_factor`, (F, Y, U, P).
 
-        `omega_rad_s` (F,) ; without integrators and delay, which stand in front of the modes.
+        `omega_rad_s` (F,), up to Nyquist (not checked); without integrators and delay, which stand in front
+        of the modes. Raises LinAlgError where a pole at z = 1 meets omega = 0; modes have none.
         """
         dynamics, drive, seen = self._one_input()
         z = np.exp(1j * np.asarray(omega_rad_s) * self.data.dt_s)
@@ -577,7 +619,7 @@ class ModalFit:
         """State space of what `response_columns` gives at frequencies: A (n, n), B (n, U), C (P, Y, n + U).
 
         C takes states and inputs to what each number of `covariance_factor` changes. Every input drives
-        states of its own.
+        states of its own. Nothing goes in, so nothing is refused.
         """
         dynamics, drive, seen = self._one_input()
         size = len(dynamics)
@@ -596,6 +638,7 @@ class ModalFit:
         A (m, m), B (m, 1), and (P, Y, U, m + 1): the change of each output for each input, seen from the m
         states of that input and the input itself. Inputs as they drive the modes, behind integrators and
         delay. A mode has a state (two for a pair: real and imaginary part) and as many again for 1/(z - p)^2.
+        P numbers, those of the modes first; at the free numbers as they are now.
         """
         n_outputs = self.y.shape[0]
         n_inputs = self.u.shape[0]
@@ -644,7 +687,7 @@ class ModalFit:
         return np.asarray(block_diag(*blocks)), np.array(drive)[:, None], np.array(columns)
 
     def _values_at(self, x: RealArray) -> Iterator[_ModeValue]:
-        """Every mode at free numbers (P,) of all of them."""
+        """Every mode at free numbers (P,) of all of them; too few raise in `ShapedMode.at`."""
         ends = np.cumsum([mode.n_free() for mode in self.modes])
         for mode, numbers in zip(self.modes, np.split(x, ends[:-1]), strict=True):
             yield mode.at(numbers)
@@ -657,7 +700,8 @@ class ModalFit:
         """The fit as coefficients on the basis of the poles as they are now.
 
         `before` : poles of the fit with free residues; those at zero, which stand for integrators, are taken
-        over as they are.
+        over as they are. Raises ValueError (`residue_columns`) where poles have met, so that they have no
+        residue each.
         """
         values = self.values()
         integrator_poles = np.zeros(int(np.sum(before.real == 0)))
@@ -701,7 +745,8 @@ class ModalFit:
     def _linear_coefficients(self, unexplained: RealArray, poles: list[complex]) -> RealArray:
         """Coefficients (Y, Q) of the linear rows, by least squares beside the nuisances.
 
-        `unexplained` (Y, N) : what the modes leave of the outputs; `poles` : those of the free responses.
+        `unexplained` (Y, N) : what the modes leave of the outputs; `poles` : those of the free responses. (Y,
+        0) without linear rows; shapes are not checked.
         """
         n_outputs = len(unexplained)
         if not len(self.linear_rows):
@@ -728,7 +773,7 @@ class _ResponseChange(NamedTuple):
 def _inverse_factor(columns: RealArray) -> RealArray:
     """S (P, P) with S S^T = (C^T C)^-1 for columns C (N, P); what the columns do not see gets zero.
 
-    Columns are scaled to one length, so that what counts as unseen has no units.
+    Columns are scaled to one length, so that what counts as unseen has no units. nan raises LinAlgError.
     """
     scale = np.maximum(np.linalg.norm(columns, axis=0), TINY)
     triangle = np.linalg.qr(columns / scale, mode="r")

@@ -11,6 +11,7 @@ Types of other files that travel here: `Regression`, records made ready for a fi
 (N,) of all records, and their structure); `PoleSearch`, a search on one of them, with its options, its fixed
 poles and its trace (minima, stages, evaluations); `Refined`, the end of a descent (poles, residual sum of
 squares rss); `Fitted`, a search and such an end; `SearchOutcome`, a `Fitted` with the selection of its order.
+A `Record` has finite samples, at least one, or it could not be made.
 """
 
 from __future__ import annotations
@@ -86,8 +87,8 @@ def identify(
     Raises
     ------
     ValueError
-        In one line: a record that cannot be used (constant signal, several columns, other sampling time), or
-        too few samples for the order.
+        In one line: no record, a record that cannot be used (constant signal, several columns, other sampling
+        time), or too few samples for the order.
     """
     options = options or IdentOptions()
     report = progress or silent
@@ -97,7 +98,7 @@ def identify(
     def identified_step(
         step_records: Sequence[Record], step_options: IdentOptions, begin: float, end: float
     ) -> Identification:
-        """Fit in white noise, with the part `begin` to `end` of the progress."""
+        """Fit in white noise, with the part `begin` to `end` of the progress; raises as `identify`."""
         return _identified(step_records, step_options, part_of(report, begin, end - begin))
 
     refuse_unusable(records, prepare(records, options.structure()), least_order(options))
@@ -105,7 +106,8 @@ def identify(
 
 
 def part_of(report: Progress, begin: float, length: float) -> Progress:
-    """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole."""
+    """Progress of a step: its shares 0 .. 1 are reported as begin .. begin + length of the whole; not
+    checked."""
 
     def report_step(share: float, message: str) -> None:
         """Report a share of the step as one of the whole."""
@@ -127,11 +129,12 @@ def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfMode
     Returns
     -------
     GobfModel
+        The model of the search, refined on all samples.
 
     Raises
     ------
     ValueError
-        As `identify`.
+        A record cannot be used, or there are too few samples for the order, as `identify` says it.
     """
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
@@ -142,7 +145,10 @@ def untested_model(records: Sequence[Record], options: IdentOptions) -> GobfMode
 
 
 def _identified(records: Sequence[Record], options: IdentOptions, report: Progress) -> Identification:
-    """The identification that takes the noise as white; raises ValueError as `identify`."""
+    """The identification that takes the noise as white.
+
+    Raises ValueError for records that cannot be used and for too few samples (`prepare`, `refuse_unusable`).
+    """
     data = prepare(records, options.structure())
     refuse_unusable(records, data, least_order(options))
     outcome, part = searched(records, data, options, report)
@@ -151,6 +157,7 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
     if outcome.dead_time is not None:
         verdicts = (outcome.dead_time, *verdicts)
 
+    # Numbers of the bar of progress are chosen by about how long each step takes; they decide nothing.
     report(0.9, "tests of what is stated as known")
     fitted, tests = _priors_judged(records, part, outcome, fitted)
     model, fields = description(records, outcome, fitted)
@@ -180,8 +187,8 @@ def _identified(records: Sequence[Record], options: IdentOptions, report: Progre
 def least_order(options: IdentOptions) -> int:
     """Number of poles that the data have to be enough for.
 
-    Those that are stated; where none is, those that a search begins with: two real poles and a pair, or as
-    many as the options allow.
+    Those that are stated; where none is, those that a search begins with (`ident.search.order_selection`):
+    two real poles and a pair, or as many as the options allow. The options have refused negative numbers.
     """
     n_real = options.n_real or 0
     n_pairs = options.n_pairs or 0
@@ -201,8 +208,9 @@ def searched(
     records : sequence of Record
         Of one input and one output.
     data : Regression
-        These records made ready for a fit from rest.
+        These records made ready for a fit from rest; that they are the same ones is not checked.
     options : IdentOptions
+        Numbers and bounds of poles, `search_samples`, and whether initial states are left to the data.
     report : callable
         Told of shares 0 to .85.
 
@@ -235,7 +243,8 @@ def _behind_dead_time(
     """Outcome of the search behind a delay that the data show, and whether the output answers at once.
 
     Nothing is sought where somebody stated a delay, or where a reference was recorded: noise that comes back
-    through a loop looks like dead time. At once means in the very sample of the input.
+    through a loop looks like dead time. At once means in the very sample of the input. `records` : those that
+    were searched. Nothing is raised for short records: these tell no delay.
     """
     in_loop = any(record.reference is not None for record in records)
     if in_loop or outcome.search.options.input_delay_samples:
@@ -258,7 +267,11 @@ def _behind_dead_time(
 def _searched(
     data: Regression, options: IdentOptions, report: Progress, start: Refined | None = None
 ) -> SearchOutcome:
-    """Outcome of one selection of the order on these data; `start`: poles to go on from."""
+    """Outcome of one selection of the order on these data; `start`: poles to go on from; None: a global
+    search.
+
+    Raises ValueError where stated bounds leave no box to search in (`search_space`).
+    """
     search = PoleSearch(data, options)
     selection = OrderSelection(search, report)
     return SearchOutcome(search, selection.run(start), selection)
@@ -270,7 +283,8 @@ def _searched_with_initial_state(
     """Outcome of a second search with unknown initial states, or of the first one from rest.
 
     `outcome` : the search from rest on these records. It stays unless it is improbably worse than a fit with
-    free responses of all poles, by `nuisance_test`; or where there are too few samples for such a fit.
+    free responses of all poles, by `nuisance_test` (a likelihood ratio at 99 %); or where there are too few
+    samples for such a fit. Nothing is raised for the records, which the first search has used.
     """
     data = outcome.data
     options = outcome.search.options
@@ -286,7 +300,8 @@ def _searched_with_initial_state(
     polished = None
     if searched_order < DYNAMICS_ORDER and order_left_to_data:
         # Nothing was found from rest. A free decay looks just like that, so one mode is sought with free
-        # responses, and its poles are judged with and without them.
+        # responses, and its poles are judged with and without them: a pair and two real poles, those of the
+        # first search.
         most_pairs = options.max_pairs if options.n_pairs is None else options.n_pairs
         n_real = min(2, options.max_real) if options.n_real is None else options.n_real
         end = search.joint(n_real, min(1, most_pairs))
@@ -314,7 +329,7 @@ def fitted_on_all(records: Sequence[Record], outcome: SearchOutcome) -> tuple[Fi
     Parameters
     ----------
     records : sequence of Record
-        All of them.
+        All of them; none is refused here, as the search has.
     outcome : SearchOutcome
         Of a search on these records, or a part of them.
 
@@ -378,7 +393,8 @@ def _priors_judged(
     `part` : records that were searched; `fitted` : the optimum on all records. In this order: integrators,
     fixed poles, direct term, relative degree, delay. What the program chose from the data, in options of its
     own, is not tested. Each test starts from a model that the data have not refused: with integrators
-    refused, relative degree is judged with slow poles in their place.
+    refused, relative degree is judged with slow poles in their place. No tests where nothing was stated, or
+    where there is no pole. Nothing is raised: a degree above the number of poles gives a test TOO_FEW_POLES.
     """
     options = outcome.search.options
     integrators_stated = options.integrators > 0 and options.is_stated("integrators")
@@ -411,6 +427,7 @@ def _priors_judged(
     end = fitted.end
     trials: tuple[int, ...] = ()
     if asked == "auto":
+        # Chosen: 2 is that of a force that moves a mass; beyond 3 none is tried, though it may be stated.
         trials = (2, 3)
     elif asked is not None and asked > 1:
         trials = (asked,)
@@ -446,7 +463,7 @@ def in_order(poles: Poles, fixed: Poles) -> Poles:
     poles : Poles
         Fixed ones first of each type.
     fixed : Poles
-        Only their numbers count here.
+        Only their numbers count here; more of them than there are poles is not checked.
 
     Returns
     -------
@@ -466,7 +483,10 @@ def in_order(poles: Poles, fixed: Poles) -> Poles:
 
 
 def _moved(outcome: SearchOutcome, data: Regression, poles: Poles) -> Fitted:
-    """Optimum near these poles on other rows or columns; noted in the trace of the search."""
+    """Optimum near these poles on other rows or columns; noted in the trace of the search.
+
+    `data` has more samples than unknowns with these poles: the caller has seen to it.
+    """
     search = PoleSearch(data, outcome.search.options)
     end = search.descend(poles, "final polish")
     outcome.search.minima += search.minima
@@ -491,8 +511,14 @@ def description(
     Returns
     -------
     GobfModel
+        With the names of the first record's columns.
     dict
         Fields of `ident.identification.FittedRecords` that are read from fit and search, by name.
+
+    Notes
+    -----
+    Nothing is raised: outputs that stand still, or no more samples than unknowns, which would divide by zero
+    here, were refused before the search.
     """
     data = fitted.data
     options = outcome.search.options
@@ -553,7 +579,8 @@ def _advice(
     """Findings of `Identification.warnings` beside those of the search.
 
     Whether there is an answer to the input at all, doubts about the records, doubts about the poles, and the
-    priors that were refused. `residuals` (T - delay,) of each record.
+    priors that were refused. `residuals` (T - delay,) of each record; `refused` : findings of `_identified`.
+    Empty where there is no doubt; nothing is raised.
     """
     data = fitted.data
     fixed = fitted.search.fixed

@@ -11,6 +11,9 @@ signal is smooth from row to row, the rows in between can be guessed, and neithe
 `law_of` tries laws of rising complexity. What rounding leaves of each is computed from the steps to which the
 columns were written (`_decimal_step`), and whether a faster controller would have left more is seen by taking
 rows away (`_tells_period`).
+
+A `Record` has an input (T, U) (the command), an output (T, Y), where it was logged a reference (T, R), finite
+samples, and the step of its rows dt_s.
 """
 
 from __future__ import annotations
@@ -28,39 +31,43 @@ from ident.data.record import Record
 # controllers of drives have no more; a law of higher order explains any smooth command by its own past.
 MOST_STATES = 4
 # Rows for each coefficient of a law, at least: with fewer, least squares explains part of the rounding, and
-# the residual is no measure of it.
+# the residual is no measure of it. With four it explains a quarter of the power at most, which
+# `MOST_OF_ROUNDING` allows for.
 ROWS_PER_COEFFICIENT = 4
-# A row whose command stands within this share of the largest one is at the limit, where no linear law holds.
+# A row whose command is above this share of the largest one is at the limit, where no linear law holds.
+# Chosen: a log of three digits rounds by as much.
 LIMIT_SHARE = 0.999
 # Residual over what the rounding of the columns leaves of a true law, up to which the law is the one that
-# ran. Five simulated drives have 1.00 +- .01, a drive that logs every second sample has 9.
+# ran. Five simulated drives have 1.00 +- .01, a drive that logs every second sample has 9; chosen near the
+# first.
 MOST_OF_ROUNDING = 1.5
 # A controller twice as fast would have left more than rounding does: at least as much again. Less could be an
 # error of the extrapolation, which is right to a third on simulated drives.
 LEAST_EXCESS = 1.0
 # Of that excess the law may show this share: half of it is as near to none as to all.
 SHOWN_SHARE = 0.5
-# Rows of all records together that are used: the residual is known to 1 % then.
+# Rows of all records together that are used: the residual is known to 1 % then (1 / sqrt(2 N) is .6 %).
 MOST_ROWS = 16_000
 # Decimal places that are looked for in a column: what logs have; more are those of numbers of 64 bits.
 MOST_DECIMALS = 9
 # Multiples of a step up to which a column may have been scaled: of 24 bits, the most of any converter.
 MOST_COUNTS = 2**24
-# Significant digits that are looked for: "%.4g" to "%.10g".
+# Significant digits that are looked for: "%.4g" to "%.10g". Of fewer a column has few values; more are those
+# of numbers of 64 bits.
 SIGNIFICANT_DIGITS = range(4, 11)
 # Reference and output enter alike, as their difference, if their coefficients cancel to this share: those of
 # least squares on rounded columns are known to 1e-3 or so, those of a law of the error are equal.
 CANCELS_SHARE = 1e-6
-# The output of a row counts for its command if its coefficient is at least this share of the largest:
-# rounding leaves less.
+# The output of a row counts for its command if its coefficient is above this share of the largest: those of
+# least squares on rounded columns are known to 1e-3 or so.
 ACTS_SHARE = 1e-3
 # Values are multiples of a step if they are so near to whole numbers of it, in steps, and a few roundings of
 # doubles: decimals that were read from text are right to half a unit of the last place.
 DECIMAL_SLACK = 1e-6
 # The same for decimals that were scaled to another unit: the step is a difference of two of them, which has
-# fewer right digits.
+# fewer right digits. Chosen: of `MOST_COUNTS` counts the last ones then need a step known to 1e-10.
 SCALED_SLACK = 1e-3
-# Roundings of doubles in the sums of a law: a few in each of its up to fifteen terms.
+# Roundings of doubles in the sums of a law: up to seven in each of its up to fifteen terms.
 DOUBLE_ROUNDINGS = 100
 
 
@@ -94,14 +101,18 @@ class RecordedLaw:
 
     @property
     def repeats_command(self) -> bool:
-        """Whether the law leaves of the command no more than the rounding of the log."""
+        """Whether the law leaves of the command no more than `MOST_OF_ROUNDING` times the rounding of the
+        log.
+
+        False for a residual of nan.
+        """
         return self.residual <= MOST_OF_ROUNDING * self.rounding
 
     @property
     def on_error(self) -> tuple[RealArray, RealArray] | None:
         """Numerator and denominator in z (n + 1,), highest power first, of K in u = K (r - y).
 
-        None where reference and output enter differently.
+        None where reference and output enter differently; of a law without either, K = 0.
         """
         size = np.linalg.norm(self.of_reference)
         difference = np.linalg.norm(self.of_reference + self.of_output)
@@ -111,7 +122,8 @@ class RecordedLaw:
 
     @property
     def acts_at_once(self) -> bool:
-        """Whether the command of a row depends on the output of the same row."""
+        """Whether the command of a row depends on the output of the same row; False without any output in
+        it."""
         largest = float(np.max(np.abs(self.of_output)))
         return bool(abs(self.of_output[0]) > ACTS_SHARE * largest)
 
@@ -128,7 +140,9 @@ def law_of(records: Sequence[Record]) -> RecordedLaw | None:
     -------
     RecordedLaw or None
         The first structure that repeats the command; where none does, the law with the least residual. None
-        where a record has no reference column, or several, or the records are too short to tell a law.
+        where there is no record, where one has no reference column, or several, or the records are too short
+        to tell a law. Of inputs and outputs the first column is taken: that there is one, and one sampling
+        time, is not checked.
 
     Notes
     -----
@@ -160,7 +174,8 @@ def _tells_period(columns: _Columns, structure: _Structure, law: RecordedLaw) ->
     reference may fall on every fourth row, which leaves little to guess there, so even and odd rows are
     judged by themselves, and the smaller answer counts. A reference that the controller got as it was written
     has no rounding error, though it has decimals, so what this law leaves beyond that of the other two
-    columns may be an excess.
+    columns may be an excess. False where there are too few rows. `columns` : of the records behind the `law`,
+    which is of this `structure`.
     """
     least_excess = np.inf
     for parity in range(2):
@@ -210,8 +225,9 @@ STRUCTURES = tuple(
 class _Columns:
     """Command, reference and output of some records, and the steps of their decimals.
 
-    signals : of each record, the three columns (T,) as logged command_step, reference_step, output_step : to
-    which the columns were rounded, in their units, in root mean
+    signals : of each record, the three columns (T,) as logged
+    command_step, reference_step, output_step : to which the columns were rounded, in their units, in root
+    mean
         square over records or rows; 0: not rounded
     largest : size of the largest command
     dt_s : step of the rows, s
@@ -226,7 +242,10 @@ class _Columns:
 
     @classmethod
     def of(cls, records: Sequence[Record]) -> _Columns:
-        """Columns of records with one input, reference and output each, `MOST_ROWS` rows of all together."""
+        """Columns of records with one input, reference and output each, `MOST_ROWS` rows of all together.
+
+        Without records it divides by zero: `law_of` has seen to it.
+        """
         signals = []
         for record in records:
             rows = slice(0, MOST_ROWS // len(records))
@@ -247,7 +266,7 @@ class _Columns:
     def least_residual(self, structure: _Structure, thinned: int, parity: int) -> float | None:
         """Least residual, input units, of the laws of every `thinned`-th even (`parity` 0) or odd (1) row.
 
-        None where there are too few rows.
+        None where there are too few rows. `thinned` : 2 or more.
         """
         residuals = []
         for start in range(parity, thinned, 2):
@@ -259,7 +278,7 @@ class _Columns:
     def fitted(self, structure: _Structure, thinned: int = 1, start: int = 0) -> RecordedLaw | None:
         """Law of a structure, by least squares over every row, or every `thinned`-th one from `start`.
 
-        None where there are too few rows.
+        None where there are too few rows. Its `tells_period` is False: nobody has asked yet.
         """
         limit = LIMIT_SHARE * self.largest
         row_parts = []
@@ -309,8 +328,9 @@ class _Columns:
     def rounding(self, of_command: RealArray, of_reference: RealArray, of_output: RealArray) -> float:
         """Root mean square, input units, of what the decimals of the columns leave of an exact law.
 
-        `of_command`, `of_reference`, `of_output` (n + 1,) : coefficients as in `RecordedLaw`. Errors of
-        rounding are independent and uniform over a step: their variance is a twelfth of its square.
+        `of_command`, `of_reference`, `of_output` (n + 1,) : coefficients by which the rows of each column
+        count (`RecordedLaw`), not checked. Errors of rounding are independent and uniform over a step: their
+        variance is a twelfth (12) of its square.
         """
         variance = (
             of_command @ of_command * self.command_step**2
@@ -332,7 +352,8 @@ def _regression(
     """Regression of a law: rows (M, P) of past commands and driving signals, and target (M,).
 
     `command`, `reference`, `output` (T,) : columns of one record. Newest sample of each signal first; rows of
-    which a command is at the `limit`, in units of the input, are left out.
+    which a command is at the `limit`, in units of the input, are left out, so that M may be 0. Raises
+    ValueError where a column has fewer rows than the law has states, and one: the caller has longer ones.
     """
     n_samples = structure.n_states + 1
     commands = sliding_window_view(command, n_samples)[:, ::-1]
@@ -357,7 +378,8 @@ def _rounding_step(signals: Sequence[RealArray]) -> float:
     `signals` : the column (T,) of each record. Steps of a reference are written in full where a chirp is
     rounded, so the finest step of all records counts. Multiples of a step that is no power of ten (an encoder
     of 3 micrometres written with three decimals of a millimetre) were not rounded by the log. A value that
-    stands has one rounding error, which a law with integral action does not see.
+    stands has one rounding error, which a law with integral action does not see. Raises ValueError without
+    signals.
     """
     finest = min(_decimal_step(signal) for signal in signals)
     if finest == 0.0:
@@ -379,7 +401,8 @@ def _decimal_step(signal: RealArray) -> float:
     """Step to which a column (T,) was rounded, in its units, in root mean square; 0 where there is none.
 
     A power of ten; or the smallest difference, where all values are multiples of it, as of decimals that were
-    scaled to another unit; or that of so many significant digits, or of a number of 32 bits, at each value.
+    scaled to another unit; or that of so many significant digits, or of a number of 32 bits, at each value. A
+    column of zeros counts as whole numbers: 1. Finite numbers, one at least: not checked.
     """
     values = np.unique(signal)
     eps = np.finfo(np.float64).eps
@@ -387,6 +410,7 @@ def _decimal_step(signal: RealArray) -> float:
     # Decimals as they were written: the largest power of ten of which every value is a multiple.
     for decimals in range(MOST_DECIMALS + 1):
         scaled = values * 10.0**decimals
+        # Four roundings: of the text, of the power of ten, of their product, and one to spare.
         slack = DECIMAL_SLACK + 4 * eps * np.abs(scaled)
         if np.all(np.abs(scaled - np.round(scaled)) <= slack):
             return float(10.0**-decimals)
@@ -404,6 +428,7 @@ def _decimal_step(signal: RealArray) -> float:
     is_nonzero = values != 0
     size = np.abs(values[is_nonzero])
     exponent = np.floor(np.log10(size))
+    # Four roundings are allowed for, as above.
     for digits in SIGNIFICANT_DIGITS:
         step = 10.0 ** (exponent + 1 - digits)
         counts = size / step

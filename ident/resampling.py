@@ -11,6 +11,10 @@ there: what the log folds back from above its Nyquist frequency, where the ellip
 
 `resampled` fits the new response by the basis of the new poles and a few taps; `resampled_poles` and
 `resampled_friction` do what their names say for poles and for an arm with friction.
+
+A `ResponsePosterior` is a Gaussian over coefficients: mean (P,), covariance factor (P, P'), of its poles, a
+direct term and `fir_length` taps; `frequency_rows` (F, P) takes coefficients to the response. `Poles` has
+real poles and of each pair the one above the axis, all inside the unit circle.
 """
 
 from __future__ import annotations
@@ -27,7 +31,8 @@ from ident.data.ellipses import LEVEL, chi2_radius
 from ident.friction import FrictionFit
 from ident.response_coefficients import coefficients_of
 
-# Whole multiples and parts of a step agree within this share of it.
+# Whole multiples and parts of a step agree within this share of it: steps are stated with three digits or
+# more.
 SAME_RATIO = 1e-3
 # Steps of one rate in one of the other, at most: a log at 10 kHz beside a controller at 100 Hz. Beyond that a
 # log shows hardly any of the controller's band, and a computation takes minutes.
@@ -49,26 +54,31 @@ LEAST_FOLDED = 1e-4
 # Weight of a response of this size above the log's Nyquist frequency, beside relative errors below: it
 # decides only what the data leave open. Halved or doubled, no test of resampling moves.
 FALLS_WEIGHT = 0.02
-# Lowest frequency that is fitted, times the longer step: a motion of a week in a log at 10 Hz.
+# Lowest frequency that is fitted, times the longer step: a motion of a week in a log at 10 Hz, far below what
+# a loop is designed for.
 LOWEST_ANGLE_RAD = 1e-6
 # Highest frequency that is fitted, as a share of pi over the longer step: at the Nyquist frequency itself
 # responses are real, so that a complex one may not be met.
 HIGHEST_SHARE = 0.99
-# Frequencies of a logarithmic grid from the lowest to the highest one: ninety in a decade.
+# Frequencies of a logarithmic grid from the lowest to the highest one: ninety in a decade, 2.6 % apart.
+# Chosen.
 SLOW_POINTS = 600
-# Frequencies of a linear grid from zero to the highest one, beside those for the taps.
+# Frequencies of a linear grid from zero to the highest one, beside those for the taps. Chosen: enough without
+# any tap.
 EVEN_POINTS = 200
-# Further ones of that grid for each tap: the last tap then has eight of them in each of its turns.
+# Further ones of that grid for each tap: the last tap, which turns round half as often as there are taps up
+# to the Nyquist frequency, then has eight of them in each of its turns.
 EVEN_POINTS_PER_TAP = 4
-# Frequencies around each mode: eight in its half-power width.
+# Frequencies around each mode: eight in its half-power width, which shows the turn of its phase. Chosen.
 MODE_POINTS = 33
-# They reach so many halves of that width to both sides.
+# They reach so many halves of that width to both sides: there a mode has a quarter of its peak, and turns
+# slowly.
 MODE_HALF_WIDTHS = 4
 # Frequencies above the log's Nyquist frequency for each multiple of it: about as dense as the linear grid.
 ABOVE_POINTS = 400
 # Taps at most: kernels decay within a hundred steps, and each tap costs the proofs between grid points.
 MOST_TAPS = 240
-# A delay that is a whole number of steps but for rounding stays that number.
+# A delay that is a whole number of steps but for this share stays that number: rounding of the steps.
 ROUNDING = 1e-9
 
 
@@ -90,7 +100,8 @@ def ratio_of(model_dt_s: float, controller_dt_s: float) -> tuple[int, int]:
     Raises
     ------
     ValueError
-        Neither is a whole multiple of the other, or there are more than `MOST_STEPS`.
+        Neither is a whole multiple of the other, or there are more than `MOST_STEPS`; nan is refused so, too.
+        A step of zero divides by zero: callers have them above zero.
     """
     longer = controller_dt_s / model_dt_s
     if max(longer, 1 / longer) > MOST_STEPS * (1 + SAME_RATIO):
@@ -171,7 +182,8 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     Raises
     ------
     ValueError
-        Other ratios; unstable plants, whose all-pass has no root.
+        Other ratios (`ratio_of`); unstable plants, whose all-pass has no root. A mean response of zero is not
+        looked for: weights are then infinite, and the least squares fail.
 
     Notes
     -----
@@ -217,6 +229,7 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
 
     # Frequencies up to the lower of both Nyquist frequencies, dense where responses turn.
     slower_dt_s = max(posterior.dt_s, controller_dt_s)
+    # Just below the highest frequency, where the linear grid is the denser one.
     slow_angle = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, SLOW_POINTS)
     slow = slow_angle / slower_dt_s
     n_even = EVEN_POINTS_PER_TAP * n_taps + EVEN_POINTS
@@ -259,8 +272,10 @@ def _falling_above(
 ) -> tuple[RealArray, ComplexArray]:
     """Frequencies (F',) and responses (F', N) with further ones above the log's Nyquist frequency.
 
-    `omega` (F,), rad/s, and `wanted` (F, N) : those below it. There the mean, the first response, has the
-    size that an inertia has, which falls with 1/w^2 from the last one below; all others are zero.
+    `omega` (F,), rad/s, ascending, and `wanted` (F, N) : those below it, one at least (IndexError without).
+    `log_dt_s` : step of the log, s, of `up` periods of the controller. Above it the mean, which is the first
+    response, has the size that an inertia has: it falls with 1/w^2 from the last one below. All others are
+    zero.
     """
     multiples = np.linspace(1.0, HIGHEST_SHARE * up, ABOVE_POINTS * up)[1:]
     above = multiples * np.pi / log_dt_s
@@ -272,11 +287,14 @@ def _falling_above(
 
 
 def _around_modes(posterior: ResponsePosterior) -> RealArray:
-    """Frequencies (F,), rad/s, at and beside the poles, where a response turns fastest; above zero."""
+    """Frequencies (F,), rad/s, at and beside the pole pairs, where a response turns fastest; above zero.
+
+    Empty without pairs; those of a badly damped pair may lie above the Nyquist frequency.
+    """
     rates = np.log(posterior.poles.pairs) / posterior.dt_s
     half_widths = np.linspace(-MODE_HALF_WIDTHS, MODE_HALF_WIDTHS, MODE_POINTS)
     around = rates.imag[:, None] + half_widths * np.abs(rates.real[:, None])
-    # A response of an integrator has no value at zero.
+    # A response of an integrator has no value at zero: 1e-12 rad/s is nothing beside any other frequency.
     return np.abs(around.ravel()) + 1e-12
 
 
@@ -284,7 +302,8 @@ def _held(posterior: ResponsePosterior, omega: RealArray, steps: int) -> Complex
     """Rows (F, P) of the response to a command held for so many steps, read once in as many.
 
     `omega` (F,), rad/s, up to the Nyquist frequency of the longer step. A sum over the frequencies that the
-    slower rate folds onto each other (module's docstring).
+    slower rate folds onto each other (module's docstring). Raises ValueError (`frequency_rows`) where one of
+    them is zero and there are integrators; that `steps` is at least 1 the caller knows.
     """
     total = np.zeros((omega.size, posterior.mean.size), dtype=np.complex128)
     nyquist = np.pi / posterior.dt_s
@@ -305,11 +324,12 @@ def _held(posterior: ResponsePosterior, omega: RealArray, steps: int) -> Complex
 def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> RealArray:
     """Directions (P, 4) of what the log does not show of a faster controller's response.
 
-    `posterior` : of the new rate; `log_dt_s` : step of the log, s, of `up` periods. Columns for its
-    covariance factor. Two are as wide as the response at the log's Nyquist frequency, wider above, and close
-    below. Two hold what was folded back: at w the log has seen what the arm does at 2 pi / T - w, too, which
-    is up to (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a few taps
-    lies in the span of poles and taps; the same a sample later is the other direction of an ellipse.
+    `posterior` : of the new rate; `log_dt_s` : step of the log, s, of `up` periods, 2 or more. They are
+    columns for its covariance factor, in units of its coefficients; where its mean response is zero they are
+    not defined (not checked). Two are as wide as the response at the log's Nyquist frequency, wider above,
+    and close below. Two hold what was folded back: at w the log has seen what the arm does at 2 pi / T - w,
+    too, which is up to (w T / 2 pi)^2 of the response where it falls with 1/w or faster. The response times a
+    few taps lies in the span of poles and taps; the same a sample later is the other direction of an ellipse.
     """
     n_even = EVEN_POINTS_PER_TAP * posterior.fir_length + EVEN_POINTS
     even = np.linspace(0.0, HIGHEST_SHARE * np.pi, n_even)[1:]
@@ -334,7 +354,7 @@ def resampled_friction(found: FrictionFit, controller_dt_s: float) -> FrictionFi
     Parameters
     ----------
     found : FrictionFit
-        An arm in continuous time with its sampling and its delay in samples; a lag of the drive in samples.
+        Its `arm` (step dt_s, delay in samples) and `lag` of the drive, in samples; nothing else is looked at.
     controller_dt_s : float
         Period of the controller, s.
 
@@ -342,7 +362,8 @@ def resampled_friction(found: FrictionFit, controller_dt_s: float) -> FrictionFi
     -------
     FrictionFit
         The arm is stepped in continuous time, so only its samples change. Dead time that is no whole number
-        of the controller's samples is rounded up; a lag of the drive is one of as many seconds.
+        of the controller's samples is rounded up; a lag of the drive is one of as many seconds. `found`
+        itself where both steps agree.
 
     Raises
     ------

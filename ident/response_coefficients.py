@@ -33,6 +33,11 @@ def coefficients_of(rows: ComplexArray, wanted: ComplexArray, weight: RealArray)
     -------
     ndarray, shape (P, N)
         Least squares over real and imaginary parts. A column of zeros gets a coefficient of zero.
+
+    Notes
+    -----
+    Numbers are not checked: with nan or infinity NumPy raises LinAlgError; with another F ValueError. Of
+    fewer equations (2 F) than columns the solution is the shortest one.
     """
     weighted = rows * weight[:, None]
     weighted_wanted = wanted * weight[:, None]

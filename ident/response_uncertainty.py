@@ -5,6 +5,10 @@ noise model as the residuals ask for (`with_noise_model`). The result, `Uncertai
 advice: what the tests of the residuals say, whether a nominal model with the identified poles lies inside the
 ellipses, and whether the data suspect a mode that is missing. Assumed: what `tangent` assumes, noise that an
 autoregression describes and a linear arm.
+
+A `ResponsePosterior` gives the ellipses of a response at frequencies (`at`: centre (F,), covariances (F, 2,
+2)) and a `report` (samples, noise model, probability of a missing mode); a `ResidualTest` has `passed` and
+`probability`; `Identification` has the model, residuals and warnings of a fit.
 """
 
 from __future__ import annotations
@@ -41,11 +45,13 @@ from ident.uncertainty.nominal import NominalAgreement, nominal_near
 # times as long, is for noise that is not white behind that. Chosen: every order takes one more embedding.
 NOISE_ORDERS = (8, 32)
 # Factor by which the data have to raise the odds of a missing mode before it is suspected: a Bayes factor of
-# "positive" evidence (Kass and Raftery, JASA 90(430), 1995).
+# "positive" evidence (Kass and Raftery, JASA 90(430), 1995), the least that is called any.
 POSITIVE_EVIDENCE = 3.0
-# Level of the ellipses whose size at the modes is told.
+# Level of the ellipses whose size at the modes is told, and of those that a nominal model is held against:
+# the usual one.
 SHOWN_LEVEL = 0.95
-# Lowest frequency at which ellipses are shown, as a share of the Nyquist frequency: three decades.
+# Lowest frequency at which ellipses are shown, as a share of the Nyquist frequency: three decades. Chosen:
+# below, most logs end.
 LOWEST_SHOWN_SHARE = 1e-3
 PosteriorT = TypeVar("PosteriorT")
 OptionsT = TypeVar("OptionsT", bound=EmbeddingOptions)
@@ -79,7 +85,10 @@ class Uncertainty(ResponsePosterior):
 
     @cached_property
     def warnings(self) -> tuple[Finding, ...]:
-        """What to look at before trusting the ellipses: residuals, and a nominal outside most of them."""
+        """What to look at before trusting the ellipses: residuals, and a nominal outside most of them.
+
+        Raises ValueError where the nominal model has more coefficients than the grid tells (`nominal_near`).
+        """
         nominal_doubt = self.agreement(self.nominal().frequency_response).doubt
         return distinct((*self.advice, *nominal_doubt))
 
@@ -93,12 +102,18 @@ class Uncertainty(ResponsePosterior):
         response : callable
             Frequencies (F,) in rad/s to G (F,).
         level : float
-            Probability of the ellipses.
+            Probability of the ellipses; 0.95 is the usual one.
 
         Returns
         -------
         NominalAgreement
             On `shown_grid`; its `doubt` is empty where the response lies inside most ellipses.
+
+        Raises
+        ------
+        ValueError
+            The level is not between 0 and 1, or the response has another shape or is not finite
+            (`FrequencyUncertainty`).
         """
         return NominalAgreement.of(self.at(self.shown_grid, level), response)
 
@@ -106,12 +121,16 @@ class Uncertainty(ResponsePosterior):
         """What a certificate for a nominal response over the ellipses of a level stands or falls with.
 
         `response` : frequencies (F,) in rad/s to G (F,). Doubts about the ellipses, then about the nominal.
+        Raises ValueError as `agreement`.
         """
         return [*conditions_of(self.advice), *self.agreement(response, level).doubt]
 
     @property
     def shown_grid(self) -> RealArray:
-        """Frequencies (F,), rad/s, over three decades up to the Nyquist frequency."""
+        """Frequencies (F,), rad/s, evenly in logarithm, over three decades up to the Nyquist frequency.
+
+        F is `FREQUENCIES`, the size of every grid of this package's own.
+        """
         nyquist = np.pi / self.dt_s
         return np.geomspace(LOWEST_SHOWN_SHARE * nyquist, nyquist, FREQUENCIES)
 
@@ -129,13 +148,18 @@ class Uncertainty(ResponsePosterior):
         return in_favour >= needed > 0
 
     def nominal(self) -> GobfModel:
-        """Model on the identified poles that is nearest to the centre, in units of the ellipses."""
+        """Model on the identified poles that is nearest to the centre, in units of the ellipses.
+
+        Raises ValueError where `shown_grid` has too few frequencies for so many coefficients
+        (`nominal_near`).
+        """
         return nominal_near(self, self.nominal_poles, self.shown_grid)
 
     def at_modes(self) -> list[tuple[float, float]]:
         """Frequency, rad/s, of every mode, and the major semi-axis of its 95 % ellipse over the gain there.
 
-        Modes up to the Nyquist frequency, from low to high; empty without modes.
+        Modes below the Nyquist frequency, from low to high; empty without modes. The gain is not zero there:
+        `uncertainty` has refused a response that may be.
         """
         omega = np.unique(self.nominal_poles.omega_rad_s(self.dt_s))
         if not omega.size:
@@ -162,7 +186,8 @@ def with_noise_model(
     white : bool
         The residuals of the identification are white: no noise model is needed.
     found_with : callable
-        Settings to a posterior and the tests of its residuals: of whiteness first.
+        Settings to a posterior and the tests of its residuals: of whiteness first, then of independence. What
+        it raises goes up.
 
     Returns
     -------
@@ -218,12 +243,15 @@ def uncertainty(
     Raises
     ------
     ValueError
-        As `tangent`, and where the output does not answer to the input: a response of zero lies inside all
-        ellipses.
+        Records are too short, of another sampling time, or do not excite the poles (`tangent`); or the output
+        does not answer to the input: a response of zero lies inside all ellipses.
     """
 
     def posterior_with(step_options: EmbeddingOptions) -> tuple[ResponsePosterior, Tests]:
-        """Posterior behind this noise model, and the tests of its residuals."""
+        """Posterior behind this noise model, and the tests of its residuals.
+
+        Raises ValueError where the records are too short for either.
+        """
         posterior = tangent(records, identification.model, step_options)
         return posterior, residual_tests(posterior, records)
 

@@ -11,7 +11,7 @@ Assumed: the noise is white in time. Its covariance between outputs is estimated
 Types of other files that travel here: `OutputRegressions`, a regression for each output (`each`) of the same
 inputs u (U, N), with `y` (N,), `segments` (rows of each record) and numbers of all outputs together;
 `PoleSearch`, a search on them with its fixed poles, bounds and trace; `Refined`, the end of a descent (poles,
-residual sum of squares rss).
+residual sum of squares rss). A `Record` has finite samples, at least one, or it could not be made.
 """
 
 from __future__ import annotations
@@ -49,8 +49,9 @@ from ident.uncertainty.embedding import NOISE_ROUNDS
 # Rounds of search and noise covariance end when no entry of the covariance of whitened residuals is off the
 # unit matrix by more: weights that are wrong by w make estimates worse by about w^2, here 0.3 %.
 LARGEST_WHITENING_ERROR = 0.05
-# Probability with which modes that have one shape are refused by noise. Halved or doubled, no test of several
-# outputs moves: a wrong shape is refused with a probability far below it.
+# Probability with which modes that have one shape are refused by noise. Chosen: one in a thousand, small as
+# each of several modes is asked. Halved or doubled, no test of several outputs moves: a wrong shape is
+# refused with a probability far below it.
 SHAPE_REFUSAL_LEVEL = 1e-3
 # A residual worth a smaller share of its samples as independent ones is called coloured. The share of white
 # noise is 1 but for chance; at 0.95 and at 0.4 the tests of several outputs do not move.
@@ -60,7 +61,8 @@ WHITE_SHARE = 0.8
 SMALLEST_DISTINCT_POWER = 1e-12
 # Where the bar of progress stands when the rounds of search are over; the shapes of the modes follow.
 ROUNDS_END = 0.9
-# Begin and length of every round, as shares of all of them: the first has no poles to start from.
+# Begin and length of every round, as shares of all of them: the first has no poles to start from, and takes
+# longer. Chosen; one entry for each of `NOISE_ROUNDS`.
 ROUND_SPANS = ((0.0, 0.7), (0.7, 0.15), (0.85, 0.15))
 
 
@@ -113,7 +115,7 @@ def identify_mimo(
     ------
     ValueError
         In one line: an output that stands still or is another one again, inputs that differ between records
-        or are one signal, too few samples for the order, an option that is not available.
+        or are one signal, too few samples for the order, an option that is not available, no record.
 
     Notes
     -----
@@ -161,7 +163,8 @@ def _refuse_outputs(records: Sequence[Record], options: IdentOptions) -> None:
     """Raise ValueError for an output that `refuse_unusable` refuses, or for outputs that are dependent.
 
     Dependent are outputs of which a combination is zero but for rounding: the same sensor twice, or a column
-    that was computed from others.
+    that was computed from others. Also raised below: no record, other names of inputs, another sampling time
+    (`prepare_outputs`).
     """
     data = prepare_outputs(records, options.structure())
     for index, regression in enumerate(data.each):
@@ -184,6 +187,7 @@ def _searched(
 
     `start` : poles to begin with; None: a global search. Where a part was searched, the poles are polished on
     all records. Whether initial states are estimated is left to a likelihood ratio if the options say "auto".
+    Records were refused before (`_refuse_outputs`); raises ValueError where bounds leave no box to search in.
     """
     part, in_mid_record = thinned(records, options.search_samples)
     structure = options.structure()
@@ -230,7 +234,8 @@ def _initial_state_test(
     """Likelihood ratio of a fit whose records begin in motion to one whose records begin at rest.
 
     The statistic is Ne ln(J at rest / J in motion), with Ne the independent samples that the residual of the
-    larger fit is worth; its degrees of freedom are the free responses that the larger fit has more.
+    larger fit is worth; its degrees of freedom are the free responses that the larger fit has more. Not
+    checked: that both ends have as many poles, and that the data of both are the same rows.
     """
     order = end_at_rest.poles.order
     columns = in_motion.data.n_parameters(order) - at_rest.data.n_parameters(order)
@@ -252,7 +257,8 @@ def _identification(
 
     `whitening` W (Y, Y) : takes outputs in their units to those of the fit. Modes get one shape each where
     `free_shapes` is False and the records do not refuse it. Model, residuals and noise covariance are in the
-    outputs' units; rss and noise_std are those of the whitened outputs.
+    outputs' units; rss and noise_std are those of the whitened outputs. `whitening` is invertible and there
+    are more samples than unknowns: `identify_mimo` has seen to both.
     """
     search = fitted.search
     data = search.data
@@ -270,12 +276,17 @@ def _identification(
     effective_share = search.colour(fitted.end).effective_samples / data.n_samples
 
     def chance_of(shaped_rss: float, saved_numbers: int) -> float:
-        """Probability that noise alone makes free residues fit so much better."""
+        """Probability that noise alone makes free residues fit so much better than shapes that leave
+        `shaped_rss`.
+
+        `saved_numbers` : free numbers that the shapes save, at least one: of none it is nan.
+        """
         loss = max(shaped_rss - free_rss, 0.0)
         return float(chi2.sf(loss / noise_power * effective_share, saved_numbers))
 
     def refused(shaped_rss: float, saved_numbers: int) -> bool:
-        """Whether noise alone hardly makes free residues fit so much better."""
+        """Whether noise alone hardly makes free residues fit so much better than shapes, as in
+        `chance_of`."""
         return chance_of(shaped_rss, saved_numbers) < SHAPE_REFUSAL_LEVEL
 
     shaped = None
@@ -355,7 +366,7 @@ def _advice(
     """Findings to look at before trusting the model; `residual` (Y, N) is that of the whitened outputs.
 
     Doubtful poles, outputs that do not answer to the inputs, few samples, inputs that move together, and a
-    residual that is not white.
+    residual that is not white. Empty where there is no doubt; nothing is raised.
     """
     data = search.data
     findings = pole_warnings(model.outputs[0], search.fixed, search.bounds)

@@ -6,6 +6,9 @@ several sensors). Each order is grown from the one below, so that a pair on a pe
 Hence a pair has to be needed: without it Ne ln(J0/J1) exceeds 4 ln Ne, the criterion of the order selection,
 with J1 and J0 the sums of squares with and without it and Ne the number of independent samples.
 `stabilisation` makes the fits and compares them; `Stabilisation.columns` are the modes that stayed.
+
+`Regression`, of another file, holds records made ready for a fit (outputs y (N,)); `Refined` is the end of a
+descent: its poles, fixed ones first of each type, and their residual sum of squares rss.
 """
 
 from __future__ import annotations
@@ -31,18 +34,24 @@ from ident.search.pole_search import PoleSearch
 FREQUENCY_TOLERANCE = 0.01
 # Relative difference in damping up to which a pair has stayed (Peeters and De Roeck, see above).
 DAMPING_TOLERANCE = 0.05
-# Pairs beyond the model's that are tried: a mode that is stable in two fits beyond it shows in these.
+# Pairs beyond the model's that are tried: a mode that is stable needs a fit that has it first and two that
+# keep it, so it shows in these.
 _BEYOND_CHOSEN = 3
 # More samples than this say no more about which modes stay, and a dozen fits of order 20 take their time.
+# Chosen.
 _MOST_SAMPLES = 10_000
 # Pairs that are tried at most, as many as `IdentOptions.n_pairs` takes.
 _MOST_PAIRS = 12
-# Factor on ln Ne that the gain of a needed pair exceeds, as in `search.order_selection`.
+# Factor on ln Ne that the gain of a needed pair exceeds: one for each of its free numbers, two of the pole
+# and two coefficients, as in the criterion of `ident.search.order_selection`.
 _NEEDED = 4
 
 
 class StableMode(NamedTuple):
-    """A column of the plot: mean frequency and damping over the fits in which it is stable and needed."""
+    """A column of the plot: mean frequency and damping over the fits in which it is stable and needed.
+
+    omega_rad_s : natural frequency, rad/s; zeta : damping ratio, no unit.
+    """
 
     omega_rad_s: float
     zeta: float
@@ -88,6 +97,8 @@ class Stabilisation:
     needed: BoolArray
 
     def __post_init__(self) -> None:
+        """Lock the arrays; raise ValueError where they do not have one entry per pair; values are not
+        checked."""
         lock(self, "rss", "omega_rad_s", "zeta")
         lock(self, "n_pairs", "previous", dtype=np.int64)
         lock(self, "same_damping", "needed", dtype=np.bool_)
@@ -102,7 +113,7 @@ class Stabilisation:
         return np.asarray(has_counterpart & self.same_damping)
 
     def columns(self) -> tuple[StableMode, ...]:
-        """Modes that are stable and needed in at least two fits, by frequency."""
+        """Modes that are stable and needed in at least two fits, by frequency; empty without any."""
         # Pairs that are each other's counterparts are a chain, named by its first pair. Fits ascend, so that
         # a counterpart has been given its chain already.
         chain = np.arange(self.n_pairs.size)
@@ -138,14 +149,22 @@ def stabilisation(
         Of these records and options: its noise model, structure and number of real poles hold for every fit,
         its poles are a start for the fit with as many pairs.
     options : IdentOptions, optional
+        Those of the identification: bounds, evaluations and samples of a search; default: the usual ones.
     max_pairs : int, optional
-        Default three more than were chosen, at most twelve; the data may end it earlier.
+        Below zero there are no fits. Default three more than were chosen, at most twelve; the data may end it
+        earlier.
     progress : callable, optional
         Told the share that is done, 0 to 1, and what is being done.
 
     Returns
     -------
     Stabilisation
+
+    Raises
+    ------
+    ValueError
+        No record, another sampling time, several columns, or no rows behind noise model and delay
+        (`prepare`). Too few samples for a fit end the list of fits, without an error.
     """
     options = options or IdentOptions()
     records = [prewhitened(record, found.noise) for record in records]
@@ -168,6 +187,7 @@ def stabilisation(
         if progress is not None:
             progress(count / (max_pairs + 1), f"{count} pole pairs")
         n_poles = search.fixed.order + n_real + 2 * count
+        # Two samples for each free number, as the order selection asks for another pair.
         if not data.n_samples > 2 * data.n_parameters(n_poles):
             break
         if fits and fits[-1].rss <= explained:
@@ -186,8 +206,9 @@ def _compared(
 ) -> Stabilisation:
     """The pairs of all fits with their counterparts, and whether each is needed.
 
-    fits: with 0, 1, 2 ... pairs beside the first fixed_pairs, which are known and not drawn. n_real, chosen:
-    as in `Stabilisation`.
+    fits: with 0, 1, 2 ... pairs beside the first fixed_pairs, which are known and not drawn; without fits all
+    arrays are empty. n_real, chosen: numbers of searched real poles, and of pairs of the model; copied.
+    Nothing is checked.
     """
     # A sum of squares below what counts as explained is rounding, and so would be a ratio of two.
     smallest = float(np.finfo(np.float64).tiny)
@@ -246,7 +267,8 @@ def _compared(
 def _counterparts(omega: RealArray, before: RealArray) -> IntArray:
     """Index of the counterpart of each frequency among those before, nearest first, each used once.
 
-    omega (K,), before (L,), rad/s; (K,), -1 where none within `FREQUENCY_TOLERANCE` is left.
+    omega (K,), before (L,), rad/s, above zero; (K,), -1 where none within `FREQUENCY_TOLERANCE` is left, or
+    where there are none before.
     """
     match = np.full(omega.size, -1)
     if before.size == 0:

@@ -43,7 +43,7 @@ from ident.search.pole_search import PoleSearch
 # With two modes at most the tests of loops and unstable plants do not move.
 STRUCTURES = ((2, 0), (2, 1), (2, 2), (2, 3), (2, 4))
 # Rounds in which zeros take the place of poles: a limit of work, the best one counts. Five are enough for the
-# tests.
+# tests; chosen as twice that.
 MOST_ROUNDS = 10
 # A pole is unstable if it lies so many standard deviations outside the circle: a stable one on the circle is
 # taken for unstable once in three million logs. With 2.5 or 10 no test of unstable plants moves.
@@ -51,12 +51,13 @@ LEAST_DEVIATIONS = 5.0
 # A pole is unstable if its growth takes at most the longest record over this number as its time constant:
 # slower growth looks like an integrator and drift. Halved or doubled, no test of unstable plants moves.
 LEAST_TIME_CONSTANTS = 1.0
-# Largest modulus of a pole of the basis: a time constant of ten million samples.
+# Largest modulus of a pole of the basis: a time constant of ten million samples, longer than any record.
 LARGEST_MODULUS = 1 - 1e-7
 # Step of the differences at a zero, as a share of its distance from the circle: poles of the basis are at
 # least that far away, so the slopes are right to 1e-4.
 DIFFERENCE_SHARE = 0.01
-# Singular values of the regression below this share of the largest are rounding, and get no variance.
+# Singular values of the regression below this share of the largest are rounding (1e-16 and a margin of four
+# digits), and get no variance.
 SMALLEST_SEEN = 1e-12
 
 
@@ -105,6 +106,12 @@ def quick_poles(records: Sequence[Record], options: IdentOptions | None = None) 
     Poles
         Zeros of 1 - M of the predictor, polished on the response from input to output; those are taken out
         again that the criterion of the order does not mind.
+
+    Raises
+    ------
+    ValueError
+        A record has several inputs or outputs, or there is none, or sampling times differ (`prepare_inputs`).
+        That signals move is not checked.
     """
     options = options or IdentOptions()
     part, _ = thinned(records, options.search_samples)
@@ -119,11 +126,15 @@ def quick_poles(records: Sequence[Record], options: IdentOptions | None = None) 
 
 
 def _predictor_poles(data: Regression) -> Poles:
-    """Poles of the predictor's basis, in the structure that the criterion of the order chooses."""
+    """Poles of the predictor's basis, in the structure that the criterion of the order chooses.
+
+    `data` : the predictor's records. Too few samples are not refused: N ln J then rewards the largest
+    structure.
+    """
     log_samples = float(np.log(data.n_samples))
 
     def criterion(end: Refined) -> float:
-        """N ln J + (free numbers) ln N: lower is better."""
+        """N ln J + (free numbers) ln N: lower is better; minus infinity where nothing is left (J = 0)."""
         numbers = data.n_parameters(end.poles.order)
         return float(data.n_samples * np.log(end.rss) + numbers * log_samples)
 
@@ -135,7 +146,8 @@ def _predictor_poles(data: Regression) -> Poles:
 def _with_output(record: Record, delay_samples: int) -> Record:
     """Record whose inputs are its output and its delayed input (T, 2): what the predictor is made of.
 
-    `delay_samples` : of the input; -1: the next input, whose last value is repeated.
+    `delay_samples` : of the input; -1: the next input, whose last value is repeated. Raises ValueError where
+    the record has several inputs or outputs.
     """
     record.refuse_several()
     output = record.output[:, 0]
@@ -149,7 +161,10 @@ def _with_output(record: Record, delay_samples: int) -> Record:
 
 
 def _prepared(records: Sequence[Record]) -> Regression:
-    """Regression of the predictor: records may begin in motion and at any offset."""
+    """Regression of the predictor: records may begin in motion and at any offset.
+
+    Raises ValueError without records, or where sampling times differ (`prepare_inputs`).
+    """
     return prepare_inputs(records, Structure(estimate_offset=True, estimate_initial_state=True))
 
 
@@ -167,7 +182,11 @@ class _Predictor(NamedTuple):
 
 
 def _predictor(data: Regression, poles: Poles) -> _Predictor:
-    """Best predictor on the basis of these poles, by linear least squares."""
+    """Best predictor on the basis of these poles, by linear least squares.
+
+    `data` : with the output's past and the input as its two inputs (not checked); B poles, one at least. What
+    the data do not show gets coefficients of zero.
+    """
     fitted = project(data, poles)
     of_output, of_input = fitted.coefficients(data.y)[: 2 * poles.order].reshape(2, -1)
     denominator = GobfModel(poles, -of_output, data.dt_s, 1.0)
@@ -177,16 +196,17 @@ def _predictor(data: Regression, poles: Poles) -> _Predictor:
 def _mirrored_often(data: Regression, n_real: int, n_pairs: int) -> Poles:
     """Poles of the best of `MOST_ROUNDS` rounds, in each of which zeros of 1 - M take the poles' place.
 
-    The start is spread evenly, in logarithm, over decays and frequencies that records of this length show.
+    The start is spread evenly, in logarithm, over decays and frequencies that records of this length show; it
+    is chosen, the rounds move it. Length and number of samples are not checked.
     """
-    # From half the longest record to three samples as time constants.
+    # From half the longest record to three samples (1 / 0.3) as time constants.
     slowest_per_s = 2 / (data.longest * data.dt_s)
     fastest_per_s = 0.3 / data.dt_s
     poles = Poles.from_continuous(
         decay_per_s=np.geomspace(slowest_per_s, fastest_per_s, n_real + 2)[1:-1],
-        # A mode has to turn round in the record.
+        # A mode has to turn round in the record: 8 radians or more.
         omega_rad_s=np.geomspace(4 * slowest_per_s, fastest_per_s, n_pairs + 2)[1:-1],
-        # Wide enough to see modes beside it.
+        # Wide enough to see modes beside it; chosen.
         zeta=[0.3] * n_pairs,
         dt_s=data.dt_s,
     )
@@ -204,14 +224,22 @@ def _mirrored_often(data: Regression, n_real: int, n_pairs: int) -> Poles:
 
 
 def _inside(zeros: ComplexArray) -> Poles:
-    """Zeros as poles of a basis: those outside the circle mirrored into it, those on it moved just inside."""
+    """Zeros (n,) as poles of a basis: those outside the circle mirrored into it, those on it moved just
+    inside.
+
+    Only the real ones and the upper one of each pair are taken; a zero at infinity or nan is not one
+    (`denominator.zeros` leaves it out).
+    """
     modulus = np.maximum(np.abs(zeros), np.finfo(np.float64).tiny)
     mirrored = np.minimum(np.minimum(modulus, 1 / modulus), LARGEST_MODULUS)
     return _poles(zeros / modulus * mirrored)
 
 
 def _poles(values: ComplexArray) -> Poles:
-    """Poles of which `values` has the real ones, and of each pair at least the upper one."""
+    """Poles of which `values` (n,) has the real ones, and of each pair at least the upper one.
+
+    Raises ValueError (`Poles`) where one is not inside the circle; lower ones and nan are left out.
+    """
     is_real = values.imag == 0
     is_upper = values.imag > 0
     return Poles(values[is_real].real, values[is_upper])
@@ -223,7 +251,8 @@ def _significant(data: Regression, poles: Poles) -> Poles:
     To first order a zero p moves by -d(1 - M)(p) / (1 - M)'(p). The errors dM and dN are those of a fit whose
     poles are free, too: of a basis with every pole twice, whose span has all their first-order changes. A
     zero that N shares, be it by chance, is no pole: the residue N / (1 - M)' of G has to differ from zero
-    beyond doubt, too.
+    beyond doubt, too. `poles` : of the predictor, B of them. Empty where the samples are too few for the
+    coefficients; nothing is raised.
     """
     predictor = _predictor(data, poles)
     zeros = predictor.denominator.zeros()
