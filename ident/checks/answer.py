@@ -4,6 +4,8 @@
 the order asks of any pole, beside nuisances that need no input. `refuse_unanswered` asks the ellipses: where
 a response of zero lies inside all of them, no number of the model means anything. That also sees an output
 that wanders by itself (drift, hum), which a fit takes for slow poles.
+
+`Regression`, of another file, holds records made ready for a fit; N samples of all records.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression, project
 
 # Level of the ellipses within which a response of zero counts as possible. An output that does not answer
-# passes where chance puts zero outside: once in a thousand at each independent frequency.
+# passes where chance puts zero outside: once in a thousand at each independent frequency. Chosen.
 ZERO_LEVEL = 0.999
 
 
@@ -40,7 +42,8 @@ def explains_nothing(data: Regression, poles: Poles, fixed: Poles, residual: Rea
     Returns
     -------
     list of Finding
-        With the share of the motion (RMS) that is explained, per cent.
+        With the share of the motion (RMS) that is explained, per cent. Empty also for an output that stands
+        still. A residual of another length is not refused.
 
     Notes
     -----
@@ -81,7 +84,8 @@ def refuse_unanswered(
     Raises
     ------
     ValueError
-        A response of zero lies inside the ellipses at all frequencies, at 99.9 %.
+        A response of zero lies inside the ellipses at all frequencies, at 99.9 %; below
+        (`ResponsePosterior.at`): frequencies that do not increase, or lie above Nyquist.
 
     Notes
     -----
@@ -95,6 +99,7 @@ def refuse_unanswered(
     squared = distance**2 * chi2.ppf(ellipses.level, 2)
     n_frequencies = 1.0
     if doubts:
+        # Two rows, one frequency, where nobody said how many there are.
         n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
         n_frequencies = n_rows / 2
     limit = chi2.isf((1 - ZERO_LEVEL) / n_frequencies, 2)

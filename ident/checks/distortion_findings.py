@@ -6,6 +6,11 @@ amplitudes show whether the response depends on the amplitude (`ident.data.repea
 coherence bounds noise and distortion together. This file turns these numbers into findings: which verdict,
 over which band, in per cent of the response. `distortion_findings` asks all three sources,
 `amplitude_effects` the repeats alone. Records have one input and one output.
+
+Types of other files: `Distortion`, periodic records of one amplitude, with levels at their excited, odd and
+even lines (`LineLevels`); `BandLevel`, the distortion of a band as a share of the response, 0 .. 1, with its
+interval; `Repeats`, experiments that were repeated, at one or several amplitudes; `AmplitudeBand`, what
+differs between amplitudes in a band. They were made from records and are not checked again.
 """
 
 from __future__ import annotations
@@ -41,7 +46,8 @@ TREND_RATIO = 1.25
 # explains so much of what differs between amplitudes. Chosen; doubled, a resonance that falls by 1 % is no
 # longer named in its test, halved nothing moves.
 LEAST_EXPLAINED = 0.3
-# Coherence that stands for zero: keeps 1 / coherence finite at lines without any answer.
+# Coherence that stands for zero: keeps 1 / coherence finite at lines without any answer. Any number far below
+# one serves.
 LEAST_COHERENCE = 1e-12
 
 
@@ -65,6 +71,12 @@ def distortion_findings(
         In this order: for each amplitude the findings of `_amplitude_verdict`; for each repeated experiment
         those of `_repeat_findings`; one NOT_PERIODIC where records are neither periodic nor repeats; one
         CLIPPED for each clipped output where there are periodic records. Empty without records.
+
+    Raises
+    ------
+    ValueError
+        A record that is neither periodic nor a repeat has several inputs or outputs, or is too short for a
+        spectrum (`coherence`).
     """
     unit = ""
     if records and records[0].input_units:
@@ -118,7 +130,8 @@ def _coherent_band(records: Sequence[Record]) -> Finding:
     """Finding NOT_PERIODIC with the band, Hz, in which noise and distortion together are small.
 
     Small: below `MOST_HIDDEN` of the response, by the coherence of each record. The band reaches from the
-    lowest to the highest such frequency; 0 to 0 Hz where there is none.
+    lowest to the highest such frequency; 0 to 0 Hz where there is none. Raises ValueError without records,
+    and where one is too short or has several inputs or outputs (`coherence`).
     """
     omegas: list[RealArray] = []
     coherences: list[RealArray] = []
@@ -149,7 +162,8 @@ def _repeat_findings(repeats: Repeats) -> list[Finding]:
 
     REPEATED always; then AMPLITUDE_EFFECT where the responses of the smallest and the largest amplitude
     differ beyond chance, or AMPLITUDE_HIDDEN where two amplitudes or more show no such difference.
-    Frequencies in Hz, sizes in per cent of the response (RMS over a band).
+    Frequencies in Hz, sizes in per cent of the response (RMS over a band). `repeats` : one amplitude and two
+    records of it at least, as `repeats_of` makes them.
     """
     scatter_percent = [100 * repeats.scatter(index) for index in range(len(repeats.rms))]
     about: dict[str, Value] = {
@@ -186,14 +200,17 @@ def _explanations(effects: Sequence[AmplitudeBand]) -> dict[str, Value]:
     """Size and band of two simple explanations of an amplitude effect, a shift of resonances and a gain.
 
     Keys shift_percent, shift_from_Hz, shift_to_Hz and the same three of gain, each of the band where the
-    explanation counts most (share explained times difference over chance); zeros where it explains less than
-    `LEAST_EXPLAINED` of every band.
+    explanation counts most (share explained times difference over chance); zeros where it explains no more
+    than `LEAST_EXPLAINED` of every band, and without bands. A chance of zero divides by zero: scatter has
+    none.
     """
 
     def shift_share(band: AmplitudeBand) -> float:
+        """Share, 0 .. 1, of the difference's power that a shift of resonances explains."""
         return band.shift_share
 
     def gain_share(band: AmplitudeBand) -> float:
+        """Share, 0 .. 1, of the difference's power that one change of gain and phase explains."""
         return band.level_share
 
     explained: dict[str, Value] = {}
@@ -223,7 +240,7 @@ def _amplitude_verdict(
     NOISE_HIDES where every band is lost in noise, DISTORTED where a band has significant distortion above
     `LEAST_DISTORTION`, else LINEAR with the largest distortion that the records leave possible; none without
     noise level. Levels in per cent of the response, band in Hz; rms of the input in `unit`. `all_amplitudes`:
-    of the same experiment, ascending, for the trend.
+    of the same experiment, ascending, for the trend; `distortion` is one of them (not checked).
     """
     findings: list[Finding] = []
     about: dict[str, Value] = {"rms": distortion.rms, "unit": unit}
@@ -272,7 +289,7 @@ def _amplitude_verdict(
 def _levels_in_bands(lines: LineLevels | None, bands_rad_s: Sequence[tuple[float, float]]) -> list[BandLevel]:
     """Distortion levels of lines in each band (low, high) in rad/s; bands without a line are left out.
 
-    Empty where there are no lines at all (None).
+    Empty where there are no lines at all (None). A band with its ends exchanged has no line.
     """
     if lines is None:
         return []
@@ -285,7 +302,7 @@ def _parity(distortion: Distortion, distorted: Sequence[BandLevel]) -> str:
 
     Told by the lines without excitation: where only odd lines are excited, odd distortion (a cube, dry
     friction) stands at odd lines, even distortion (a square) at even ones. "unknown" without detection lines
-    of both parities.
+    of both parities; "both" where none of them lies in the bands.
     """
     if distortion.odd is None or distortion.even is None:
         return "unknown"
@@ -306,7 +323,8 @@ def _trend(
 
     Median over the distorted bands of the ratio between this amplitude and the one farthest from it: the
     largest, or the smallest for the largest itself. "unknown" with one amplitude, or where the other one
-    shows no distortion in any of these bands.
+    shows no distortion in any of these bands. `all_amplitudes` : ascending, not empty; `distorted` : bands of
+    `distortion` with a level above zero, else it divides by zero.
     """
     other = all_amplitudes[-1]
     if distortion is other:

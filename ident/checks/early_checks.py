@@ -8,6 +8,11 @@ is certain. What may be meant is a doubt (`early_doubts`), and the identificatio
 
 Whether an output answers to its input is asked by three tests without a model, of coherence, prediction and
 correlation, each with its reference at its function.
+
+A `Record` has an input (T, U), an output (T, Y), where it was logged a reference (T, R), finite samples of no
+more than 1e100, T at least 1, names of its columns and a sampling time dt_s: it could not be made otherwise.
+Checks of one channel look at the first input and the first output only. An empty list of records is refused
+nowhere here: each check fails on it, or has nothing to say.
 """
 
 from __future__ import annotations
@@ -30,7 +35,7 @@ from ident.data.wrapping import spikes_in, wraps_at
 FEWEST_SAMPLES = 2 * WHITE_LAGS
 
 # Relative to its motion: a column that differs by no more from a multiple of another one is its copy. Text
-# logs have six digits or more; the best servo follows its reference a hundred times worse.
+# logs have six digits or more; the best servo follows its reference a hundred times worse, say 1e-4.
 _COPY_ERROR = 1e-6
 
 # Readings of an output that takes fewer different values are doubted: so few steps of a sensor hide what a
@@ -38,8 +43,8 @@ _COPY_ERROR = 1e-6
 # design.
 _FEW_READINGS = 10
 
-# Share of samples: a command of a loop that stands at its ends more often than not follows no linear law
-# there.
+# Share of samples (half): a command of a loop that stands at its ends more often than not follows no linear
+# law there.
 _MOSTLY = 0.5
 
 # Frequencies, as the participation ratio of the command's spectrum, that tell a machine from its loop. A Hann
@@ -48,40 +53,45 @@ _MOSTLY = 0.5
 FEWEST_LINES = 6.0
 
 # Probability that two signals which have nothing in common pass for a cause and its answer, in each of the
-# tests that `_answers` makes. Errors on that side cost time only: the identification finds that nothing is
-# explained.
+# tests that `_answers` makes. Chosen: errors on that side cost time only, as the identification finds that
+# nothing is explained.
 _BY_CHANCE = 1e-3
-# Its standard normal deviate, for the chi-square limit.
+# Its standard normal deviate, one-sided, for the chi-square limit: without SciPy there is no function for it.
 _BY_CHANCE_DEVIATE = 3.09
 
-# Parts into which the coherence test cuts a record: few for slow answers, many for weak ones.
+# Parts into which the coherence test cuts a record: few for slow answers, many for weak ones. Chosen, by
+# factors of four.
 _PARTS = (8, 32, 128)
 # Samples of a part at least: shorter ones have too few lines. A record that has no room for the fewest parts
-# is not tested.
+# is not tested. Chosen.
 _SHORTEST_PART = 32
-# Share of the largest power of the cause: lines with less hold rounding only.
+# Share of the largest power of the cause: lines with less (-90 dB) hold rounding only, of a log of five
+# digits or so. Chosen.
 _NO_POWER = 1e-9
 
 # Samples over which the prediction test averages: from one up to a sixty-fourth of the sampling rate, for
 # machines that are far slower than their log.
 _AVERAGED = (1, 4, 16, 64)
-# Earlier values of the output in a prediction: ten pairs of poles for what it does by itself.
+# Earlier values of the output in a prediction: ten pairs of poles for what it does by itself. Chosen.
 _OWN_PAST = 20
 # Values of the cause in a prediction: as many as show its action over a few samples; later ones are seen at
-# coarser averages.
+# coarser averages, each four times as long. Chosen.
 _PAST_OF_CAUSE = 10
 # Moves of a cause (participation ratio): of fewer, ten lags have no variance that their own squares tell.
+# Chosen: two for each lag.
 _FEWEST_EVENTS = 20.0
 # Share of the largest eigenvalue of their covariance: lags of a slow cause with less variance of their own
-# are one and the same.
+# are one and the same: the root of it, 1e-4, is what a log of four digits tells of their difference. Chosen.
 _SAME_LAGS = 1e-8
 # Samples of each average that the prediction test uses at most: 20 000 rows of 31 columns cost 20 ms.
 _MOST_AVERAGES = 20_000
-# Share of an output's samples by which an answer may come late: what overlaps less tells nothing.
+# Share of an output's samples by which an answer may come late: what overlaps less, a quarter, tells nothing.
+# Chosen.
 _LATEST = 0.75
 # Samples that the correlation test uses at most, to end in a fraction of a second.
 _MOST_CORRELATED = 200_000
-# Share of the output's power: what is predicted better is rounding, of which no test holds.
+# Share of the output's power: what is predicted better (1e-9 of its size) is rounding, of which no test
+# holds.
 _EXACT = 1e-18
 
 
@@ -94,7 +104,7 @@ class EarlyCheck:
     name : str
         What it asks for, as in "the output moves".
     complaint : callable
-        Of the records of one channel: one line, or "" where there is nothing to complain of.
+        Of the records of one channel, one at least: one line, or "" where there is nothing to complain of.
     """
 
     name: str
@@ -107,7 +117,7 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
     Parameters
     ----------
     records : sequence of Record
-        Of one channel, to identify from: one input and one output each.
+        Of one channel, to identify from: one input and one output each, which is not checked.
     checks : sequence of EarlyCheck
         In the order in which they speak: `early_checks`.
 
@@ -126,7 +136,7 @@ def early_doubts(records: Sequence[Record]) -> list[Finding]:
     """Findings SATURATED, then FEW_READINGS, on records that can be used but hardly are what was meant.
 
     A command of a loop that mostly stands at its ends, an output of few readings; one input and one output
-    each.
+    each (not checked). Empty where nothing is doubted.
     """
     return [*saturated(records), *few_readings(records)]
 
@@ -134,7 +144,8 @@ def early_doubts(records: Sequence[Record]) -> list[Finding]:
 def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
     """The complaint that no record has more than `FEWEST_SAMPLES` rows, or "".
 
-    order: of the model, where it is stated; it stands in the complaint and decides nothing.
+    order: of the model, where it is stated (else 0); it stands in the complaint and decides nothing.
+    ValueError of `max` without records.
     """
     longest = max(records, key=lambda record: record.n_samples)
     if longest.n_samples > FEWEST_SAMPLES:
@@ -149,7 +160,7 @@ def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
 
 
 def still_input(records: Sequence[Record]) -> str:
-    """The complaint about the first record none of whose inputs moves, or ""."""
+    """The complaint about the first record none of whose inputs moves, or ""; any number of columns."""
     for record in records:
         if not np.ptp(record.input, axis=0).any():
             return _constant(record, "input", record.input_names[0], float(record.input[0, 0]))
@@ -157,7 +168,7 @@ def still_input(records: Sequence[Record]) -> str:
 
 
 def still_output(records: Sequence[Record]) -> str:
-    """The complaint about the first record one of whose outputs is constant, or ""."""
+    """The complaint about the first record one of whose outputs is constant, or ""; any number of columns."""
     for record in records:
         for index, name in enumerate(record.output_names):
             if not np.ptp(record.output[:, index]) > 0:
@@ -166,8 +177,10 @@ def still_output(records: Sequence[Record]) -> str:
 
 
 def _constant(record: Record, role: str, name: str, value: float) -> str:
-    """The complaint that a column stands at a value; role: "input" or "output", also the name of the
-    option."""
+    """The complaint that a column `name` stands at a value, in its units.
+
+    role: "input" or "output", also the name of the option; that the column stands still is not checked.
+    """
     return (
         f"{record.label}: {role} column '{name}' is constant ({value:.6g}); expected a signal that moves: "
         f"leave this log out, or name another column with --{role} NAME ({role})"
@@ -177,7 +190,8 @@ def _constant(record: Record, role: str, name: str, value: float) -> str:
 def late_command(records: Sequence[Record]) -> str:
     """The complaint that in every record the input first moves when hardly a sample is left, or "".
 
-    Hardly: `FEWEST_SAMPLES` or fewer from the first row whose input differs from that of row 0.
+    Hardly: `FEWEST_SAMPLES` or fewer from the first row whose input differs from that of row 0. An input that
+    never moves counts as moving at once: `still_input` speaks of it.
     """
     samples_left = []
     for record in records:
@@ -196,7 +210,10 @@ def late_command(records: Sequence[Record]) -> str:
 
 
 def two_readings(records: Sequence[Record]) -> str:
-    """The complaint that the output takes two values at most in all records together, or ""."""
+    """The complaint that the output takes two values at most in all records together, or "".
+
+    One value alone is complained of with that value twice, where `still_output` has not spoken before.
+    """
     values = np.unique(np.concatenate([np.unique(record.output[:, 0]) for record in records]))
     if values.size > 2:
         return ""
@@ -211,7 +228,8 @@ def two_readings(records: Sequence[Record]) -> str:
 def resting_output(records: Sequence[Record]) -> str:
     """The complaint that in every record the output leaves one reading for hardly a sample, or "".
 
-    Hardly: for `FEWEST_SAMPLES` rows or fewer, as a sensor at its end or a machine that sticks.
+    Hardly: for `FEWEST_SAMPLES` rows or fewer, as a sensor at its end or a machine that sticks. The complaint
+    is about the last record.
     """
     for record in records:
         output = record.output[:, 0]
@@ -229,7 +247,10 @@ def resting_output(records: Sequence[Record]) -> str:
 
 
 def copied_column(records: Sequence[Record]) -> str:
-    """The complaint that the output is the input or a reference again, times a number, row by row; or ""."""
+    """The complaint that the output is the input or a reference again, times a number, row by row; or "".
+
+    About the first such record; a column that stands still is nobody's copy.
+    """
     for record in records:
         output = record.output[:, 0]
         other_columns = [("input", record.input[:, 0], record.input_names[0])]
@@ -249,7 +270,10 @@ def copied_column(records: Sequence[Record]) -> str:
 
 
 def _is_copy(signal: RealArray, other: RealArray) -> bool:
-    """Whether a signal (T,) is another one (T,) times a number, beside a constant."""
+    """Whether a signal (T,) is another one (T,) times a number, beside a constant.
+
+    False where the other one stands still, or where its power is beyond the range of doubles.
+    """
     moved = signal - signal.mean()
     moved_other = other - other.mean()
     power = float(moved_other @ moved_other)
@@ -263,7 +287,8 @@ def few_lines(records: Sequence[Record]) -> str:
     """The complaint that records of a loop excite no band, or "".
 
     Their input is concentrated at few frequencies, as of a sine or a limit cycle, or their references all
-    stand still: an arm cannot be told from its loop then.
+    stand still: an arm cannot be told from its loop then. Records are cut to the shortest, of one sampling
+    time; of inputs that all stand still nothing is said here (`still_input`).
 
     Notes
     -----
@@ -298,7 +323,7 @@ def few_lines(records: Sequence[Record]) -> str:
 
 
 def _without_line(signal: RealArray) -> RealArray:
-    """A signal (T,) without its straight line of least squares."""
+    """A signal (T,) without its straight line of least squares; zeros for one sample or two."""
     line = np.linspace(-1.0, 1.0, signal.size)
     centred = signal - signal.mean()
     power = max(float(line @ line), np.finfo(np.float64).tiny)
@@ -307,7 +332,11 @@ def _without_line(signal: RealArray) -> RealArray:
 
 
 def refuse_few_lines(records: Sequence[Record]) -> None:
-    """Nothing, where the records of a loop excite a band; else raises ValueError (`few_lines`)."""
+    """Nothing, where the records of a loop excite a band; else raises ValueError with the complaint of
+    `few_lines`.
+
+    Without records IndexError.
+    """
     refuse_hopeless(records, [FEW_LINES])
 
 
@@ -319,6 +348,7 @@ def no_answer(records: Sequence[Record]) -> str:
     In open loop that is the input. In a loop noise of a sensor comes back in the input, so that only the
     reference and earlier inputs count. Nothing is said where a reference stands still, where a record is
     short, or where readings wrap or jump as those of a sensor without a value: those have words of their own.
+    Signals that stand still were complained of before. IndexError without records.
     """
     for record in records:
         command = record.input[:, 0]
@@ -350,7 +380,8 @@ def _answers(output: RealArray, cause: RealArray) -> bool:
     """Whether an output (T,) shows more of a cause (T,) than chance would.
 
     The coherence sees what lasts, as a few sines; the prediction what happens once, as a step; the
-    correlation what comes late.
+    correlation what comes late. Both move, and have `_SHORTEST_PART` rows for each of 8 parts: `no_answer`
+    has seen to it.
     """
     if _is_coherent(output, cause):
         return True
@@ -361,6 +392,9 @@ def _answers(output: RealArray, cause: RealArray) -> bool:
 
 def _correlates(output: RealArray, cause: RealArray) -> bool:
     """Whether what is new in an output (T,) is correlated with what was new in a cause (T,), at any lag >= 0.
+
+    False where nothing new is common, as of a cause that stands still. Signals of 20 samples or fewer are not
+    refused, and fail in NumPy.
 
     Notes
     -----
@@ -385,7 +419,7 @@ def _correlates(output: RealArray, cause: RealArray) -> bool:
 
 
 def _sums_of_products(later: RealArray, earlier: RealArray) -> RealArray:
-    """Sum of later[k + lag] earlier[k] of two signals (T,) at lags 0 to T - 1, (T,)."""
+    """Sum of later[k + lag] earlier[k] of two signals (T,) at lags 0 to T - 1, (T,); lengths are equal."""
     n = later.size
     # Zeros behind the signals: no product wraps around.
     spectrum = np.fft.rfft(later, 2 * n) * np.fft.rfft(earlier, 2 * n).conj()
@@ -395,7 +429,8 @@ def _sums_of_products(later: RealArray, earlier: RealArray) -> RealArray:
 def _innovations(signal: RealArray) -> RealArray:
     """What an autoregression of 20 lags does not predict of a signal (T,), (T - 20,), in its own size.
 
-    The coefficients come from the first 20 000 rows, by least squares.
+    The coefficients come from the first 20 000 rows, by least squares. Own size: the largest distance of the
+    signal from its mean is one. T is more than 20; a signal that stands still leaves zeros.
     """
     centred = _averages(signal, 1, signal.size)
     fitted = centred[: _MOST_AVERAGES + _OWN_PAST]
@@ -408,6 +443,8 @@ def _innovations(signal: RealArray) -> RealArray:
 def _is_coherent(output: RealArray, cause: RealArray) -> bool:
     """Whether two signals (T,) are more coherent at some frequency than noise would be, over parts of some
     lengths.
+
+    False for signals of fewer than 8 parts of `_SHORTEST_PART` samples, and for one that stands still.
 
     Notes
     -----
@@ -435,6 +472,7 @@ def _is_coherent(output: RealArray, cause: RealArray) -> bool:
             continue
         coherence = common[lines] / (power_answer[lines] * power_driven[lines])
         n_pieces = answer.shape[0]
+        # Carter's numbers for a Hann window and half overlap (see Notes).
         worth = 18 * n_pieces**2 / (19 * n_pieces - 1)
         largest = min(float(coherence.max()), 1.0)
         # Probability at one line, times the number of lines (Bonferroni).
@@ -446,6 +484,9 @@ def _is_coherent(output: RealArray, cause: RealArray) -> bool:
 
 def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
     """Whether an output (T,) is predicted better from its own past with a cause (T,) than without.
+
+    False where there are fewer than two rows for each coefficient; True for an output that its past predicts
+    but for rounding, of which no test holds.
 
     Notes
     -----
@@ -459,6 +500,7 @@ def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
     for averaged in _AVERAGED:
         n = min(output.size // averaged, _MOST_AVERAGES)
         n_equations = n - _OWN_PAST
+        # Two equations for each coefficient at least: of fewer a test holds nothing.
         if n_equations < 2 * (_OWN_PAST + _PAST_OF_CAUSE):
             return False
         y = _averages(output, averaged, n)
@@ -493,21 +535,30 @@ def _predicts(output: RealArray, cause: RealArray, from_lag: int) -> bool:
 
 
 def _chi_square_limit(degrees_of_freedom: int) -> float:
-    """The value that a chi-square exceeds with probability `_BY_CHANCE` (Wilson and Hilferty, PNAS 17,
-    1931)."""
+    """The value that a chi-square exceeds with probability `_BY_CHANCE` (Wilson and Hilferty, PNAS 17, 1931).
+
+    Right to a per cent; degrees of freedom of zero divide by zero.
+    """
     part = 2 / (9 * degrees_of_freedom)
     return float(degrees_of_freedom * (1 - part + _BY_CHANCE_DEVIATE * np.sqrt(part)) ** 3)
 
 
 def _events(cause: RealArray) -> float:
-    """How often a signal (T,) moves anew: the participation ratio of what its past does not predict."""
+    """How often a signal (T,) moves anew: the participation ratio of what its past does not predict.
+
+    0 for one that stands still; T is more than 20.
+    """
     power = _innovations(cause) ** 2
     sum_of_squares = max(float(power @ power), np.finfo(np.float64).tiny)
     return float(power.sum() ** 2 / sum_of_squares)
 
 
 def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
-    """The first n averages of a signal (T,) over so many samples, (n,), around zero and of unit size."""
+    """The first n averages of a signal (T,) over so many samples, (n,), around zero and of unit size.
+
+    Unit size: the largest is one; zeros for a signal that stands still. T is at least n `averaged`
+    (ValueError of NumPy).
+    """
     means = signal[: n * averaged].reshape(n, averaged).mean(axis=1)
     centred = means - means.mean()
     size = max(float(np.abs(centred).max()), np.finfo(np.float64).tiny)
@@ -515,8 +566,11 @@ def _averages(signal: RealArray, averaged: int, n: int) -> RealArray:
 
 
 def saturated(records: Sequence[Record]) -> list[Finding]:
-    """Findings SATURATED, on every record of a loop (with a reference) whose input mostly stands at its
-    ends."""
+    """Findings SATURATED, on every record of a loop (with a reference) whose input mostly stands at its ends.
+
+    Mostly: more than `_MOSTLY` of its samples, at its least or largest value; the share is told with both
+    values. Empty where there is none.
+    """
     findings = []
     for record in records:
         command = record.input[:, 0]
@@ -542,7 +596,8 @@ def saturated(records: Sequence[Record]) -> list[Finding]:
 
 
 def few_readings(records: Sequence[Record]) -> list[Finding]:
-    """Findings FEW_READINGS, on every record whose output takes fewer than ten values."""
+    """Findings FEW_READINGS, on every record whose output takes fewer than `_FEW_READINGS` values; often
+    empty."""
     findings = []
     for record in records:
         count = np.unique(record.output[:, 0]).size
@@ -558,7 +613,8 @@ def few_readings(records: Sequence[Record]) -> list[Finding]:
 def clipped(records: Sequence[Record]) -> list[Finding]:
     """Findings CLIPPED, on every input or output that stands suspiciously often at an end of its range.
 
-    Of each record the first input and the first output; `share`: of its samples (`clipped_share`).
+    Of each record the first input and the first output; `share`: of its samples (`clipped_share`). Empty
+    where none does; signals of fewer than ten levels are not judged.
     """
     findings = []
     for record in records:
@@ -589,13 +645,14 @@ def early_checks(order: int = 0, *, loop: bool = False) -> list[EarlyCheck]:
     Parameters
     ----------
     order : int
-        Of the model, where it is stated; else 0.
+        Of the model, where it is stated; else 0. Only for words.
     loop : bool
         The logs were made in a closed loop that is to be opened: their command has to excite a band.
 
     Returns
     -------
     list of EarlyCheck
+        Eight, or nine with the one of a loop.
     """
     checks = [
         EarlyCheck("more samples than a residual test needs", partial(too_few_samples, order=order)),

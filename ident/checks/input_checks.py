@@ -6,6 +6,11 @@ rank of their spectral matrix. `advice` runs after a fit and lists the doubts: f
 records do not tell (Gauss-Newton covariance), an input without power at high frequency, clipped signals,
 drift, and an operating point far from zero. Densities are Welch's (IEEE Trans. Audio Electroacoustics 15(2),
 1967). Noise is taken as stationary; each doubt becomes a `Finding`, whose sentence is written elsewhere.
+
+A `Record` has an input (T, U), an output (T, Y), finite samples and its sampling time dt_s. `Regression`
+holds records made ready for a fit: inputs u (U, N) and output y (N,) of all K records, `starts` (K + 1,) of
+each of them, samples of the `longest`. `Poles` has real poles and of each pair the upper one, fixed ones
+first of each type.
 """
 
 from __future__ import annotations
@@ -35,7 +40,8 @@ PRESENT_DENSITY = 1e-2
 # where this is reached. The response is then known to 1 / sqrt(10), about 30 %. Doubled or halved, no test of
 # the advice moves.
 TOLD_POWER_RATIO = 10.0
-# That average is taken over a band as wide as its frequency divided by this number.
+# That average is taken over a band as wide as its frequency divided by this number: in a third of a frequency
+# the response of all but a mode changes little. Chosen.
 TOLD_BAND_PARTS = 3
 # Share of the largest density (-60 dB) below which power may be leakage: the side lobes of a Hann window are
 # lower from its seventh line on. Ten times as much takes the weak input of a good sensor for none.
@@ -43,23 +49,29 @@ LEAKAGE = 1e-6
 # Share of the Nyquist frequency: an input that ends below it is called weak. Above it a sampled model has few
 # samples a period anyway, and hardly any machine is driven there. Chosen.
 WEAK_BELOW_NYQUIST = 0.6
-# Stretches that a density is averaged over: an eighth of the record each, half overlapping, so fifteen.
+# Stretches that a density is averaged over: an eighth of the record each, half overlapping, so fifteen, which
+# scatter by a third. Chosen.
 STRETCHES = 8
-# Samples of a stretch at least: below, a density has too few lines to show where an input ends.
+# Samples of a stretch at least: below, a density has too few lines to show where an input ends. Chosen: 32
+# lines, 3 % of the Nyquist frequency apart.
 SHORTEST_STRETCH = 64
 # Lines over which the density of noise is smoothed: the mean of few stretches has holes that are chance.
+# Chosen.
 SMOOTHED_LINES = 11
 
 # Factor either way (95 %) within which a rate of decay counts as known; beyond, the record does not tell it.
+# Chosen: a damping ratio that may be half or twice as large changes the peak of a mode by 6 dB.
 KNOWN_WITHIN = 2.0
 # Quantile of the standard normal distribution for 95 % on two sides.
 TWO_SIDED_95 = 1.96
 # Largest factor by which the colour of a residual has made a deviation wider than white noise would, so far:
 # deviations below the limit by this factor are not looked at (saves time).
 COLOUR_FACTOR = 5
-# Samples of a stretch of the residual at most: enough lines to tell the noise around a pole from its mean.
+# Samples of a stretch of the residual at most: enough lines (128) to tell the noise around a pole from its
+# mean. Chosen.
 LONGEST_RESIDUAL_STRETCH = 256
-# Lines around a pole over which the density of the residual is averaged.
+# Lines around a pole over which the density of the residual is averaged: the pole's own and one to each side,
+# as many as a Hann window mixes.
 LINES_AROUND_POLE = 3
 # Distance of a real pole from one, or decay of a pair, over the whole longest record: what is slower stands
 # at the bound of a refinement (`ident.fit.refinement.Bounds`: 1e-3), of which `pole_warnings` speaks. The 1 %
@@ -77,9 +89,10 @@ SINGULAR = 1e-12
 # Share of a residual's power that a straight line has to have to be called a drift. Chosen; doubled or
 # halved, no test of the advice moves.
 DRIFT_SHARE = 0.2
-# Probability that noise has so much of a line: one false alarm in 100 000 records.
+# Probability that noise has so much of a line: one false alarm in 100 000 records. Chosen.
 DRIFT_BY_CHANCE = 1e-5
-# Samples of a residual in which a drift is looked for: of fewer the colour is not known.
+# Samples of a residual in which a drift is looked for: of fewer the colour is not known, as its
+# autocorrelation is taken to a tenth of them.
 SHORTEST_DRIFT = 50
 # A straight line serves as well as a slow pole if it leaves at most this factor more. Chosen; at 1.1 or 1.025
 # no test of the advice moves.
@@ -88,7 +101,8 @@ AS_WELL = 1.05
 # constant response is a hundred times the power of what is fitted. Chosen; doubled or halved, no test of the
 # advice moves.
 LARGE_OFFSET = 10.0
-# Samples for each unknown below which the choice of the poles is itself uncertain. A rule of thumb.
+# Samples for each unknown below which the choice of the poles is itself uncertain. A rule of thumb; it gives
+# advice alone.
 SAMPLES_PER_UNKNOWN = 10
 
 # Share of the power of unit inputs that a combination of them has to have to tell them apart over a whole
@@ -99,6 +113,7 @@ SAME_INPUT = 1e-12
 # Doubled or halved, no test of such bands moves.
 ALIKE_POWER = 1e-2
 # Share of the largest part in the dependent combinations from which on an input counts as one of the alike.
+# Chosen: what noise mixes into them is smaller.
 ALIKE_PART = 0.05
 # Cells an octave into which frequencies are sorted: bands are told to a twelfth of an octave. Doubled,
 # independent inputs are called alike in their tests, likely as a window closes with fewer lines to spare;
@@ -109,7 +124,7 @@ CELLS_PER_OCTAVE = 12
 FEWEST_CELLS = 4
 # Rounding of logarithms: a line exactly on the edge of a cell belongs to the upper one.
 CELL_ROUNDING = 1e-9
-# Keeps ratios of powers finite where a power is zero.
+# Keeps ratios of powers finite where a power is zero: near the smallest double.
 TINY = 1e-300
 
 
@@ -129,7 +144,7 @@ def refuse_unusable(records: Sequence[Record], data: Regression, order: int) -> 
     ------
     ValueError
         An input or the output is constant, a combination of inputs is zero, or there are no more samples than
-        unknowns.
+        unknowns. IndexError without records, which `prepare` has refused before.
     """
     names = records[0].input_names
     if len(names) == 1:
@@ -161,7 +176,8 @@ def least_independence(data: Regression) -> float:
     """Least power of a combination of unit length of the inputs, each of unit length over all records.
 
     The least eigenvalue of their correlation matrix (U, U): 1 for uncorrelated inputs, 0 for dependent ones.
-    A single input has 1. data : Regression: its inputs u (U, N).
+    A single input has 1. data : Regression: its inputs u (U, N); one of zeros divides by zero, and
+    `refuse_unusable` has refused it before.
     """
     if data.n_inputs == 1:
         return 1.0
@@ -170,7 +186,11 @@ def least_independence(data: Regression) -> float:
 
 
 class Dependence(NamedTuple):
-    """Inputs that rest or depend on one another in a band, and how many directions all inputs move in."""
+    """Inputs that rest or depend on one another in a band, and how many directions all inputs move in.
+
+    inputs : their indices, ascending; rank : the number of directions, from 1 to one less than there are
+    inputs.
+    """
 
     inputs: tuple[int, ...]
     rank: int
@@ -200,7 +220,9 @@ def alike_inputs(records: Sequence[Record]) -> list[Finding]:
     -------
     list of Finding
         One for each group of inputs and rank: their names, the rank of their spectral matrix summed over all
-        records, and the widest such band in rad/s. Empty for a single input.
+        records, and the widest such band in rad/s. Empty for a single input, and where the inputs are
+        independent. IndexError without records; an input that stands still in all of them gives nan, and
+        `refuse_unusable` has refused it before.
 
     Notes
     -----
@@ -278,7 +300,7 @@ def _dependence(spectrum: ComplexArray) -> Dependence | None:
     """Inputs that rest or depend on one another by their spectral matrix (U, U), with its rank.
 
     The matrix is the mean over the lines of a band, each input of unit mean density over all frequencies.
-    None for full rank, or where every input rests.
+    None for full rank, or where every input rests. nan raises LinAlgError: `alike_inputs` has none.
     """
     density = np.diag(spectrum).real
     moving = np.flatnonzero(density > LEAKAGE)
@@ -324,7 +346,8 @@ def advice(
     -------
     list of Finding
         In this order: few samples, decays that are not known, a weak input, clipped signals, drift, and
-        operating points far from zero.
+        operating points far from zero. Nothing is raised for records that `refuse_unusable` has passed; that
+        records, data and residuals belong together is not checked, but for their number (ValueError).
     """
     findings = few_samples(data, model.order)
     findings += _unknown_rates(data, model, fixed)
@@ -351,7 +374,11 @@ def few_samples(data: Regression, order: int) -> list[Finding]:
 
 
 def _far_from_zero(records: Sequence[Record]) -> list[Finding]:
-    """Findings FAR_FROM_ZERO on every record whose input has a mean of ten times its deviation or more."""
+    """Findings FAR_FROM_ZERO on every record whose input has a mean of more than `LARGE_OFFSET` times its
+    deviation.
+
+    Both in units of the input; one input each. Empty where there is none.
+    """
     findings = []
     for record in records:
         mean = record.input.mean()
@@ -376,6 +403,7 @@ def _unknown_rates(data: Regression, model: GobfModel, fixed: Poles) -> list[Fin
     from the Gauss-Newton covariance sigma^2 (S^T S)^-1 of the free poles, sigma^2 the mean power of the
     residual, made wider by the noise around the pole (`_is_known`). `fixed`: stated poles, first of each
     type, which are not judged. Empty where nothing was searched or there are no samples to spare.
+    `model` : the fit of `data`, not checked.
     """
     poles = model.poles
     n_fixed_real, n_fixed_pairs = fixed.counts
@@ -427,7 +455,8 @@ def _is_known(residual: RealArray, data: Regression, omega_rad_s: float, deviati
 
     deviation: relative standard deviation of the decay, computed for white noise. What counts for a pole is
     the noise around its own frequency omega [rad/s]: the deviation grows with the root of the residual's
-    density there over its mean. data : Regression: where each record begins in the residual.
+    density there over its mean. data : Regression: where each record begins in the residual. False for a
+    deviation of nan; a frequency above Nyquist counts as Nyquist.
     """
     # The logarithm of the decay is taken as normal.
     allowed = float(np.log(KNOWN_WITHIN)) / TWO_SIDED_95
@@ -454,7 +483,8 @@ def _drifting(
     replaces. Without slow poles DRIFT for each record whose residual (T,) has a significant straight line:
     total drift in units of the output, and the line's share of the power. Empty for a model with integrators:
     such a machine also integrates friction and offsets, and walks away without any fault of the records.
-    `fixed`: stated poles, first of each type, which are not judged.
+    `fixed`: stated poles, first of each type, which are not judged. Residuals of fewer than `SHORTEST_DRIFT`
+    samples are passed over; of another number than records they are a ValueError.
     """
     if model.integrators:
         return []
@@ -505,7 +535,8 @@ def _is_a_line(data: Regression, poles: Poles, index: int) -> bool:
     """Whether a straight line on each record serves as well as the slow real pole with this index.
 
     Two fits of the same data: with the poles, and with one pole less and Legendre columns up to degree 1 (or
-    those that integrators leave free). False where there are too few samples for the lines.
+    those that integrators leave free). False where there are too few samples for the lines. IndexError for an
+    index beyond the real poles.
     """
     degree = max(data.polynomials.shape[0], 1)
     columns = []
@@ -537,6 +568,8 @@ def excitation_limit_rad_s(
     Returns
     -------
     float
+        0 without records. Of an input that stands still every line counts: the Nyquist frequency. With a
+        model a record without a residual is an IndexError.
 
     Notes
     -----
@@ -572,7 +605,7 @@ def _spectrum(signal: RealArray, segment: int) -> RealArray:
 
     Welch's mean of periodograms over half-overlapping stretches of `segment` samples under a Hann window, the
     mean of each stretch taken off. scipy.signal.welch takes ten times as long on short records, which is a
-    tenth of a whole fit.
+    tenth of a whole fit. A shorter signal is a ValueError of NumPy.
     """
     window = 0.5 - 0.5 * np.cos(2 * np.pi * np.arange(segment) / segment)
     step = segment - segment // 2
@@ -586,7 +619,7 @@ def _spectrum(signal: RealArray, segment: int) -> RealArray:
 
 
 def _smooth(density: RealArray, width: int = SMOOTHED_LINES) -> RealArray:
-    """Mean (F,) of a density (F,) over `width` neighbouring lines, over fewer at the ends."""
+    """Mean (F,) of a density (F,), F at least 1, over `width` neighbouring lines, over fewer at the ends."""
     window = np.ones(min(width, density.size))
     total = np.convolve(density, window, "same")
     count = np.convolve(np.ones(density.size), window, "same")

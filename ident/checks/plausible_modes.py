@@ -22,7 +22,7 @@ from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.refinement import Bounds
 
 # Periods that the longest record has of a mode at least: of fewer it does not show that anything swings.
-# Chosen.
+# Chosen: one may be a drift, two may be chance.
 FEWEST_PERIODS = 3.0
 # Damping ratio above which a pair swings no more than two real poles do: its step overshoots by
 # exp(-pi zeta / sqrt(1 - zeta^2)) = 10 %.
@@ -32,7 +32,8 @@ LARGEST_DAMPING = 0.6
 LIGHT = 0.3
 # Factor within which a pole that a search holds at a bound is near it: exp and log round on the way.
 AT_BOUND = 1 + 1e-6
-# Distance of a damping ratio from `ZETA_LIMIT` for the same reason.
+# Distance of a damping ratio from `ZETA_LIMIT`, the largest one of a search, up to which it is at this limit:
+# exp and log round on the way.
 AT_ZETA_LIMIT = 1e-6
 # Poles at zero that are called dead time at least. A single one is the part of a sample that a delay has
 # beyond whole ones.
@@ -62,6 +63,7 @@ def kind_of_pair(omega_rad_s: float, zeta: float, longest_s: float) -> PairKind:
     Returns
     -------
     PairKind
+        MODE for nan: numbers are not checked.
     """
     if omega_rad_s * longest_s < 2 * np.pi * FEWEST_PERIODS:
         return PairKind.SLOW
@@ -78,13 +80,14 @@ def implausible_pairs(poles: Poles, fixed: Poles, dt_s: float, longest_s: float)
     poles, fixed : Poles
         Poles of a fit, and those of them that were stated as known, which are not judged.
     dt_s : float
-        Sampling time.
+        Sampling time, s, above zero (not checked).
     longest_s : float
         Length of the longest record, s.
 
     Returns
     -------
     list of Finding
+        Empty where every searched pair may be a mode. A fixed pair is known by its exact numbers.
     """
     findings = []
     pairs = zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
@@ -112,6 +115,7 @@ def poles_without_data(poles: Poles, fixed: Poles, measured_rad: RealArray) -> P
         All poles of a fit, the known ones (fixed) first of each type.
     measured_rad : (K, 2) array
         Low and high end of each measured band in rad/sample, from 0 to pi; a single frequency has both ends.
+        No band at all is a ValueError of NumPy.
 
     Returns
     -------
@@ -127,8 +131,10 @@ def poles_without_data(poles: Poles, fixed: Poles, measured_rad: RealArray) -> P
 
 
 def _without_data(values: ComplexArray, measured_rad: RealArray) -> BoolArray:
-    """Whether poles (P,) are farther from every band (K, 2) [rad/sample] than their half-power width,
-    (P,)."""
+    """Whether poles (P,) are farther from every band (K, 2) [rad/sample] than their half-power width, (P,).
+
+    K is at least 1 (ValueError of NumPy without); of a pair the upper pole is given.
+    """
     low, high = measured_rad.T
     # A pole at zero has no angle and an infinite width.
     size = np.maximum(np.abs(values), np.finfo(float).tiny)
@@ -147,13 +153,14 @@ def pairs_outside(poles: Poles, fixed: Poles, dt_s: float, band_rad_s: tuple[flo
     poles, fixed : Poles
         Poles of a fit, and those of them that were stated as known, which are not judged.
     dt_s : float
-        Sampling time.
+        Sampling time, s, above zero (not checked).
     band_rad_s : (low, high)
-        Both ends belong to the band.
+        Both ends belong to the band. With ends exchanged every pair is outside.
 
     Returns
     -------
     list of Finding
+        Empty where every searched pair lies inside. A fixed pair is known by its exact frequency.
     """
     low, high = band_rad_s
     fixed_omegas = set(fixed.omega_rad_s(dt_s).tolist())
@@ -183,7 +190,8 @@ def pole_warnings(model: GobfModel | MisoModel, fixed: Poles, bounds: Bounds) ->
     list of Finding
         NO_POLE alone where nothing was found; SLOW_BOUND, FAST_BOUND of real poles; DEADBEAT with the delay
         that poles at zero stand for, in samples; of each pair at most one of OVERDAMPED_PAIR, DAMPING_BOUND
-        and NO_DECAY, and FREQUENCY_BOUND.
+        and NO_DECAY, and FREQUENCY_BOUND. Nothing is raised; that the model has the fixed poles first is not
+        checked.
     """
     poles = model.poles
     findings = []

@@ -13,6 +13,12 @@ step of a descent alone (Rao's score test): J - g^T H^-1 g on the linearisation 
 found without them.
 
 Neglected: the noise is taken as stationary, its colour counts through Ne only.
+
+Types of other files: `Fitted`, an optimum (`poles`, fixed ones first of each type; `end.rss`, its J) with its
+`data`, records made ready for a fit (outputs y (N,)), its `search`, and `worth()`, which is Ne; `Refined`,
+the end of a descent (poles, rss); `Structure`, integrators, delay and nuisances; `PriorTest`, a verdict. All
+records and fits were made by an identification that has refused unusable ones; nothing is refused here unless
+it is said.
 """
 
 from __future__ import annotations
@@ -43,7 +49,7 @@ from ident.search.pole_search import Fitted, PoleSearch
 ROUGH = 1e-4
 # Slow poles from which freed integrators start, by number of integrators: distances from one times the
 # samples of the longest record, from a pole that hardly decays (0.1) to one that has settled after a
-# twentieth (20).
+# twentieth (20). Chosen: a few to a decade, spread over both where there are several.
 SLOW_STARTS = {
     1: ((0.1,), (1.0,), (5.0,), (20.0,)),
     2: ((0.1, 1.0), (0.3, 5.0), (1.0, 20.0), (10.0, 30.0)),
@@ -53,15 +59,16 @@ SLOW_STARTS = {
 # around one turn.
 SLOW_TURNS = (0.3, 1.0, 3.0)
 # Decay of such a pair as a share of its angle: a damping ratio of 0.29, in the middle of what a search
-# allows.
+# allows. Chosen.
 SLOW_PAIR_DECAY = 0.3
 # Decay over the longest record of the real pole that a third integrator starts as, beside such a pair.
+# Chosen: it hardly decays in the record, as an integrator does.
 SLOW_BESIDE_PAIR = 0.3
 # Largest change of the logarithm of a decay or frequency (15 %) up to which two ends of a search are one
-# start.
+# start: from so near, descents end alike. Chosen.
 SAME_START = 0.15
-# Starts of a descent under a relative degree: the optimum without it and two others. A wrong start
-# can lose a mode.
+# Starts of a descent under a relative degree: the optimum without it and two others. A wrong start can lose a
+# mode. Chosen, as each one more takes a descent.
 STARTS_UNDER_DEGREE = 3
 # A score below this part of the limit, every sample counted as independent, leaves the descent out. The score
 # is a first step; the rest of the way would have to gain two thirds as much again. Halved, or at the limit
@@ -84,7 +91,8 @@ def statistic(rss_with_prior: float, without: Fitted) -> float:
     Returns
     -------
     float
-        0 also where the residual under the prior is rounding (noise-free data): that decides nothing.
+        0 also where the residual under the prior is rounding (noise-free data): that decides nothing. nan
+        where a sum is nan.
 
     Notes
     -----
@@ -97,7 +105,10 @@ def statistic(rss_with_prior: float, without: Fitted) -> float:
 
 
 def limit(degrees_of_freedom: int) -> float:
-    """Chi-square quantile that the statistic of a true prior stays below in 99 % of the records."""
+    """Chi-square quantile that the statistic of a true prior stays below in 99 % of the records.
+
+    nan for no degree of freedom, or less.
+    """
     return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
 
 
@@ -107,7 +118,7 @@ def judged(
     """Verdict on a prior that the model keeps: refused where the statistic `value` exceeds its limit.
 
     prior: the setting in words, such as "integrators = 2". details: further numbers of the sentence of this
-    kind of finding.
+    kind of finding; which they have to be is not checked. A statistic of nan is not refused.
     """
     bound = limit(degrees_of_freedom)
     return PriorTest(
@@ -139,7 +150,8 @@ def fixed_poles_test(
     Returns
     -------
     PriorTest
-        One degree of freedom for each fixed real number; `free_poles` names where free poles end.
+        One degree of freedom for each fixed real number; `free_poles` names where free poles end. Asked only
+        where there are fixed poles.
 
     Notes
     -----
@@ -192,7 +204,12 @@ def delay_test(records: Sequence[Record], with_prior: Fitted, relative_degree: i
     Returns
     -------
     PriorTest
-        `other_delay`: the better of the two, in samples.
+        `other_delay`: the better of the two, in samples; delay + 1 where neither is better.
+
+    Raises
+    ------
+    ValueError
+        A record has no rows behind one sample of delay more (`prepare`).
 
     Notes
     -----
@@ -232,8 +249,8 @@ def delay_test(records: Sequence[Record], with_prior: Fitted, relative_degree: i
 def _residual_under(fitted: Fitted, relative_degree: int) -> RealArray:
     """Residual (N,) of a fit with its coefficients under a relative degree.
 
-    Those without a condition where there is a direct term: even a relative degree of 1, the least there is,
-    would refuse it.
+    Where there is a direct term the coefficients are free, whatever the degree: even 1, the least there is,
+    would refuse it. `relative_degree` : 1 or more; that the fit has as many poles the caller knows.
     """
     if fitted.data.structure.feedthrough:
         return fitted.residual
@@ -241,7 +258,8 @@ def _residual_under(fitted: Fitted, relative_degree: int) -> RealArray:
 
 
 def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
-    """Sum of squares of a residual (N,) without the first `skip` rows of each record."""
+    """Sum of squares of a residual (N,) without the first `skip` rows of each record; 0 where none are
+    left."""
     parts = [residual[rows][skip:] for rows in data.segments]
     return float(sum(part @ part for part in parts))
 
@@ -249,7 +267,8 @@ def _power_from(residual: RealArray, data: Regression, skip: int) -> float:
 def direct_term_test(records: Sequence[Record], with_prior: Fitted) -> PriorTest:
     """Verdict on relative degree 1 (no direct term), against a model with a direct term.
 
-    records: all records of the fit `with_prior`, which has none. One degree of freedom.
+    records: all records of the fit `with_prior`, which has none. One degree of freedom. A fit that has one
+    already is compared with itself, and not refused.
     """
     free = with_prior.refitted(records, with_prior.poles, feedthrough=True)
     return judged(FindingKind.DIRECT_TERM, "relative_degree = 1", statistic(with_prior.end.rss, free), 1)
@@ -263,11 +282,12 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
     free : Fitted
         The fit of relative degree 1, with further optima in the trace of its search.
     relative_degree : int
-        r; r - 1 degrees of freedom.
+        r, at most the number of poles (`too_few_poles` says so of others); r - 1 degrees of freedom.
 
     Returns
     -------
     (PriorTest, Refined)
+        Kind RELATIVE_DEGREE; poles and J under the degree.
     """
     constrained = best_under_relative_degree(free, relative_degree)
     # Nested models: the free fit is at least as good as one that starts from the constrained optimum.
@@ -285,7 +305,10 @@ def relative_degree_test(free: Fitted, relative_degree: int) -> tuple[PriorTest,
 
 
 def too_few_poles(relative_degree: int, order: int) -> PriorTest:
-    """Verdict "refused, not imposed" on a relative degree above the number of poles `order` of the fit."""
+    """Verdict "refused, not imposed" on a relative degree above the number of poles `order` of the fit.
+
+    That it is above is not checked; the statistic is 0, as there is no fit to compare.
+    """
     return PriorTest(
         kind=FindingKind.TOO_FEW_POLES,
         prior=f"relative_degree = {relative_degree}",
@@ -307,10 +330,12 @@ def best_under_relative_degree(free: Fitted, relative_degree: int) -> Refined:
         The fit without it. Descents start from its poles and from the two lowest ends in the trace of its
         search that are other optima with the same numbers of real poles and pairs.
     relative_degree : int
+        2 or more, at most the number of poles (not checked here).
 
     Returns
     -------
     Refined
+        Poles, fixed ones first of each type, and J under the degree.
     """
     search = free.search
     starts = [free.poles]
@@ -332,7 +357,7 @@ def _distance(first: Poles, second: Poles) -> float:
     """Largest change between two sets of as many poles, in natural logarithms.
 
     Of the distance 1 - a of real poles, compared in order; of decay and of angle per sample of pairs,
-    compared by decay. 0 without poles.
+    compared by decay. 0 without poles. Raises ValueError of NumPy where the numbers of poles differ.
     """
     decays = np.sort(1 - first.real)
     other_decays = np.sort(1 - second.real)
@@ -358,7 +383,8 @@ def integrators_test(
         The part of them that is searched (`thinned`), and its structure; the alternative is searched anew
         there.
     with_prior : Fitted
-        The fit with k integrators.
+        The fit with k integrators, 1 to 3 (KeyError for others: `SLOW_STARTS`; the options have refused
+        them).
 
     Returns
     -------
@@ -407,7 +433,8 @@ def _without_integrators(
     """Best fit of all records with free poles in place of the integrators of `with_prior`.
 
     Starts are compared on the part that is searched: the other poles of `with_prior` with slow real poles, or
-    a slow pair, in place of the integrators; and a search anew. The best goes on with all samples.
+    a slow pair, in place of the integrators; and a search anew. The best goes on with all samples. KeyError
+    (`SLOW_STARTS`) for other numbers of integrators than 1 to 3.
     """
     n_integrators = with_prior.data.structure.integrators
     fixed = with_prior.search.fixed
@@ -424,7 +451,7 @@ def _without_integrators(
 
     def prepared(chosen: Sequence[Record], structure: Structure) -> Regression:
         """The records without integrators, with the polynomials that integrators leave free: they belong to
-        both sides of the comparison."""
+        both sides of the comparison. Raises ValueError as `prepare`: no record, no rows behind the delay."""
         polynomials = prepare(chosen, structure).polynomials
         return replace(prepare(chosen, replace(structure, integrators=0)), polynomials=polynomials)
 
@@ -450,7 +477,8 @@ def _without_integrators(
 def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int) -> float:
     """Statistic of `fewer` integrators against none; infinite without so many searched real poles.
 
-    free: the fit without integrators; its slowest searched real poles become the integrators.
+    free: the fit without integrators; its slowest searched real poles become the integrators. `fewer` is at
+    least 1.
     """
     n_fixed = free.search.fixed.real.size
     searched_real = np.sort(free.poles.real[n_fixed:])
@@ -464,7 +492,10 @@ def _fewer_integrators_value(records: Sequence[Record], free: Fitted, fewer: int
 
 
 class SpareIntegrators(NamedTuple):
-    """How many integrators are enough; the statistic of the others, and the price they would have to gain."""
+    """How many integrators are enough; the statistic of the others, and the price they would have to gain.
+
+    Both without a unit, in twice the logarithm of a likelihood.
+    """
 
     enough: int
     statistic: float
@@ -475,7 +506,8 @@ def _spare_integrators(records: Sequence[Record], with_prior: Fitted) -> SpareIn
     """How few integrators are enough beside the same other poles of `with_prior`; None where all are needed.
 
     Each integrator has to gain 2 ln Ne. None also where a searched pole, or a pair at twice the price, can be
-    spared as well: that one can take the place of an integrator.
+    spared as well: that one can take the place of an integrator. Nothing is raised; a fit without integrators
+    gives None.
     """
     n_integrators = with_prior.data.structure.integrators
     price_of_one = 2 * float(np.log(with_prior.worth()))
@@ -523,12 +555,15 @@ class NuisanceTest:
 
     @property
     def limit(self) -> float:
-        """Chi-square quantile at 99 % that the statistic of a nuisance that is not there stays below."""
+        """Chi-square quantile at 99 % that the statistic of a nuisance that is not there stays below.
+
+        nan where it adds no number to the fit: nothing is needed then.
+        """
         return float(chdtri(self.columns, 1 - TEST_LEVEL))
 
     @property
     def needed(self) -> bool:
-        """The data ask for the nuisance."""
+        """Whether the data ask for the nuisance; False for a statistic or limit of nan."""
         return self.statistic > self.limit
 
     @property
@@ -546,7 +581,11 @@ class NuisanceTest:
 
 
 def nuisance_test(name: str, without: Fitted, with_it: Fitted) -> NuisanceTest:
-    """Verdict on a nuisance by the likelihood ratio of two optima, `without` and `with_it`."""
+    """Verdict on a nuisance by the likelihood ratio of two optima, `without` and `with_it`.
+
+    name : "initial state" or "offset". The optima are of the same rows and of as many poles: not checked. J =
+    0 counts as `TINY`.
+    """
     ratio = max(without.end.rss, TINY) / max(with_it.end.rss, TINY)
     value = float(with_it.worth() * np.log(ratio))
     return NuisanceTest(name, _columns(without, with_it.data), value)
@@ -562,7 +601,7 @@ def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> Nuisanc
     without : Fitted
         The optimum without it.
     with_it : Regression
-        The same rows with its columns.
+        The same rows with its columns; more rows than unknowns, which the caller has asked for.
 
     Returns
     -------
@@ -584,6 +623,9 @@ def clearly_left_out(name: str, without: Fitted, with_it: Regression) -> Nuisanc
 
 
 def _columns(without: Fitted, with_it: Regression) -> int:
-    """Free real numbers that the data `with_it` have more in a fit than those of `without`, at its order."""
+    """Free real numbers that the data `with_it` have more in a fit than those of `without`, at its order.
+
+    Negative where they have fewer: the caller does not exchange them.
+    """
     order = without.poles.order
     return with_it.n_parameters(order) - without.data.n_parameters(order)

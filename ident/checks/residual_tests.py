@@ -7,6 +7,10 @@ records and keep their level over all lags together. `residual_tests` runs them 
 leaves of its records, `residual_advice` says what is wrong where one fails, and `fed_back` measures what
 input and residual still have in common in radii of the ellipses: where a loop feeds noise back that is
 noncausal, which neither test counts. Signals are taken as stationary.
+
+A `ResponsePosterior` is the mean of a response and its ellipses at frequencies; a `Record` has an input (T,
+1), an output (T, 1) and finite samples; `TEST_LEVEL` is .99 and `WHITE_LAGS` 25, both of
+`ident.data.finding`.
 """
 
 from __future__ import annotations
@@ -31,7 +35,7 @@ from ident.data.record import Record
 # Frequencies at which feedback is looked for: ten a band below in the mean. Chosen; at 30 or 120 no test of
 # feedback moves.
 RESOLVED_FREQUENCIES = 60
-# Lines to each side that are averaged for one frequency at least: eleven lines scatter by a third.
+# Lines to each side that are averaged for one frequency at least: eleven lines scatter by a third. Chosen.
 FEWEST_LINES_BESIDE = 5
 # Bands over which feedback is averaged, equally wide on a logarithmic axis from the first line to Nyquist.
 # Chosen; at 3 or 12 no test of feedback moves.
@@ -83,7 +87,10 @@ class ResidualTest:
 
     @property
     def largest(self) -> tuple[int, float]:
-        """Lag (not negative, in samples) and value of the largest correlation in size."""
+        """Lag (not negative, in samples) and value of the largest correlation in size; the first of equals.
+
+        Without lags ValueError: the tests of this file have some.
+        """
         size = np.where(self.lags >= 0, np.abs(self.correlation), 0)
         at = int(np.argmax(size))
         return int(self.lags[at]), float(self.correlation[at])
@@ -93,7 +100,8 @@ class ResidualTest:
         """Share of the residual's power that its own past over all lags predicts, 0 to 1; 0 of white noise.
 
         Of a whiteness test. By the Yule-Walker equations of its autocorrelation r at lags 1..K: r^T R^-1 r, R
-        the Toeplitz matrix of r at lags 0..K-1.
+        the Toeplitz matrix of r at lags 0..K-1. Not defined of a test of independence; LinAlgError where the
+        matrix is singular, as of a residual that is one sine.
         """
         first_row = np.append(1.0, self.correlation[:-1])
         predictor = solve_toeplitz(first_row, self.correlation)
@@ -101,7 +109,7 @@ class ResidualTest:
 
     @property
     def finding(self) -> Finding:
-        """The outcome as a finding WHITENESS or INDEPENDENCE, for the sentence."""
+        """The outcome as a finding WHITENESS or INDEPENDENCE, for the sentence; KeyError for another name."""
         lag, correlation = self.largest
         return finding(
             FindingKind[self.name.upper()],
@@ -122,16 +130,18 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS)
     residuals : sequence of (T,) array
         One for each record. Those of at most 2 max_lag samples are left out beside longer ones.
     max_lag : int
-        In samples.
+        In samples; the usual number of lags is that of all whiteness tests.
 
     Returns
     -------
     ResidualTest
+        Of K = max_lag lags; it passes at 99 %.
 
     Raises
     ------
     ValueError
-        No residual is longer than 2 max_lag, or all are constant.
+        No residual is longer than 2 max_lag, all are constant, one that counts is not finite, or max_lag is
+        below 1.
 
     Notes
     -----
@@ -178,8 +188,8 @@ def independence_test(
     Raises
     ------
     ValueError
-        Numbers or lengths of inputs and residuals differ, no record is longer than 2 max_lag, or all signals
-        are constant.
+        Numbers or lengths of inputs and residuals differ, no record is longer than 2 max_lag, all signals are
+        constant, one is not finite, or max_lag is below 1.
 
     Notes
     -----
@@ -196,6 +206,7 @@ def independence_test(
     correlation = _pooled_correlation(e, u, max_lag)
 
     # Standard deviation of a lag. A Bartlett taper keeps the sum of sample correlations positive.
+    # Lags up to half the shortest record: beyond, few products are averaged.
     longest = min(part.size for part in e) // 2
     memory = _pooled_correlation(e, e, longest) * _pooled_correlation(u, u, longest)
     memory_lags = np.arange(-longest, longest + 1)
@@ -234,7 +245,8 @@ def independence_test(
 def conditions_of(advice: Iterable[Finding]) -> list[Finding]:
     """Findings that a certificate over ellipses stands or falls with, out of those about the ellipses.
 
-    Left out where an observer's prediction errors are not white: the ellipses were widened for it.
+    Left out where an observer's prediction errors are not white: the ellipses were widened for it. Empty
+    where none of the findings is one; unknown kinds are passed over.
     """
     kinds = {FindingKind.NOT_WHITE, FindingKind.NOMINAL_OUTSIDE, FindingKind.UNTRIED_FRICTION}
     conditions = []
@@ -258,6 +270,7 @@ def residual_advice(
     Parameters
     ----------
     whiteness, independence : ResidualTest
+        Outcomes, each of its own test (`residual_tests`); exchanged ones are not noticed.
     noise_order : int
         Order of the noise model behind which whiteness was tested; 0: none.
     friction : bool
@@ -297,6 +310,12 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
     float
         Root mean square over a band, chance taken off, of all bands the largest; 0 where nothing is sure.
 
+    Raises
+    ------
+    ValueError
+        Without records, where one has no rows behind the delay or another sampling time
+        (`fit_on_fresh_data`), or where they are too short for a spectrum (`empirical_frf`).
+
     Notes
     -----
     G_r = S_eu / S_uu, e the residual, by averaged spectra. Where a loop feeds noise back, G_r is noncausal,
@@ -312,6 +331,7 @@ def fed_back(posterior: ResponsePosterior, records: Sequence[Record]) -> float:
         of_residual.append(
             replace(record.slice(0, shortest), output=residual, reference=None, reference_names=())
         )
+    # There are shortest / 2 lines, and a frequency takes twice as many of them as stand on one side: so 4.
     lines_beside = max(FEWEST_LINES_BESIDE, shortest // (4 * RESOLVED_FREQUENCIES))
     common = empirical_frf(of_residual, half_width_lines=lines_beside)
     omega = common.omega_rad_s
@@ -368,6 +388,7 @@ def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag:
     """Correlation (2 max_lag + 1,) of signals e and u, (T,) of each record, at lags -max_lag..max_lag.
 
     sum_k e(k) u(k - lag) over all records, divided by the norms; samples of two records are never multiplied.
+    Equal lengths above max_lag, and a power above zero, `_centred` and the callers have seen to.
     """
     total = np.zeros(2 * max_lag + 1)
     for part_e, part_u in zip(e, u, strict=True):
@@ -413,6 +434,12 @@ def residual_tests(
     -------
     (ResidualTest, ResidualTest)
         Whiteness, independence.
+
+    Raises
+    ------
+    ValueError
+        No record is longer than 50 samples behind delay and noise model, all residuals are constant, or a
+        record has another sampling time or several columns (`fit_on_fresh_data`).
     """
     # Prediction errors of an observer are white as they are.
     in_loop = friction is not None and friction.observed

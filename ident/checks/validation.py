@@ -6,6 +6,10 @@ drift. `repeat_scatter` holds the noise ellipses of repeated experiments against
 repeats, band by band, with the range that chance allows (a chi-square with the degrees of freedom of
 Satterthwaite, Biometrics Bulletin 2(6), 1946). Records have one output. What a record has before its first
 row is unknown: the free response of the model's poles is fitted to it, and not counted as an error.
+
+A `Record` has an input (T, U), an output (T, Y) and finite samples; `FrequencyUncertainty` a response at
+frequencies (centre (F,), covariance (F, 2, 2) of real and imaginary part); a model its poles, dt_s and delay
+in samples.
 """
 
 from __future__ import annotations
@@ -33,12 +37,12 @@ MOST_WINDOWS = 16
 # twentieth of the noise.
 SAMPLES_PER_UNKNOWN = 20
 # Free responses weaker than this share of the strongest are left out of the fit of a start: poles that lie
-# together have nearly equal ones.
+# together have nearly equal ones. Chosen: far above the rounding of doubles, far below what a record tells.
 SAME_RESPONSE = 1e-10
-# Quantiles between which an honest ratio of standard deviations lies in 95 % of experiments.
+# Quantiles between which an honest ratio of standard deviations lies in 95 % of experiments, the usual share.
 LOW_QUANTILE = 0.025
 
-# The upper one of the two.
+# The upper one of the two: as many experiments lie above it as below the lower one.
 HIGH_QUANTILE = 0.975
 
 
@@ -65,7 +69,7 @@ class FreshFit:
     answers: bool = True
 
     def __post_init__(self) -> None:
-        """Locked arrays."""
+        """Locked arrays; their shapes are not checked."""
         lock(self, "simulated", "residual")
 
 
@@ -145,9 +149,9 @@ def fit_in_windows(model: GobfModel | MisoModel | ResponsePosterior, record: Rec
     Parameters
     ----------
     model : GobfModel, MisoModel or ResponsePosterior
-        Of one output.
+        Of one output; a posterior is simulated with its mean.
     record : Record
-        One output, and the model's inputs.
+        One output, and the model's inputs, of its sampling time.
 
     Returns
     -------
@@ -158,7 +162,8 @@ def fit_in_windows(model: GobfModel | MisoModel | ResponsePosterior, record: Rec
     Raises
     ------
     ValueError
-        As of `fit_on_fresh_data`; a constant output only where it is so in every window.
+        The record has another sampling time, other inputs, several outputs (where a window moves), no rows
+        behind the delay, or an output that is constant in every window.
 
     Notes
     -----
@@ -250,11 +255,13 @@ def repeat_scatter(
     Returns
     -------
     list of ScatterRow
+        In the order of the bands; empty where no band has a frequency.
 
     Raises
     ------
     ValueError
-        A group has fewer than two repeats, or the grids differ.
+        There is no group, one has fewer than two repeats, or the grids differ. That the posterior is of the
+        same sampling time is not checked; where the mean response is zero sizes are infinite or nan.
     """
     estimates = [estimate for group in groups for estimate in group]
     if not estimates or any(len(group) < 2 for group in groups):
@@ -339,7 +346,8 @@ def _relative_spread(
     band.
 
     inside (F,): the frequencies of the band; size (F,): |G|. By the posterior, errors of neighbouring
-    frequencies move together; without it M is a diagonal of blocks (2, 2), one for each frequency.
+    frequencies move together; without it M is a diagonal of blocks (2, 2), one for each frequency. B is at
+    least 1; a variance below zero counts as zero.
     """
     if posterior is not None:
         spread = posterior.frequency_rows(estimate.omega_rad_s[inside]) @ posterior.covariance_factor
@@ -352,12 +360,13 @@ def _relative_spread(
 
 
 def _variance(estimate: FrequencyUncertainty) -> RealArray:
-    """Variance E|G_hat - G|^2 (F,) of an estimate: the trace of its covariance (F, 2, 2)."""
+    """Variance E|G_hat - G|^2 (F,) of an estimate, in its units squared: the trace of its covariance (F, 2,
+    2)."""
     return np.asarray(estimate.covariance[:, 0, 0] + estimate.covariance[:, 1, 1])
 
 
 def _rms(squares: RealArray) -> float:
-    """Root of the mean of squares (B,)."""
+    """Root of the mean of squares (B,), in their unit; nan without any, or where one is nan."""
     return float(np.sqrt(np.mean(squares)))
 
 
