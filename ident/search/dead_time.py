@@ -5,6 +5,11 @@ show in a correlation of changes. `seek` selects the order again behind that man
 the best one, and keeps the delay where the criterion of the order, which charges for it, clearly prefers the
 delayed model. Both numbers are sought together because poles near zero stand for delay, and a pole too many
 for a delay that is wrong by a sample. Neglected: a delay of each input by itself; a loop around the plant.
+
+`Fitted`, of another file, is an optimum (`poles`, fixed ones first of each type; `end.rss`, its J) with its
+`data` (records made ready for a fit), its `search`, and `worth()`, the independent samples Ne that its
+residual is worth. Records are those of a fit that has refused unusable ones; nothing is refused here unless
+it is said.
 """
 
 from __future__ import annotations
@@ -29,25 +34,27 @@ from ident.search.order_selection import OrderSelection
 from ident.search.pole_search import Fitted, PoleSearch
 
 # Lags of the output in the long model: fifteen pairs of poles for what the plant and the noise do by
-# themselves.
+# themselves. Chosen.
 OUTPUT_LAGS = 30
-# Lags of the input in the long model; later answers are left to the correlation.
+# Lags of the input in the long model; later answers are left to the correlation. Chosen: a model of 131
+# columns takes little time.
 INPUT_LAGS = 100
 # Rows that the shortest record has for each lag at least: the lags then take up a twentieth of the noise.
 ROWS_PER_LAG = 20
-# Records that have no room for so many lags tell no delay.
+# Records that have no room for so many lags tell no delay: of a single lag nothing can come before an answer.
 FEWEST_LAGS = 2
-# Inputs that are missed less probably than this by chance are missed. Errors cost time only: what is found
-# here is judged again.
+# Inputs that are missed less probably than this by chance are missed. Chosen: errors cost time only, as what
+# is found here is judged again.
 MISSED_BY_CHANCE = 1e-3
 # Changes of the number of samples that are tried around the best one so far, in this order: next to it, and
-# over a gap, as J swings with the delay where the input is limited to a band.
+# over a gap, as J swings with the delay where the input is limited to a band. Chosen.
 STEPS = (-1, 1, -3, 3, -8, 8)
 # A delay is shorter than this part of the shortest record: behind it as much has to be left to fit.
 LONGEST_PART = 2
 # Changes of the number of samples beside the best one where the order is selected again from its poles ...
 NEAR_STEPS = (-1, 1)
 # ... and where it is selected again from the start, as the poles may stand for a wrong number of samples.
+# Chosen: a real pole and a pair at zero stand for three.
 ANEW_STEPS = (-3, -2, -1, 0, 1, 2, 3)
 # Selections of the order behind one number of samples after the other, at most. A bound on time: they end
 # where the number stays.
@@ -58,8 +65,7 @@ STRONG = 6.0
 
 
 def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> SearchOutcome | None:
-    """The model behind a delay that the criterion of the order prefers to one without; None where there is
-    none.
+    """Model behind a delay that the criterion of the order prefers to one without; None where there is none.
 
     Parameters
     ----------
@@ -68,7 +74,8 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> Sea
     plain : Fitted
         End of a search without a delay on these records.
     starts : sequence of int
-        Delays in samples where the search begins (`first_answer`); empty: none is sought.
+        Delays in samples where the search begins (`first_answer`); empty: none is sought. They are shorter
+        than the shortest record, else `prepare_inputs` raises ValueError.
 
     Returns
     -------
@@ -145,11 +152,13 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     Parameters
     ----------
     records : sequence of Record
-        One input and one output each. Nothing is missed where they are too short, or without noise.
+        One input and one output each, one record at least (ValueError without).
 
     Returns
     -------
     FirstAnswer
+        Without starts, and not at once, where records are too short, or where nothing is left of the output,
+        as of data without noise.
 
     Notes
     -----
@@ -211,7 +220,9 @@ def _late_answer(records: Sequence[Record], n_lags: int) -> int:
     out.
 
     Over lags 0 to n_lags - 1, all records together. A peak counts that lags of nothing but chance would show
-    once in a thousand such records: normal with the root mean square of all lags, the largest of n_lags.
+    once in a thousand such records: normal with the root mean square of all lags, the largest of n_lags,
+    which is sqrt(2 ln(n_lags / p)) deviations at probability p. Every record has more than n_lags rows
+    (ValueError of NumPy else); 0 also where nothing moves.
     """
     total: RealArray = np.zeros(n_lags)
     for record in records:
@@ -255,7 +266,8 @@ class SearchOutcome(Fitted):
 
         Ne ln(J' / J) + (free numbers' - free numbers) ln Ne - 2 (ln(1 + d) - ln(1 + d')), those of the other
         fit with a prime. A delay of d samples costs 2 ln(1 + d), as an integer of which the small ones are
-        the likelier (Rissanen, Annals of Statistics 11(2), 1983).
+        the likelier (Rissanen, Annals of Statistics 11(2), 1983). That both are fits of the same records is
+        not checked.
         """
         n_numbers = self.data.n_parameters(self.poles.order)
         n_fewer = other.data.n_parameters(other.poles.order) - n_numbers
@@ -267,6 +279,8 @@ def _behind(records: Sequence[Record], near: Fitted, delay: int, anew: bool = Fa
     """Order and poles selected behind a delay in samples.
 
     From the poles of `near`, a model with another delay; from the start where that has none, or with `anew`.
+    Raises ValueError (`prepare_inputs`) where a record has no rows behind the delay, or the delay is below
+    zero.
     """
     search = _search(records, near, delay)
     selection = OrderSelection(search)
@@ -282,7 +296,8 @@ def _better_neighbour(records: Sequence[Record], best: SearchOutcome) -> SearchO
 
     A pole too many stands for what is wrong with the number of samples, so neighbours are also selected from
     the start. Those are left out that lose more with these poles than all free numbers of the fit are worth:
-    fewer poles could not win that back.
+    fewer poles could not win that back. Raises ValueError where a neighbour has no rows: `best` lies far from
+    the end of the records.
     """
     fits = _moved(records, best).by_delay
     worth_of_numbers = best.data.n_parameters(best.poles.order) * float(np.log(best.worth()))
@@ -301,7 +316,11 @@ def _better_neighbour(records: Sequence[Record], best: SearchOutcome) -> SearchO
 
 
 def _search(records: Sequence[Record], near: Fitted, delay: int) -> PoleSearch[Regression]:
-    """A search like that of `near` on the records behind a delay in samples."""
+    """A search like that of `near` on the records behind a delay in samples; nothing is searched yet.
+
+    Raises ValueError (`prepare_inputs`, `Structure`) where a record has no rows behind it, or it is below
+    zero.
+    """
     data = prepare_inputs(records, replace(near.data.structure, input_delay_samples=delay))
     return PoleSearch(data, near.search.options.model_copy(update={"input_delay_samples": delay}))
 
@@ -322,6 +341,7 @@ def _moved(records: Sequence[Record], fitted: Fitted) -> DelayFits:
     """The order of a fit behind the number of samples that fits best, and behind all that were tried.
 
     From the fit's own delay by the first of `STEPS` that gains, until none does; poles are refined each time.
+    Delays below zero, or of half the shortest record and more, are passed over.
     """
     best = fitted
     by_delay = {_delay(fitted): fitted}
@@ -346,7 +366,8 @@ def _moved(records: Sequence[Record], fitted: Fitted) -> DelayFits:
 def gain(fitted: Fitted, other: Fitted) -> float:
     """Ne ln(J of other / J of fitted) on the rows that both explain: how much better `fitted` is.
 
-    Ne: independent samples that the residual of `fitted` is worth. 0 where both leave rounding only.
+    Ne: independent samples that the residual of `fitted` is worth. 0 where both leave rounding only. Both are
+    fits of the same records (not checked).
     """
     common_delay = max(_delay(fitted), _delay(other))
     power = _power_from(fitted, common_delay)
@@ -358,6 +379,7 @@ def gain(fitted: Fitted, other: Fitted) -> float:
 def _power_from(fitted: Fitted, delay: int) -> float:
     """Sum of squares of the residual of a fit in the rows from this delay on, over all records."""
     residual = fitted.residual
-    # Residuals of a record begin behind the fit's own delay.
+    # `delay` is at least the fit's own (`gain`); rows beyond the end of a record are an empty sum. Residuals
+    # of a record begin behind the fit's own delay.
     skip = delay - _delay(fitted)
     return sum(float(np.sum(residual[rows][skip:] ** 2)) for rows in fitted.data.segments)

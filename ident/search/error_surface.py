@@ -2,7 +2,8 @@
 
 `error_surface` moves one pair of a fitted model over a grid and fits coefficients and nuisances anew at every
 point. The picture shows how many local minima a descent could end in. Coordinates are those of the pole
-search: the paper's (beta, gamma) of its equation (29), or frequency and damping ratio.
+search: (beta, gamma) of equation (29) of the paper that the package follows (its terms are in the glossary),
+with gamma = |p|^2 and beta = 2 Re p / (1 + gamma) of a pole p; or frequency and damping ratio.
 """
 
 from __future__ import annotations
@@ -22,21 +23,22 @@ from ident.data.record import Record
 from ident.data.shown import Shown
 from ident.fit.regression import prepare
 
-# Default window, for a picture that holds the pair's own valley and its neighbours. Frequency: two octaves
-# each way, below the Nyquist frequency by this share.
+# Default window, for a picture that holds the pair's own valley and its neighbours. Frequency: a factor of
+# four, two octaves, each way. Chosen.
 OMEGA_FACTOR = 4
 
-# Share of the Nyquist frequency at which the window ends: at Nyquist itself a pair is two real poles.
+# Share of the Nyquist frequency at which the window ends at most: at Nyquist itself a pair is two real poles.
 BELOW_NYQUIST = 0.99
-# Damping ratio, and width 1 - gamma: a factor of 30 each way, the damping ratio within these ends.
+# Damping ratio, and width 1 - gamma: a factor of 30 each way, a decade and a half. Chosen.
 DAMPING_FACTOR = 30
 
 # Least damping ratio of the window: a lighter pair rings for more than ten thousand periods.
 LEAST_ZETA = 1e-5
 
-# Largest damping ratio of the window: at 1 the pair becomes two real poles.
+# Largest damping ratio of the window: at 1 the pair becomes two real poles, and near it hardly differs.
+# Chosen.
 LARGEST_ZETA = 0.95
-# beta: ten damping widths each way, at least this much, and inside -1..1 by a rounding error.
+# beta: so many damping widths 1 - gamma each way. Chosen: valleys of neighbours are a few widths away.
 BETA_WIDTHS = 10
 
 # Least width of beta each way, for a pair so light that ten damping widths show as a line.
@@ -53,14 +55,16 @@ LOG_BOX = ((-1.0, -12.0, -12.0), (0.0, 1.0, 0.0))
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorSurface(Shown):
-    """Mean square residual J / N (20) over two coordinates of one pair, coefficients fitted at every point.
+    """Mean square residual J / N over two coordinates of one pair, coefficients fitted at every point.
+
+    J is the residual sum of squares of N samples, the paper's (20).
 
     Attributes
     ----------
     first : (A,) array
-        Values of beta of (29), or omega in rad/s.
+        Values of beta, or omega in rad/s.
     second : (B,) array
-        Values of gamma of (29), or zeta.
+        Values of gamma, or zeta; no unit.
     names : tuple of two str
         What the coordinates are called.
     mean_square : (A, B) array
@@ -84,7 +88,10 @@ class ErrorSurface(Shown):
             )
 
     def local_minima(self) -> list[tuple[int, int]]:
-        """Indices (of first, of second) of points lower than all their up to 8 neighbours, lowest first."""
+        """Indices (of first, of second) of points lower than all their up to 8 neighbours, lowest first.
+
+        Points at the edge count too; plateaus and nan do not. Empty where there is none.
+        """
         neighbours = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
         least_beside = minimum_filter(self.mean_square, footprint=neighbours, mode="constant", cval=np.inf)
         is_minimum = self.mean_square < least_beside
@@ -116,12 +123,12 @@ def error_surface(
     pair : int
         Which of the model's pairs, from 0.
     coordinates : str
-        "raw" for (beta, gamma), "log" for (omega [rad/s], zeta).
+        Any but "raw" counts as "log". "raw" for (beta, gamma), "log" for (omega [rad/s], zeta).
     first, second : (A,), (B,) array, optional
         The grid; default two octaves each way in omega and a factor of 30 in zeta, or a window of ten damping
         widths.
     n_points : int
-        Points of each default grid.
+        Points of each default grid: 61, chosen, is enough for a smooth picture.
 
     Returns
     -------
@@ -130,8 +137,9 @@ def error_surface(
     Raises
     ------
     ValueError
-        The model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi / dt,
-        0 < zeta < 1.
+        The model has no such pair, or a grid leaves |beta| < 1, 0 <= gamma < 1, 0 < omega < pi / dt, 0 < zeta
+        < 1; or a record does not fit (`prepare`): none, several outputs, another sampling time, no rows
+        behind the delay.
 
     Notes
     -----

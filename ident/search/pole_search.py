@@ -11,6 +11,11 @@ frozen. `descend` is the local refinement behind all of them. What problem is se
 
 `Fitted` is an optimum with its search; `SearchStage`, `PolishedMinimum` and `SearchTrace` are the trace that
 is stored and drawn. Fixed poles come first of each type everywhere and are never moved.
+
+Types of other files: `Refined`, the end of a descent (`poles`, their J `rss`); `SearchSpace`, a box of poles
+as a map from the unit cube of D coordinates; `CandidateCost`, J over that cube with other poles frozen;
+`ResidualColour`, whether a residual is white and its worth in independent samples. Data with too few samples,
+or without motion, the callers have refused: here nothing is raised for them.
 """
 
 from __future__ import annotations
@@ -39,50 +44,56 @@ from ident.search.direct import best_apart, minimise
 Problem = TypeVar("Problem", bound=PoleProblem, covariant=True)
 
 # Share of J that a rescan or an exchange of poles has to gain to count: far more than rounding, far less than
-# any pole is worth.
+# any pole is worth (2 ln Ne / Ne, 3e-5 at a million samples). Chosen between both.
 GAIN = 1e-6
-# Share of J that is left to gain when a descent ends that only compares starts.
+# Share of J that is left to gain when a descent ends that only compares starts. Chosen.
 ROUGH = 1e-3
-# Share of J that is left to gain when a descent ends whose poles are used.
+# Share of J that is left to gain when a descent ends whose poles are used: far below the 1 / N by which noise
+# moves J, and above its rounding.
 FINE = 1e-9
 # Rescans of every block at most. A bound on time: the rescan ends where a whole round gains nothing.
 MOST_ROUNDS = 6
-# Points of a rescan of real poles, and of a pair, from which a descent starts.
+# Points of a rescan of real poles from which a descent starts: the best may lead back to where the poles are.
+# Chosen.
 STARTS_OF_REAL = 2
 
 # Points of a rescan of a pair from which one starts: a descent of two unknowns takes longer.
 STARTS_OF_PAIR = 1
 
-# Starts that end in one place and make further ones and a rescan superfluous.
+# Starts that end in one place and make further ones and a rescan superfluous. Chosen: two may agree by
+# chance.
 STARTS_TO_AGREE = 3
 # Where they disagree, so many times the starts asked for are tried. A safeguard: on 78 records of the
 # benchmark plants all models stay the same with neither further starts nor an early end, as rescans find the
 # better place.
 PATIENCE = 5
 # Share of the output's power up to which a residual is little: with more noise many minima lie together, and
-# starts that agree prove nothing.
+# starts that agree prove nothing. Chosen.
 LITTLE_NOISE = 0.02
-# Share of J by which ends of rough descents differ that are one optimum: each is known to `ROUGH`.
+# Share of J by which ends of rough descents differ that are one optimum: each is known to `ROUGH`, so two
+# differ by 2 ROUGH, and one is to spare.
 SAME_COST = 3 * ROUGH
 # Share of a decay or frequency by which poles of such ends differ: near an optimum J is flat, so poles end
-# less alike than J.
+# less alike than J: by the root of `ROUGH`, 3 %, and some more. Chosen.
 SAME_POLE = 0.1
 
-# Cost evaluations of DIRECT for one more pair when the rest is frozen: two unknowns.
+# Cost evaluations of DIRECT for one more pair when the rest is frozen: two unknowns, so fifteen or so a side.
+# Chosen.
 PAIR_EVALUATIONS = 240
-# Levels of a real pole in a grid: two a decade over the box of a record of 10 000 samples.
+# Levels of a real pole in a grid: two a decade over the box of a record of 10 000 samples. Chosen: descents
+# find what lies between.
 REAL_LEVELS = 9
 # Frequencies and damping ratios of a pair in a grid. A grid of 60 x 3 led to the same models on the benchmark
 # plants.
 PAIR_OMEGAS = 40
 
-# Damping ratios of a pair in a grid: light and well damped.
+# Damping ratios of a pair in a grid: light and well damped. Chosen, as a descent finds the damping.
 PAIR_ZETAS = 2
-# Samples below which a record counts as so long for the slowest pole of a search (`search_space` does so,
-# too).
+# Samples below which a record counts as so long for the slowest pole of a search, so that its box is not
+# empty. It has to be the number of `ident.basis.coordinates.search_space`.
 SHORTEST = 30
 # Decay over the longest record, 1 - a times samples, of the slowest real pole of the search's box: a record
-# says nothing about slower ones.
+# says nothing about slower ones. It has to be the number of `ident.basis.coordinates.search_space`.
 SLOWEST_DECAY = 0.2
 
 
@@ -118,7 +129,10 @@ class PoleSearch(Generic[Problem]):
     """
 
     def __init__(self, data: Problem, options: IdentOptions, bounds: Bounds | None = None) -> None:
-        """Nothing is searched yet."""
+        """Nothing is searched yet.
+
+        Fixed poles outside the circle were refused by the options; `bounds` are not checked.
+        """
         self.data = data
         self.options = options
         self.fixed = options.fixed()
@@ -138,7 +152,10 @@ class PoleSearch(Generic[Problem]):
         self._coloured: tuple[Refined, ResidualColour] | None = None
 
     def space(self, n_real: int, n_pairs: int) -> SearchSpace:
-        """Box of so many searched real poles and pairs, as a map from the unit cube."""
+        """Box of so many searched real poles and pairs, as a map from the unit cube.
+
+        Raises ValueError where bounds that were stated leave it empty.
+        """
         return search_space(n_real, n_pairs, self.data.longest, self.data.dt_s, self._box)
 
     def joint(self, n_real: int, n_pairs: int) -> Refined:
@@ -153,6 +170,11 @@ class PoleSearch(Generic[Problem]):
         -------
         Refined
             Poles, fixed ones first, and J.
+
+        Raises
+        ------
+        ValueError
+            Bounds that were stated leave no box (`space`).
 
         Notes
         -----
@@ -190,12 +212,13 @@ class PoleSearch(Generic[Problem]):
     def is_trusted(self, best: Refined) -> bool:
         """Whether an end leaves little of the output, the rest white, and is no saddle of equal real poles.
 
-        Two real poles that are about to meet are such a saddle: a descent does not part them.
+        Two real poles that are about to meet are such a saddle: a descent does not part them. White at 99 %;
+        a record of less than 250 samples never is.
         """
         searched_real = best.poles.real[self.fixed.real.size :]
         distances = sorted(1 - pole for pole in searched_real.tolist())
         for slow, fast in pairwise(distances):
-            # Poles far slower than the box are all alike.
+            # Poles far slower than the box are all alike. Far: four times; chosen.
             in_box = fast > self._slowest / 4
             if in_box and fast - slow <= SAME_POLE * fast:
                 return False
@@ -203,8 +226,10 @@ class PoleSearch(Generic[Problem]):
         return explains and self.colour(best).white
 
     def _is_same(self, end: PolishedMinimum, best: Refined) -> bool:
-        """Whether a rough descent was on its way to `best`, by J and by decays and frequencies of the
-        poles."""
+        """Whether a rough descent was on its way to `best`, by J and by decays and frequencies of the poles.
+
+        Both have as many poles of each type (ValueError else); by `SAME_COST` and `SAME_POLE`.
+        """
         if end.rss > best.rss * (1 + SAME_COST):
             return False
         for rate, best_rate in zip(_rates(end.poles), _rates(best.poles), strict=True):
@@ -217,7 +242,8 @@ class PoleSearch(Generic[Problem]):
         """End of the best descent from some poles (fixed ones first) and one more pair.
 
         The pair is sought by DIRECT on what the tangent space of these poles leaves of the output: whatever
-        their first-order changes explain is taken out (`Poles.doubled`).
+        their first-order changes explain is taken out (`Poles.doubled`). Raises ValueError where bounds leave
+        no box for a pair.
         """
         title = f"pair {poles.pairs.size - self.fixed.pairs.size + 1}"
         space = self.space(0, 1)
@@ -230,7 +256,7 @@ class PoleSearch(Generic[Problem]):
         """End of the best descent from some poles (fixed ones first) and one more real pole.
 
         Starts are the two best levels of a grid, twice as fine as that of a rescan, on what the tangent space
-        of the poles leaves of the output.
+        of the poles leaves of the output. Raises ValueError where bounds leave no box for a real pole.
         """
         space = self.space(1, 0)
         cost = self.data.candidate_cost(space, poles.doubled(), poles)
@@ -244,6 +270,7 @@ class PoleSearch(Generic[Problem]):
         """End of the best descent with one searched pair as two, a half-width apart.
 
         For two modes so close that `add_pair` sees none: one pair in the middle explains both to first order.
+        Each searched pair is a start; without any `min` raises ValueError.
         """
         starts = []
         for index in range(self.fixed.pairs.size, poles.pairs.size):
@@ -266,6 +293,7 @@ class PoleSearch(Generic[Problem]):
         Returns
         -------
         Refined
+            `best` itself where nothing gains.
 
         Notes
         -----
@@ -296,7 +324,7 @@ class PoleSearch(Generic[Problem]):
         """Best end of descents from the best points of a grid over one block of poles, the rest frozen.
 
         `best` itself where nothing gains. Points next to where the block is are left out: they would come
-        back.
+        back. Raises ValueError where bounds leave no box for the block.
         """
         poles = best.poles
         if block.part == "real":
@@ -331,7 +359,7 @@ class PoleSearch(Generic[Problem]):
     def colour(self, end: Refined) -> ResidualColour:
         """Colour of the residual of an end: whether it is white, and what it is worth in independent samples.
 
-        Kept for the end asked for last.
+        Kept for the end asked for last. The end is one of this search's data, which is not checked.
         """
         if self._coloured is None or self._coloured[0] is not end:
             residual = self.data.residual(end.poles)
@@ -344,6 +372,7 @@ class PoleSearch(Generic[Problem]):
         Parameters
         ----------
         poles : Poles
+            The start; outside the bounds it is brought inside.
         stage : str
             Name of the step in the trace.
         tolerance : float
@@ -353,6 +382,7 @@ class PoleSearch(Generic[Problem]):
         Returns
         -------
         Refined
+            The start itself where there is nothing to move, or nothing gains; after 60 steps where it is.
         """
         damping = FAR if tolerance >= ROUGH else NEAR
         end = refine(self.data, poles, self.bounds, self.fixed, tolerance=tolerance, damping=damping)
@@ -361,17 +391,21 @@ class PoleSearch(Generic[Problem]):
         return end
 
     def _best_descent(self, starts: Sequence[Poles], stage: str) -> Refined:
-        """End of a fine descent from the best end of rough descents from some starts."""
+        """End of a fine descent from the best end of rough descents from some starts; ValueError without
+        any."""
         return self.descend(self._best_rough(starts, stage).poles, stage)
 
     def _best_rough(self, starts: Sequence[Poles], stage: str) -> Refined:
-        """Best of the ends of rough descents from some starts, the first of equal ones."""
+        """Best of the ends of rough descents from some starts, the first of equal ones; ValueError without
+        any."""
         ends = [self.descend(start, stage, ROUGH) for start in starts]
         return min(ends, key=lambda end: end.rss)
 
     def _global(self, title: str, cost: CandidateCost, evaluations: int, count: int) -> RealArray:
-        """Up to `count` best points (C, D) apart from each other of a search by DIRECT; noted in the
-        trace."""
+        """Up to `count` best points (C, D) apart from each other of a search by DIRECT; noted in the trace.
+
+        title: of the stage; evaluations: of the cost, about. nlopt.runtime_error where NLopt fails at once.
+        """
         points, costs = minimise(cost.log, cost.space.dimension, self.options.algorithm, evaluations)
         self.evaluations += cost.evaluations
         coordinates = cost.space.coordinates(points)
@@ -406,7 +440,7 @@ class Fitted:
 
     @property
     def residual(self) -> RealArray:
-        """What the fit leaves of the output, (N,)."""
+        """What the fit leaves of the output, (N,), in its units."""
         return self.data.residual(self.poles)
 
     def worth(self) -> float:
@@ -430,6 +464,12 @@ class Fitted:
         Fitted
             Where the rows are the same their nuisance polynomials are, so that both sides of a comparison
             have them.
+
+        Raises
+        ------
+        ValueError
+            A setting is not allowed (`Structure`), or a record has no rows behind the delay (`prepare`).
+            TypeError for a name that the structure does not have.
         """
         data = prepare(records, replace(self.data.structure, **changed))
         if data.n_samples == self.data.n_samples:
@@ -440,7 +480,10 @@ class Fitted:
 
 def _rates(poles: Poles) -> list[float]:
     """Distances from one of the real poles, frequencies of the pairs and their decays, per sample, each by
-    size."""
+    size.
+
+    R + 2 P numbers; empty without poles.
+    """
     logs = [cmath.log(pole) for pole in poles.pairs.tolist()]
     distances = sorted(1 - pole for pole in poles.real.tolist())
     frequencies = sorted(abs(log) for log in logs)
@@ -459,7 +502,10 @@ def _pair_grid() -> RealArray:
 
 @cache
 def _real_grid(n_poles: int) -> RealArray:
-    """Levels of one real pole (E, 1), or all ordered couples of levels of two (E, 2), in the unit cube."""
+    """Levels of one real pole (E, 1), or all ordered couples of levels of two (E, 2), in the unit cube.
+
+    n_poles: 1 or 2; every other number counts as 2.
+    """
     levels = np.linspace(0, 1, REAL_LEVELS)
     if n_poles == 1:
         return levels[:, np.newaxis]
@@ -501,7 +547,8 @@ class SearchStage:
 
 @dataclass(frozen=True, eq=False)
 class PolishedMinimum:
-    """End of one descent: name of the step, the poles it reached and their residual sum of squares."""
+    """End of one descent: name of the step, the poles it reached (fixed first) and their residual sum of
+    squares J."""
 
     stage: str
     poles: Poles
