@@ -65,7 +65,8 @@ class TwoStage:
     records : tuple of Record
         Input u_hat, output y - G0 (u - u_hat), no reference.
     fit_percent : tuple of float
-        Of each record, 100 (1 - |u - u_hat| / |u - mean u|).
+        Of each record, 100 (1 - |u - u_hat| / |u - mean u|), of several inputs with the root mean square of
+        this ratio over them (deviations about means).
     plant : GobfModel or MimoModel
         G0.
     enough_percent : float
@@ -112,11 +113,13 @@ def two_stage(
     options : IdentOptions, optional
         Of the plant; the same are to be used for `identify` and `tangent` afterwards.
     plant : GobfModel, optional
-        G0; default: of a second stage on the direct fit.
+        Model G0 of the plant; default: fitted to the logs as they are, then to the records that this fit
+        opened.
 
     Returns
     -------
     TwoStage
+        One open-loop record of each, the share of its command that the reference explains, and G0.
 
     Raises
     ------

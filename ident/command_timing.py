@@ -90,7 +90,7 @@ class TimingSource(Enum):
     LAW : a linear law made every command from the rows, and a faster one would have shown
     REPEATS : the command changes every few rows only
     OPEN_LOOP : there is no controller; the command is taken as held from row to row
-    UNKNOWN : it is not
+    UNKNOWN : the period is not known; several holds are possible
     """
 
     STATED = "stated"
@@ -155,7 +155,7 @@ class CommandTiming:
     possible : tuple of Hold
         What the ellipses have to hold; empty where the period is known.
     middle : Hold
-        Of what is possible: what the ellipses are about.
+        The hold at whose response the ellipses have their centres.
     rows_per_command : int
         Rows that were logged for each command; above 1 only the rows at which it changes are used.
     first_row : tuple of int
@@ -177,14 +177,15 @@ class CommandTiming:
 
     @property
     def known(self) -> bool:
-        """Whether there is one possibility only, which the records are corrected for."""
+        """Whether there is one possibility only, which the records are corrected for: `possible` is empty."""
         return not self.possible
 
     @property
     def offered_dt_s(self) -> float:
         """Period, s, that a new controller may have.
 
-        The known one where it is a whole part of the step of the rows in use; else that step.
+        The known one where it is a whole part of the step of the rows in use, to `SAME_PERIOD`; else that
+        step. Never zero for a timing of `timing_of`.
         """
         used_step_s = self.row_step_s * self.rows_per_command
         if self.period_s is None:
@@ -196,7 +197,10 @@ class CommandTiming:
 
     @property
     def acts_at_once(self) -> bool:
-        """Whether the rows tell that the command of a row was made of the output of the same row."""
+        """Whether the rows tell that the command of a row was made of the output of the same row.
+
+        False without a law, and for a law that does not tell its period.
+        """
         return self.law is not None and self.law.tells_period and self.law.acts_at_once
 
 
@@ -223,6 +227,7 @@ def timing_of(
     Returns
     -------
     CommandTiming
+        By the first of: the stated period, open loop, a command that repeats, a law; else UNKNOWN.
 
     Raises
     ------

@@ -121,15 +121,18 @@ class FrfIdentification(Shown):
 
     @property
     def share_inside(self) -> float:
-        """Share of the measured points whose ellipses, of the measurement's own level, hold the model."""
+        """Share of the measured points whose ellipses, of the measurement's own level, hold the model.
+
+        0 .. 1; there is one point at least.
+        """
         return float(np.mean(self.distance <= 1.0))
 
     def to_control(self) -> Any:
-        """The model as `control.StateSpace`."""
+        """The model as `control.StateSpace`; ImportError without python-control."""
         return self.model.to_control()
 
     def save(self, path: str | Path) -> None:
-        """Write the model to a file, as `GobfModel.save` does."""
+        """Write the model to a file (`GobfModel.save`); OSError where it cannot be written."""
         self.model.save(path)
 
 
@@ -204,7 +207,7 @@ def identify_frf(
     to_last = np.array([[0.0, angles_rad[-1]]])
     points = np.column_stack([angles_rad, angles_rad])
     points_and_below = np.vstack([[0.0, angles_rad[0]], points])
-    # What lies above the last frequency first: the misfit that other poles follow may be gone with it.
+    # First what lies above the last frequency: a direct term may take the misfit that other poles follow.
     direct_term_helps = "feedthrough" not in options.model_fields_set
     best_fit = _limited_to_data(best_fit, response, options, to_last, also_direct_term=direct_term_helps)
     best_fit = _limited_to_data(best_fit, response, options, points_and_below)
@@ -365,7 +368,8 @@ def _limited_to_data(
         criterion = limited_fit.data.criterion(*read_from)(end.rss, end.poles.order)
         more_unknowns = limited_fit.data.n_parameters(end.poles.order) > given_unknowns
         allowed = given_criterion if more_unknowns else given_criterion + by_chance
-        # A pair is never damped beyond its largest ratio, not even where it should be wider.
+        # A limited fit may still hold a pair that no band shows: at the largest damping ratio it gets no
+        # wider.
         complies = poles_without_data(end.poles, limited_fit.search.fixed, measured_rad).order == 0
         if complies and criterion <= min(allowed, best_criterion):
             best_fit = limited_fit

@@ -140,11 +140,11 @@ class Identification(FittedRecords):
     model: GobfModel
 
     def to_control(self) -> Any:
-        """The model as `control.StateSpace`."""
+        """The model as `control.StateSpace`; ImportError without python-control."""
         return self.model.to_control()
 
     def save(self, path: str | Path) -> None:
-        """Write the model to a file, as `GobfModel.save` does."""
+        """Write the model to a file (`GobfModel.save`); OSError where it cannot be written."""
         self.model.save(path)
 
 
@@ -158,6 +158,7 @@ class MimoIdentification(FittedRecords):
     Attributes
     ----------
     model : MimoModel
+        One `MisoModel` for each output, with poles in common.
     noise_covariance : ndarray, shape (Y, Y)
         Of the outputs' noise, in their units.
     output_fit_percent : ndarray, shape (K, Y)
@@ -176,5 +177,5 @@ class MimoIdentification(FittedRecords):
     rank_one_test: float = 1.0
 
     def to_control(self) -> Any:
-        """The model as `control.StateSpace`."""
+        """The model as `control.StateSpace`; ImportError without python-control."""
         return self.model.to_control()

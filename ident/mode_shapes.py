@@ -126,7 +126,8 @@ class _ModeValue(NamedTuple):
     def seen(self, rows: RealArray | ComplexArray) -> RealArray:
         """Real rows (R, N) that complex rows (R, N) of the mode are at the outputs.
 
-        A pair's rows come with those of its conjugate: twice their real part.
+        A pair's rows come with those of its conjugate: twice their real part. Of a real mode the imaginary
+        part, which is zero, is left out.
         """
         if self.mode.is_pair:
             return 2 * np.real(rows)
@@ -147,6 +148,7 @@ class ShapedMode:
     pole : complex
         Real, or the upper one of a pair.
     residue : ndarray, shape (Y, U), complex
+        Of whitened outputs, for the inputs behind integrators and delay.
     moves : bool
         The pole is fitted; False: it was given.
     rank_one : bool
@@ -176,14 +178,17 @@ class ShapedMode:
         return int((outputs - 1) * (inputs - 1) * self.reals_per_number)
 
     def n_free(self) -> int:
-        """Free real numbers of the mode."""
+        """Free real numbers of the mode: those of the residue, and of the pole where it moves."""
         outputs, inputs = self.residue.shape
         residue_numbers = outputs + inputs - 1 if self.rank_one else outputs * inputs
         pole_numbers = 1 if self.moves else 0
         return int(self.reals_per_number * (residue_numbers + pole_numbers))
 
     def largest_input(self) -> int:
-        """Index of the input that drives the mode most: its share b of the shape is one."""
+        """Index of the input with the largest column of the residue: its share b of the shape is one.
+
+        The first of equals; 0 for a residue of zeros.
+        """
         return int(np.argmax(np.linalg.norm(self.residue, axis=0)))
 
     def pack(self, input_sizes: RealArray) -> RealArray:
@@ -380,9 +385,11 @@ class ModalFit:
     y : ndarray, shape (Y, N)
         Outputs of the same rows.
     linear_rows : ndarray, shape (Q, N)
+        Inputs a sample later, then inputs: U rows of each that the structure asks for; Q = 0, U or 2 U.
     x : ndarray, shape (P,)
         Free numbers of all modes.
     residual : ndarray, shape (Y, N)
+        What the modes leave of the outputs, projected off nuisances and linear rows.
     rss : float
         Its sum of squares.
     """
@@ -693,7 +700,8 @@ class ModalFit:
             yield mode.at(numbers)
 
     def values(self) -> list[_ModeValue]:
-        """Every mode as it is now: pole and residue (Y, U)."""
+        """Every mode as it is now, in the order of `modes`: pole and residue (Y, U), in whitened output
+        units."""
         return list(self._values_at(self.x))
 
     def shaped(self, before: Poles) -> Shaped:

@@ -55,7 +55,8 @@ from ident.search.pole_search import Fitted, PoleSearch, PolishedMinimum, Search
 
 # Factor in residual energy from a fit whose records begin in motion to one from rest. From it on, the search
 # from rest may have been led to other poles, and the records are searched anew; below it the search goes on
-# from the poles that were found from rest, which is faster. Set to 1 or doubled, no test of `identify` moves.
+# from the poles that were found from rest, which is faster. Chosen; set to 1 or doubled, no test of
+# `identify` moves.
 MISLED_FACTOR = 1.2
 # Fewest poles beside the fixed ones with which a search from rest counts as one that found the dynamics: one
 # real pole and a pair.
@@ -110,7 +111,7 @@ def part_of(report: Progress, begin: float, length: float) -> Progress:
     checked."""
 
     def report_step(share: float, message: str) -> None:
-        """Report a share of the step as one of the whole."""
+        """Report a share 0 .. 1 of the step as one of the whole; it is not checked."""
         report(begin + length * share, message)
 
     return report_step
@@ -315,7 +316,8 @@ def _searched_with_initial_state(
                 return replace(outcome, from_rest=left_out.finding)
         end = search.descend(from_rest.poles, "with initial state")
         polished = end
-        # Transients no larger than the noise leave the search from rest its bearings: go on from its poles.
+        # Where transients are no larger than the noise the search from rest was not misled: go on from its
+        # poles.
         if from_rest.end.rss < MISLED_FACTOR * end.rss:
             start = end
     if end.poles.order == 0 or not nuisance_test("initial state", from_rest, Fitted(search, end)).needed:

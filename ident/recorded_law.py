@@ -226,10 +226,9 @@ class _Columns:
     """Command, reference and output of some records, and the steps of their decimals.
 
     signals : of each record, the three columns (T,) as logged
-    command_step, reference_step, output_step : to which the columns were rounded, in their units, in root
-    mean
-        square over records or rows; 0: not rounded
-    largest : size of the largest command
+    command_step, reference_step, output_step : step to which each column was rounded, in its units; 0: not
+        rounded. Root mean square over records (command) or rows (others)
+    largest : size of the largest command, input units
     dt_s : step of the rows, s
     """
 

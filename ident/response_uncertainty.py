@@ -170,7 +170,7 @@ class Uncertainty(ResponsePosterior):
         return list(zip(at_modes.omega_rad_s.tolist(), relative_size.tolist(), strict=True))
 
     def to_control(self) -> object:
-        """`nominal` as `control.StateSpace`, without the ellipses."""
+        """`nominal` as `control.StateSpace`, without the ellipses; ImportError without python-control."""
         return self.nominal().to_control()
 
 
@@ -233,12 +233,14 @@ def uncertainty(
     records : sequence of Record
         Those of the identification.
     identification : Identification
+        Its model (poles, integrators, delay), its residuals, and warnings that make no answer likelier.
     options : EmbeddingOptions
         Kernel, taps, noise model and the probability of a missing mode.
 
     Returns
     -------
     Uncertainty
+        Without advice where the records are too short for the tests of residuals.
 
     Raises
     ------

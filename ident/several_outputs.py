@@ -59,7 +59,7 @@ WHITE_SHARE = 0.8
 # Power of a combination of outputs, each of unit length, below which it is zero. Sensors have at least a
 # millionth of their motion as noise, 1e-12 in power; a copied column leaves 1e-16 of rounding.
 SMALLEST_DISTINCT_POWER = 1e-12
-# Where the bar of progress stands when the rounds of search are over; the shapes of the modes follow.
+# Where the bar of progress stands when the rounds of search are over; the shapes of the modes follow. Chosen.
 ROUNDS_END = 0.9
 # Begin and length of every round, as shares of all of them: the first has no poles to start from, and takes
 # longer. Chosen; one entry for each of `NOISE_ROUNDS`.

@@ -108,7 +108,8 @@ class Stabilisation:
 
     @property
     def stable(self) -> BoolArray:
-        """Whether each pair has the same frequency and damping as with one pair less, (K,)."""
+        """Whether each pair has the same frequency and damping as with one pair less, (K,); False without
+        counterpart."""
         has_counterpart = self.previous >= 0
         return np.asarray(has_counterpart & self.same_damping)
 
@@ -159,6 +160,7 @@ def stabilisation(
     Returns
     -------
     Stabilisation
+        S fits, one for each number of pairs from 0, as far as the data go.
 
     Raises
     ------

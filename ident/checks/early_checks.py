@@ -70,7 +70,7 @@ _SHORTEST_PART = 32
 _NO_POWER = 1e-9
 
 # Samples over which the prediction test averages: from one up to a sixty-fourth of the sampling rate, for
-# machines that are far slower than their log.
+# machines that are far slower than their log. Chosen, by factors of four.
 _AVERAGED = (1, 4, 16, 64)
 # Earlier values of the output in a prediction: ten pairs of poles for what it does by itself. Chosen.
 _OWN_PAST = 20
@@ -347,7 +347,7 @@ def no_answer(records: Sequence[Record]) -> str:
     -----
     In open loop that is the input. In a loop noise of a sensor comes back in the input, so that only the
     reference and earlier inputs count. Nothing is said where a reference stands still, where a record is
-    short, or where readings wrap or jump as those of a sensor without a value: those have words of their own.
+    short, or where readings wrap or jump as those of a sensor without a value: other checks speak of those.
     Signals that stand still were complained of before. IndexError without records.
     """
     for record in records:

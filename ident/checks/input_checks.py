@@ -204,7 +204,7 @@ class CellBand(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Number of cells."""
+        """Number of cells; 0 for a band that does not exist yet."""
         return self.stop - self.start
 
 
@@ -365,7 +365,8 @@ def advice(
 def few_samples(data: Regression, order: int) -> list[Finding]:
     """Finding FEW_SAMPLES where records have fewer than ten samples for each unknown of a fit; else empty.
 
-    data : Regression: number of samples over all records, and of unknowns with `order` poles.
+    data : Regression: number of samples over all records, and of unknowns with `order` poles. The order, 0 or
+    more, is not checked.
     """
     unknowns = data.n_parameters(order)
     if data.n_samples >= SAMPLES_PER_UNKNOWN * unknowns:

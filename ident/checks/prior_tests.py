@@ -568,7 +568,7 @@ class NuisanceTest:
 
     @property
     def finding(self) -> Finding:
-        """The verdict as a finding, for the sentence."""
+        """The verdict as a finding NUISANCE, for the sentence: statistic and limit as above, level 0 .. 1."""
         return finding(
             FindingKind.NUISANCE,
             name=self.name,

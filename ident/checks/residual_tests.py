@@ -62,6 +62,7 @@ class ResidualTest:
     band : (K,) array
         |correlation| stays below it with probability `level` at each lag alone if the hypothesis holds.
     level : float
+        Between 0 and 1; that of both tests is .99.
     probability : float
         Of correlations as large as these, all lags together, if the hypothesis holds.
     passed : bool
@@ -410,7 +411,10 @@ class Simulated(Protocol):
         ...
 
     def residual(self, record: Record) -> RealArray:
-        """What the simulation leaves of a record, (T - delay,) in units of the output."""
+        """What the simulation leaves of a record, (T - delay,) in units of the output.
+
+        May raise ValueError for a record that is not one of its machine.
+        """
         ...
 
 

@@ -86,6 +86,7 @@ def fit_on_fresh_data(model: GobfModel | MisoModel | ResponsePosterior, record: 
     Returns
     -------
     FreshFit
+        Rows behind the input delay.
 
     Raises
     ------

@@ -41,7 +41,8 @@ OUTPUT_LAGS = 30
 INPUT_LAGS = 100
 # Rows that the shortest record has for each lag at least: the lags then take up a twentieth of the noise.
 ROWS_PER_LAG = 20
-# Records that have no room for so many lags tell no delay: of a single lag nothing can come before an answer.
+# Records that have no room for so many lags tell no delay: with a single lag there is none before an answer
+# that could be left out.
 FEWEST_LAGS = 2
 # Inputs that are missed less probably than this by chance are missed. Chosen: errors cost time only, as what
 # is found here is judged again.
@@ -209,6 +210,8 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     starts = []
     if missed.any():
         starts.append(int(np.argmax(missed)))
+    # Lags up to half the shortest record: behind a longer delay less than that is left to fit
+    # (`LONGEST_PART`).
     late = _late_answer(records, shortest // 2)
     if late > lags or (late and not starts):
         starts.append(late)
@@ -249,9 +252,9 @@ class SearchOutcome(Fitted):
     selection : OrderSelection
         Of the order, with its table.
     free : Refined or None
-        End of a descent with initial states, where the test of these took one.
+        End of the descent with free initial states by which these were tested; None where none was made.
     from_rest : Finding or None
-        What the test said that left initial states out.
+        The verdict by which initial states were left out without a descent; None else.
     dead_time : Finding or None
         The delay that was found.
     """
@@ -326,7 +329,7 @@ def _search(records: Sequence[Record], near: Fitted, delay: int) -> PoleSearch[R
 
 
 def _delay(fitted: Fitted) -> int:
-    """Input delay of a fit in samples."""
+    """Input delay of a fit in samples, 0 or more."""
     return fitted.data.structure.input_delay_samples
 
 
@@ -377,7 +380,10 @@ def gain(fitted: Fitted, other: Fitted) -> float:
 
 
 def _power_from(fitted: Fitted, delay: int) -> float:
-    """Sum of squares of the residual of a fit in the rows from this delay on, over all records."""
+    """Sum of squares of the residual of a fit in the rows from this delay on, over all records.
+
+    In output units squared; the delay is not below the fit's own.
+    """
     residual = fitted.residual
     # `delay` is at least the fit's own (`gain`); rows beyond the end of a record are an empty sum. Residuals
     # of a record begin behind the fit's own delay.

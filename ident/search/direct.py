@@ -86,6 +86,7 @@ def best_apart(points: RealArray, costs: RealArray, count: int, apart: float = S
     Parameters
     ----------
     points : (E, D) array
+        In the unit cube.
     costs : (E,) array
         Of equal costs the first counts as better.
     count : int

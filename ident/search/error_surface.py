@@ -133,6 +133,7 @@ def error_surface(
     Returns
     -------
     ErrorSurface
+        (A, B) mean squares, and where the model's own pair lies.
 
     Raises
     ------

@@ -251,7 +251,8 @@ class OrderSelection:
         """End with one real pole or two in the place of each pair without any overshoot, if that is likelier.
 
         As long as the criterion falls: what grows pair by pair makes such pairs of real poles. Then poles
-        that have met are parted (`_parted`). With stated numbers of poles `best` stays.
+        that have met are parted (`_parted`). With stated numbers of poles `best` stays. Without such pairs
+        and such poles `best` is returned.
         """
         while self.options.n_real is None and self.options.n_pairs is None:
             poles = best.poles
@@ -274,7 +275,8 @@ class OrderSelection:
         """End without poles that have met: a descent does not part them, and they have no residue each.
 
         One in the place of two, or two real poles further apart, whichever the criterion prefers. `best`
-        where no poles have met, or their numbers are stated.
+        where no poles have met, or their numbers are stated. Met: nearer than `MET` times their distance from
+        1; one couple is parted, others are left.
         """
         fixed = self.search.fixed
         poles = best.poles

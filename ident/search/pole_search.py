@@ -178,9 +178,9 @@ class PoleSearch(Generic[Problem]):
 
         Notes
         -----
-        It has settled if the first starts, far from each other, all end in one place that can be trusted
-        (`is_trusted`: a broad wrong minimum catches several, but leaves dynamics). Else `PATIENCE` times as
-        many starts as asked for are tried.
+        A search has settled (`rescan` then leaves its end as it is) if the first starts, far from each other,
+        all end in one place that can be trusted (`is_trusted`: a broad wrong minimum catches several, but
+        leaves dynamics). Else `PATIENCE` times as many starts as asked for are tried.
         """
         title = f"{n_real} real, {n_pairs} pairs"
         if n_real + n_pairs == 0:
@@ -444,7 +444,7 @@ class Fitted:
         return self.data.residual(self.poles)
 
     def worth(self) -> float:
-        """Independent samples that the residual is worth."""
+        """Independent samples that the residual is worth, at most N; N for a residual of zeros."""
         return self.search.colour(self.end).effective_samples
 
     def refitted(self, records: Sequence[Record], start: Poles, **changed: Any) -> Fitted:
@@ -493,7 +493,10 @@ def _rates(poles: Poles) -> list[float]:
 
 @cache
 def _pair_grid() -> RealArray:
-    """Frequencies and damping ratios of one pair, as points (E, 2) of the unit cube."""
+    """Frequencies and damping ratios of one pair, as points (E, 2) of the unit cube.
+
+    E = `PAIR_OMEGAS` times `PAIR_ZETAS`; nothing goes in.
+    """
     omegas = np.linspace(0, 1, PAIR_OMEGAS)
     # Inside the box: at its sides a pair has no damping, or no peak.
     zetas = np.linspace(0, 1, PAIR_ZETAS + 2)[1:-1]
@@ -524,9 +527,11 @@ class SearchStage:
     Attributes
     ----------
     title : str
+        Numbers of poles that were sought, as "2 real, 1 pairs".
     coordinate_names : tuple of str
         D names with units.
     points : (E, D) array
+        Coordinates in the units that their names say, not of the unit cube.
     log_cost : (E,) array
         Natural logarithm of J.
     """
@@ -566,6 +571,7 @@ class SearchTrace:
     minima : tuple of PolishedMinimum
         Ends of descents, in order.
     warnings : tuple of Finding
+        On poles at a bound and the like; empty where a later step looks for them.
     evaluations : int
         Of the cost, rescans and descents included.
     """
