@@ -74,7 +74,8 @@ def identify_in_noise(records: Sequence[Record], options: IdentOptions, identify
     Raises
     ------
     ValueError
-        What `identify` refuses; below (`whiteness_test`): residuals of 50 samples or fewer.
+        What `identify` refuses. Records of fewer than 13 rows for each of 4 + delay lags get the fit in white
+        noise.
     """
     # Each of both fits takes half of the bar of progress.
     plain = identify(records, options, 0.0, 0.5)

@@ -100,8 +100,8 @@ def ratio_of(model_dt_s: float, controller_dt_s: float) -> tuple[int, int]:
     Raises
     ------
     ValueError
-        Neither is a whole multiple of the other, or there are more than `MOST_STEPS`; nan is refused so, too.
-        A step of zero divides by zero: callers have them above zero.
+        Neither is a whole multiple of the other, or there are more than `MOST_STEPS`; of nan `round`
+        raises it. A step of zero divides by zero: callers have them above zero.
     """
     longer = controller_dt_s / model_dt_s
     if max(longer, 1 / longer) > MOST_STEPS * (1 + SAME_RATIO):

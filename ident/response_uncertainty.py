@@ -129,7 +129,7 @@ class Uncertainty(ResponsePosterior):
     def shown_grid(self) -> RealArray:
         """Frequencies (F,), rad/s, evenly in logarithm, over three decades up to the Nyquist frequency.
 
-        F is `FREQUENCIES`, the size of every grid of this package's own.
+        F is `FREQUENCIES`, 400, the size of such grids everywhere: 1.7 % apart here.
         """
         nyquist = np.pi / self.dt_s
         return np.geomspace(LOWEST_SHOWN_SHARE * nyquist, nyquist, FREQUENCIES)

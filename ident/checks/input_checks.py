@@ -569,8 +569,8 @@ def excitation_limit_rad_s(
     Returns
     -------
     float
-        0 without records. Of an input that stands still every line counts: the Nyquist frequency. With a
-        model a record without a residual is an IndexError.
+        0 without records. Of an input that stands still it means nothing: `refuse_unusable` has refused that.
+        With a model, a record without a residual is an IndexError.
 
     Notes
     -----
