@@ -230,6 +230,7 @@ def searched(
         structure = replace(structure, estimate_initial_state=True)
     if in_mid_record or len(part) < len(records):
         data = prepare(part, structure)
+    # Shares of the bar of progress here and below are chosen; they decide nothing.
     outcome = _searched(data, options, part_of(report, 0.0, 0.4))
     # In mid-record the free responses are there already.
     if options.estimate_initial_state == "auto" and not in_mid_record:
@@ -250,6 +251,7 @@ def _behind_dead_time(
     in_loop = any(record.reference is not None for record in records)
     if in_loop or outcome.search.options.input_delay_samples:
         return outcome, False
+    # Just behind the end of the search (.85) on the bar of progress.
     report(0.86, "dead time")
     starts, answers_at_once = first_answer(records)
     delayed = None
@@ -322,6 +324,7 @@ def _searched_with_initial_state(
             start = end
     if end.poles.order == 0 or not nuisance_test("initial state", from_rest, Fitted(search, end)).needed:
         return replace(outcome, free=polished)
+    # From .45 to .85 on the bar of progress, behind the first search.
     return _searched(data_in_motion, options, part_of(report, 0.45, 0.4), start)
 
 

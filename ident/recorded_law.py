@@ -179,6 +179,7 @@ def _tells_period(columns: _Columns, structure: _Structure, law: RecordedLaw) ->
     """
     least_excess = np.inf
     for parity in range(2):
+        # Rows twice, four and eight times as far apart: three steps show a power, and whether it grows.
         second = columns.least_residual(structure, 2, parity)
         fourth = columns.least_residual(structure, 4, parity)
         eighth = columns.least_residual(structure, 8, parity)

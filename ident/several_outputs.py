@@ -155,6 +155,7 @@ def identify_mimo(
         # With L L^T the covariance, L^-1 whitens what the last weights left.
         whitening = np.asarray(np.linalg.solve(np.linalg.cholesky(covariance), whitening))
 
+    # Half way from `ROUNDS_END` to the end of the bar.
     report(0.95, "one shape for every mode")
     return _identification(records, whitening, fitted, options, free_shapes=free_shapes)
 

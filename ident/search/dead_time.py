@@ -199,6 +199,7 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     if freedom < 1 or not noise > 0:
         return FirstAnswer((), at_once=False)
     # What leaving out the input at lag 0, 1, ... lags costs, each after those before it were left out.
+    # The last row of the triangle is that of the output itself, so lag 0 stands in the one before, at -2.
     last_column = triangle[-2 : -lags - 3 : -1, -1]
     costs = last_column**2 / noise
     at_once = bool(chi2.sf(costs[0], 1) < MISSED_BY_CHANCE)

@@ -161,6 +161,7 @@ class OrderSelection:
         """
         while self._counts(best).pairs < most_pairs and self._visible(best):
             n_pairs = self._counts(best).pairs
+            # Between a tenth and nine tenths of the bar of progress; chosen.
             self.progress(0.1 + 0.8 * n_pairs / max(most_pairs, 1), f"search for pole pair {n_pairs + 1}")
             trial = self._noted(self.search.rescan(self.search.add_pair(best.poles)))
             if self.options.n_pairs is None and not self._better(trial, best):
