@@ -19,9 +19,11 @@ from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
 
-# Worst case at which a trial ends: so much clear of the specification that the whole design meets it, too.
+# Worst case at which a trial ends, and at most which it counts as met: clear of 1 by 5 %, since a trial is
+# judged on coarser grids and by less search than the whole design, which has to stay below 1. Chosen.
 _CLEAR = 0.95
-# Ratio of neighbouring bandwidths, about: the full search closes a part of it again, by a lower gamma.
+# Ratio of neighbouring bandwidths, at most: the full search closes a part of it again, by a lower gamma.
+# Chosen; at the square root of it one trial more is made of every bisection.
 _RATIO = 1.3
 
 
@@ -38,9 +40,12 @@ def synthesise_widest(
     Parameters
     ----------
     plants : sequence of UncertainPlant
+        At least one; all of one sampling time.
     specification : Specification
-        From `bandwidth_rad_s` down to `lowest_bandwidth_rad_s`; without both, one design as `synthesise`.
+        From `bandwidth_rad_s` down to `lowest_bandwidth_rad_s`, rad/s; without both, one design as
+        `synthesise`.
     options : SynthesisOptions, optional
+        Effort of the last design; trials have it too, but end at gamma = .95.
     rng : numpy.random.Generator
         Every bandwidth is tried with the same starts.
     progress : callable, optional
@@ -52,16 +57,20 @@ def synthesise_widest(
         With the bandwidth that was designed for, and the order where "auto" was asked. Where no bandwidth is
         met, with the lowest one.
     result : SynthesisResult
+        Of a whole design; its `gamma` is above 1 where no bandwidth is met.
 
     Raises
     ------
     SpecificationError
-        Specification and plants contradict each other, at the bandwidth of the last design.
+        Specification and plants contradict each other, at the bandwidth of the last design; a trial that they
+        contradict counts as not met.
 
     Notes
     -----
-    Bisection: a wider bandwidth is taken to ask for more. Trials start from controllers of the Youla bound
-    only; what they miss and many starts would meet is not found.
+    Bisection: a wider bandwidth is taken to ask for more. Trials start from controllers of the Youla bound,
+    and from many starts only where these lead to nothing stable, until that has failed once; what many starts
+    would meet beside them is not found. Several bandwidths are designed for in the end where the whole design
+    misses one that a trial met.
     """
     options = options or SynthesisOptions()
     tell = progress or (lambda fraction, message: None)
@@ -72,6 +81,7 @@ def synthesise_widest(
         return with_order(specification, result), result
 
     count = 1 + int(np.ceil(np.log(top / lowest) / np.log(_RATIO)))
+    # At least both ends.
     bandwidths = np.geomspace(top, lowest, max(count, 2)).tolist()
     trials = [stated(specification, bandwidth) for bandwidth in bandwidths]
     # A trial ends before it can mend a pole that is slower than the plant's grids; a whole design does.
@@ -81,10 +91,15 @@ def synthesise_widest(
     many_starts_may_help = True
 
     def gamma(trial: Specification) -> float:
-        """Worst case of a quick design; inf: refused, or nothing stable."""
+        """Worst case (no unit) of a quick design; inf: refused, or nothing stable.
+
+        Where nothing is stable, `many_starts_may_help` goes to False for all later trials. Errors other than
+        SpecificationError go up.
+        """
         nonlocal many_starts_may_help
         tell(0.0, f"bandwidth {trial.bandwidth_rad_s:.3g} rad/s")
-        # Where no fit is stable, the bandwidth may still be met: by many starts.
+        # Where no fit of the Youla bound's controllers is stable, the bandwidth may still be met: by the many
+        # starts of a thorough search.
         for thorough in (False, True) if many_starts_may_help else (False,):
             try:
                 rng_of_trial = np.random.default_rng(seed)
@@ -93,11 +108,12 @@ def synthesise_widest(
                 return np.inf
             if np.isfinite(result.gamma):
                 return result.gamma
-        # What nothing stabilises, nothing stabilises at another bandwidth: the last design looks once more.
+        # Stability does not depend on the bandwidth asked: what many starts did not stabilise here, they are
+        # not expected to stabilise in another trial. The last design looks once more.
         many_starts_may_help = False
         return np.inf
 
-    # All from `high` on are met, or nothing is known of the last.
+    # Trial `high` is met, or it is the last, of which nothing is known; all before `low` are not met.
     low = 0
     high = len(trials) - 1
     while low < high:
@@ -120,12 +136,14 @@ def with_order(specification: Specification, result: SynthesisResult) -> Specifi
     Parameters
     ----------
     specification : Specification
+        Its `controller_order`: a number, or "auto".
     result : SynthesisResult
         A controller without states counts as no design.
 
     Returns
     -------
     Specification
+        The one given where nothing changes.
     """
     if specification.controller_order != "auto" or not result.controller.order:
         return specification
@@ -139,10 +157,12 @@ def stated(specification: Specification, bandwidth_rad_s: float) -> Specificatio
     ----------
     specification : Specification
     bandwidth_rad_s : float
+        Positive; not checked again, `synthesise` refuses what does not fit the plants.
 
     Returns
     -------
     Specification
+        A copy; three digits, as pages state them and no requirement is known better.
     """
     rounded = float(f"{bandwidth_rad_s:.3g}")
     return specification.model_copy(update={"bandwidth_rad_s": rounded, "lowest_bandwidth_rad_s": None})

@@ -31,7 +31,7 @@ from control_design.synthesis.minimax_step import (
 )
 from control_design.synthesis.rows import LoopRows, Rows
 
-# A descent ends where so many steps ..
+# A descent ends where so many steps .. (chosen: a box that has shrunk needs some ten to grow back)
 _PATIENCE = 15
 # .. gain less than this in the logarithm of the worst case: a tenth of a per cent.
 _SLOW = 1e-3
@@ -39,7 +39,8 @@ _SLOW = 1e-3
 _LEAST_GAIN = 1e-7
 # Rows this far below the worst, in the logarithm, are left out of a step: they cannot become it within one.
 _FAR_BELOW = 2.5
-# A step that gains less than this share of what it promised is corrected to second order.
+# A step that gains less than this share of what it promised is corrected to second order: the share below
+# which the box shrinks.
 _CORRECTED_BELOW = 0.25
 # Least logarithms of a section's denominator and a notch's numerator, in units of the scale: e^a is a
 # corner or a damping term, e^b a corner squared. Their negatives are the largest. So corners stay within
@@ -48,7 +49,8 @@ _LEAST_LOG = -12.0
 
 # Least logarithm of a corner squared: e^-20 is a corner of e^-10.
 _LEAST_LOG_OF_SQUARE = -20.0
-# Least gain of a section in its natural units: one whose numerator vanishes can still move.
+# Least gain of a section in its natural units: one whose numerator vanishes can still move. No gain that is
+# used comes near.
 _LEAST_GAIN_OF_SECTION = 1e-9
 
 
@@ -60,11 +62,11 @@ class MinimaxDescent:
     cascade : Cascade
         Sections of the controller, of n parameters.
     plants : sequence of Rows
-        Ellipses and weights of every plant on its grid.
+        Ellipses and weights of every plant on its grid; at least one weight above 0 (`LoopRows`).
     stable : callable
         Whether all nominal loops are stable under parameters (n,).
     controller_damping : float, optional
-        Least damping ratio of the controller's own pairs of poles; None: none asked.
+        Least damping ratio of the controller's own pairs of poles, positive; None: none asked.
     """
 
     def __init__(
@@ -117,6 +119,7 @@ class MinimaxDescent:
         -------
         float
             Over boundary points of the ellipses; inf for an unstable nominal loop or an ellipse over -1.
+            `Cascade` raises ValueError for another number of parameters.
         """
         logs = self._logs(parameters)
         return float("inf") if logs is None else float(np.exp(np.max(logs)))
@@ -127,6 +130,7 @@ class MinimaxDescent:
         Parameters
         ----------
         start : ndarray, shape (n,)
+            Clipped to the bounds of the parameters first.
         steps : int
             At most; steps that are not accepted count.
 
@@ -135,7 +139,7 @@ class MinimaxDescent:
         x : ndarray, shape (n,)
             Parameters where it ended.
         gamma : float
-            Worst case there, as `value`; inf: the start is unstable, and x is the start.
+            Worst case there, as `value`; inf: the start is unstable, and x is the clipped start.
         taken : int
             Steps taken.
         """
@@ -198,7 +202,8 @@ class MinimaxDescent:
         """Model of the rows at x (n,): values, slopes, and their curvature weighted by multipliers (R,).
 
         The curvature is made positive semi-definite in natural units, so that the programme of a step is
-        convex; without multipliers, in the first step, it is zero.
+        convex; without multipliers, in the first step, it is zero. Raises LinAlgError where slopes are not
+        finite, which a stable loop with bounded parameters does not show.
         """
         curvature = np.zeros((x.size, x.size))
         unit = natural_units(self.cascade, x)
@@ -212,7 +217,8 @@ class MinimaxDescent:
         """Step d (n,) in natural units with the smallest largest row, |d| <= box; None where that fails.
 
         log (R,): values of the rows, which a second-order correction changes. Bounds of the parameters and
-        the damping asked are kept. The multipliers returned are those of all rows (R,).
+        the damping asked are kept. The multipliers returned are those of all rows (R,), 0 of those left out.
+        It fails where `minimax_step` does: mostly by rounding, or by a damping that x misses beyond the box.
         """
         unit = local.unit
         near = log > np.max(log) - _FAR_BELOW
@@ -231,7 +237,8 @@ class MinimaxDescent:
 
 
 class _Local(NamedTuple):
-    """Model at a point: log (R,), slope (R, n), curvature (n, n), natural unit of each parameter (n,)."""
+    """Model at a point: log (R,) of the weighted values, slope (R, n) and curvature (n, n) in the parameters
+    themselves, natural unit of each parameter (n,)."""
 
     log: Real
     slope: Real
@@ -252,7 +259,12 @@ def natural_units(cascade: Cascade, x: Real) -> Real:
     -------
     ndarray, shape (n,)
         Of logarithms: 1. Of numerators: the section's gain times its corner to the power that the
-        coefficient's p lacks, so that each changes the section by about its gain at its corner.
+        coefficient's p lacks, so that each changes the section by about its gain at its corner. All positive.
+
+    Raises
+    ------
+    ValueError
+        Another number of parameters, from `Cascade.split`.
     """
     units: list[float] = []
     for kind, (numerator, denominator) in zip(cascade.sections, cascade.split(x), strict=True):

@@ -23,7 +23,8 @@ import numpy as np
 from control_design.plants.ellipses import Real
 from ident.data.arrays import COMPILED, INSIDE
 
-# Half width of the first box, in natural units: a third of a substantial change of every parameter.
+# Half width of the first box, in natural units: a third of a substantial change of every parameter. Chosen;
+# `adapted_box` corrects it within a few steps.
 FIRST_BOX = 0.3
 # Largest half width: beyond a natural unit no linear row says anything.
 LARGEST_BOX = 1.0
@@ -36,7 +37,7 @@ ACCEPTED_SHARE = 0.02
 # named above are 3/4 and 1/4.
 _ENLARGED_ABOVE = 0.7
 
-# Share of the predicted gain below which the box shrinks.
+# Share of the predicted gain below which the box shrinks: that of the algorithm named above.
 _SHRUNK_BELOW = 0.25
 
 # Factor by which it grows, that of the algorithm named above.
@@ -45,19 +46,23 @@ _ENLARGEMENT = 2.0
 # Factor by which it shrinks; the algorithm named above takes 1/4. Chosen.
 _SHRINKAGE = 0.35
 
-# Iterations of the interior point; 8 to 15 are usual.
+# Iterations of the interior point, at most; 8 to 15 are usual, so one that takes 40 will not come to its end.
 _MOST_ITERATIONS = 40
-# Complementarity and row residuals at the end, in the logarithm of the worst case.
+# Complementarity and row residuals at the end, in the logarithm of the worst case: a tenth of the least gain
+# that a descent takes a step for.
 _ACCURACY = 1e-8
-# Residual of the stationarity at the end, of a step of natural size; rounding leaves 1e-7.
+# Residual of the stationarity at the end, where multipliers add up to one; rounding leaves 1e-7.
 _STATIONARY = 1e-5
-# Complementarity with which an end counts although the iterations ran out or stopped at rounding.
+# Complementarity with which an end counts although the iterations ran out or stopped at rounding: the level
+# then is too high by at most this, a tenth of the fourth digit of a worst case.
 _USABLE_GAP = 1e-5
-# Excess over the box that is rounding, and clipped.
+# Excess over the box that is rounding, and clipped: a hundredth of the smallest box.
 _ROUNDING = 1e-6
-# Room of a bound that is met exactly: the interior point needs an interior.
+# Room of a bound that is met exactly: the interior point needs an interior. A thousandth of what is clipped
+# as rounding, so no bound moves.
 _LEAST_ROOM = 1e-9
-# Height of the first s above the largest row, in logarithms, so that every row has slack.
+# Height of the first s above the largest row, in logarithms, so that every row has slack: of the size of what
+# a step gains. Chosen; the iterations move s anyway.
 _FIRST_SLACK = 0.1
 
 
@@ -88,9 +93,10 @@ def adapted_box(box: float, actual: float, predicted: float) -> float:
     box : float
         Half width of the step before, in natural units.
     actual : float
-        What that step gained; -inf: it left stability.
+        What that step gained; -inf: it left stability. nan leaves the box as it is.
     predicted : float
-        What its model promised.
+        What its model promised, in the same unit; positive, as a descent ends before a step that gains
+        nothing (not checked).
 
     Returns
     -------
@@ -112,13 +118,14 @@ def minimax_step(
     Parameters
     ----------
     value : ndarray, shape (R,)
-        Rows f at d = 0.
+        Rows f at d = 0, logarithms of weighted worst cases (log gamma, or log gamma^2 of several joints);
+        R >= 1, else numpy's ValueError of an empty maximum.
     slope : ndarray, shape (R, n)
-        Their slopes F.
+        Their slopes F, in natural units of the n parameters.
     curvature : ndarray, shape (n, n)
-        H, positive semi-definite.
+        H, positive semi-definite (not checked).
     low, high : ndarray, shape (n,)
-        Box; low < 0 < high.
+        Box in natural units; low <= 0 <= high, where a 0 gets the room `_LEAST_ROOM` (not checked).
     a : ndarray, shape (L, n)
         Side conditions a d <= b; L may be 0.
     b : ndarray, shape (L,)
@@ -126,7 +133,13 @@ def minimax_step(
     Returns
     -------
     MinimaxStep or None
-        None where the interior point fails: no d of the box meets a d <= b, or rounding spoils the solution.
+        None where the interior point fails: no d of the box meets a d <= b, a value is nan, or rounding
+        spoils the solution. `level` is that of d before it is clipped to the box by at most `_ROUNDING`.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not fit, from numpy.
     """
     n = slope.shape[1]
     rows = value.size
@@ -173,7 +186,8 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
     optimum in place. The first `rows` inequalities are those of the rows, whose multipliers add up to one.
     Neither the iterations running out nor rounding is an error here: the caller sees the complementarity.
     """
-    # Slacks far enough from 0 for a first step, and multipliers whose products with them are alike.
+    # Slacks of at least 1e-3, far enough from 0 for a first step, and multipliers whose products with them
+    # are alike, 0.1 each (the rows' own are scaled to the sum 1, which stationarity asks). Both chosen.
     slack = np.maximum(limit - matrix @ v, 1e-3)
     z = 0.1 / slack
     z[:rows] /= np.sum(z[:rows])
@@ -185,7 +199,8 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
         missed = max(np.sum(slack * z), np.max(np.abs(primal)))
         if missed < _ACCURACY and np.max(np.abs(dual)) < _STATIONARY:
             break
-        # Normal equations, with a trace of 1e-12 on the diagonal where rows leave a direction free.
+        # Normal equations, with a trace of 1e-12, some thousand times rounding, on the diagonal where rows
+        # leave a direction free: without it the solution would raise LinAlgError.
         ratio = z / slack
         centre = slack * z
         normal = hessian + (matrix.T * ratio) @ matrix
@@ -202,12 +217,13 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
             step = -np.linalg.solve(normal, dual + pull @ matrix)
             moved = primal + matrix @ step
             dz = ratio * moved - centre / slack
+            # Longest steps of slacks and of multipliers, each by itself.
             first = _longest(slack, -moved)
             second = _longest(z, dz)
             if corrector == 0:
                 after = np.mean((slack - first * moved) * (z + second * dz))
                 centre = centre - moved * dz - gap * min(1.0, after / gap) ** 3
-        # 0.995: not quite to the boundary, where the next step would have no room.
+        # 0.995: not quite to the boundary, where the next step would have no room (usual: .99 to .9995).
         v += 0.995 * first * step
         slack -= 0.995 * first * moved
         z += 0.995 * second * dz
@@ -216,7 +232,10 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
 
 @numba.njit(**INSIDE)
 def _longest(value: Real, step: Real) -> float:
-    """Longest length in [0, 1] for which value + length * step (m,) stays positive; value > 0."""
+    """Longest length in [0, 1] for which value + length * step (m,) does not become negative.
+
+    value (m,) > 0, which every iteration keeps (not checked); a nan in step is passed over.
+    """
     length = 1.0
     for i in range(value.size):
         if length * step[i] < -value[i]:

@@ -19,25 +19,31 @@ import numpy as np
 
 from control_design.plants.ellipses import Boolean, Complex, Real
 
-# Highest corner of a block, in units of the scale; the scale is where the loop crosses, about.
+# Highest corner of a block, in units of the scale; the scale is where the loop crosses, about, and corners
+# that much faster are a gain to it. Chosen.
 _FASTEST = 60.0
 # Highest damping ratio of a block: two real poles (2 zeta)^2 = 10^4 apart, nearly any pair of real poles.
 _MOST_DAMPED = 50.0
-# Least natural unit of D. Where a part of K vanishes, its own size as its unit would keep it there.
+# Least natural unit of D. Where a part of K vanishes, its own size as its unit would keep it there. Far below
+# any gain that is used.
 _LEAST_GAIN = 1e-9
-# Least natural unit of B, whose blocks begin with entries of one.
+# Least natural unit of B, whose blocks begin with entries of one: small beside them. Chosen.
 _LEAST_B = 1e-3
 # Least natural unit of C, over the gain of D over the size of B. Doubled, an idle block takes larger first
 # steps, and problem T of `benchmarks.mimo_designs` ends 8 % (full) and 27 % (decentralised) higher after
 # six rounds.
 _LEAST_C_OF_GAIN = 0.05
-# Least natural unit of C_0, over the gain of D times the scale.
+# Least natural unit of C_0, over the gain of D times the scale: integral action with a corner of a hundredth
+# of the scale. Chosen.
 _LEAST_C_0_OF_GAIN = 0.01
-# Imaginary part, of the modulus, up to which a pole counts as real: rounding of an eigenvalue.
+# Imaginary part, of the modulus, up to which a pole counts as real: rounding of an eigenvalue, above the
+# 1e-16 of a single one, below the 1e-8 of a double one.
 _REAL = 1e-9
-# Coordinates of a block that are tried, evenly over half a turn; the best has the smallest norms of C and B.
+# Coordinates of a block that are tried, evenly over half a turn, every 7.5 degrees; the best has the smallest
+# norms of C and B. Chosen: a start only.
 _TURNS = 24
 # Condition number of coordinates beyond which they are no basis: two poles coincide, or the angle is unlucky.
+# Half of the digits are left there.
 _WORST_CONDITION = 1e9
 
 
@@ -51,8 +57,9 @@ class ModalParts(NamedTuple):
     C : ndarray, shape (P, m, U, 2)
     B : ndarray, shape (P, m, 2, Y)
     D : ndarray, shape (P, U, Y)
+        Command per error, as C B is.
     C_0 : ndarray, shape (P, U, i)
-        Gains of the integrators.
+        Gains of the integrators, D's unit times rad/s.
     """
 
     log_w: Real
@@ -77,15 +84,18 @@ class ModalForm:
     scale_rad_s : float
         Frequency around which the controller acts.
     slowest_rad_s : float
-        Lowest corner of a block.
+        Lowest corner of a block, below `_FASTEST` scales.
     dt_s : float
+        Sampling period, seconds; used by `discrete` only.
     damping : float
-        Least damping ratio of a block.
+        Least damping ratio of a block, positive and below `_MOST_DAMPED`. Like the frequencies it is not
+        checked; its logarithm is taken.
 
     Raises
     ------
     ValueError
-        The order is not one for each integrator and two for each block.
+        The order is not one for each integrator and two for each block. A pattern with zeros and no entry at
+        all is a ZeroDivisionError, if there are blocks.
     """
 
     def __init__(
@@ -141,6 +151,7 @@ class ModalForm:
         Parameters
         ----------
         x : ndarray, shape (P, n)
+            Fewer columns are numpy's ValueError; what stands beyond n is left out.
 
         Returns
         -------
@@ -181,7 +192,8 @@ class ModalForm:
         return np.concatenate([log_w, log_z, C[self._c], B[self._b], D[self._d], C_0[self._i]])
 
     def bounds(self) -> tuple[Real, Real]:
-        """Least and largest value (n,) of every parameter; C, B, D and C_0 are free."""
+        """Least and largest value (n,) of every parameter: corners from `slowest` to `_FASTEST` scales,
+        damping ratios from `damping` to `_MOST_DAMPED`, as logarithms; C, B, D and C_0 are free."""
         low = np.full(self.parameters, -np.inf)
         high = np.full(self.parameters, np.inf)
         m = self.blocks
@@ -203,7 +215,7 @@ class ModalForm:
         -------
         ndarray, shape (n,)
             1 for logarithms; root mean squares of D, of each block's B and C, and of C_0, with a least value
-            that lets an idle block begin to move.
+            that lets an idle block begin to move. All positive for finite x.
         """
         parts = self._split_one(x)
         direct_gain = float(np.sqrt(np.mean(parts.D[self.pattern] ** 2)))
@@ -231,7 +243,7 @@ class ModalForm:
         Parameters
         ----------
         lowest, highest : float
-            First and last corner, in units of the scale; logarithmic between them.
+            First and last corner, in units of the scale, positive; logarithmic between them.
         zeta : float
             Damping ratio, if not less than the form's least.
 
@@ -241,6 +253,7 @@ class ModalForm:
         C : ndarray, shape (m, U, 2)
             Zero.
         B : ndarray, shape (m, 2, Y)
+            Entries of 1 and 0.
 
         Notes
         -----
@@ -267,7 +280,8 @@ class ModalForm:
         Parameters
         ----------
         A, B, C, D : ndarray
-            Of K(s), with as many states as the form.
+            Of K(s), time in seconds, with as many states as the form (not checked: other numbers of poles
+            are an IndexError) and U commands of Y errors; for a full pattern.
 
         Returns
         -------
@@ -275,6 +289,11 @@ class ModalForm:
             Unstable poles are mirrored, the slowest real ones become the integrators, and corners and
             dampings are moved into their bounds. Every block has unit norm at its input. None where real
             poles do not pair, or two poles of a pair are the same.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            A is not finite, or its eigenvectors are no basis.
 
         Notes
         -----
@@ -338,7 +357,11 @@ class ModalForm:
     # Values and slopes
 
     def _resolvent(self, log_w: Real, log_z: Real, s: Complex) -> tuple[Complex, Complex]:
-        """s / w (P, R, m) and (s / w - M)^-1 (P, R, m, 2, 2) of blocks (P, m) at s (R,)."""
+        """s / w (P, R, m) and (s / w - M)^-1 (P, R, m, 2, 2) of blocks (P, m) at s (R,), without unit.
+
+        log_w, log_z (P, m): logarithms of corner, rad/s, and damping ratio. s on a pole of a block would give
+        inf; s on the imaginary axis never is, as damping is positive.
+        """
         w = np.exp(log_w)
         zeta = np.exp(log_z)
         ratio = s[None, :, None] / w[:, None, :]
@@ -360,11 +383,12 @@ class ModalForm:
         ----------
         x : ndarray, shape (P, n)
         s : ndarray, shape (R,)
-            Tustin's s.
+            Tustin's s, rad/s; not 0 where there is an integrator (inf and a warning of numpy).
 
         Returns
         -------
         ndarray, shape (P, R, U, Y)
+            Command per error.
         """
         parts = self.split(x)
         _, E = self._resolvent(parts.log_w, parts.log_zeta, s)
@@ -382,13 +406,14 @@ class ModalForm:
         ----------
         x : ndarray, shape (P, n)
         s : ndarray, shape (R,)
-            Tustin's s.
+            Tustin's s, rad/s; not 0 where there is an integrator.
         left : ndarray, shape (P, R, U)
         right : ndarray, shape (P, R, Y)
 
         Returns
         -------
         ndarray, shape (P, R, n)
+            Complex: left^H (dK/dx_i) right of each parameter x_i.
         """
         log_w, log_z, C, B, _, _ = self.split(x)
         ratio, E = self._resolvent(log_w, log_z, s)
@@ -425,11 +450,12 @@ class ModalForm:
         Parameters
         ----------
         x : ndarray, shape (n,)
+            As `split` takes it; logarithms beyond 700 overflow, which `bounds` excludes.
 
         Returns
         -------
         A, B, C, D : ndarray, shapes (order, order), (order, Y), (U, order), (U, Y)
-            States: integrators, then two for each block.
+            Time in seconds. States: integrators, then two for each block.
         """
         parts = self._split_one(x)
         n_integrators = self.integrates.size
@@ -455,10 +481,12 @@ class ModalForm:
         Parameters
         ----------
         x : ndarray, shape (n,)
+            As `split` takes it.
 
         Returns
         -------
         A, B, C, D : ndarray, shapes (order, order), (order, Y), (U, order), (U, Y)
+            States as of `continuous`.
         """
         return tustin(*self.continuous(x), self.dt_s)
 
@@ -468,14 +496,20 @@ def tustin(A: Real, B: Real, C: Real, D: Real, dt_s: float) -> tuple[Real, Real,
 
     Parameters
     ----------
-    A, B, C, D : ndarray
-        Continuous state space; no pole at s = 2/dt.
+    A, B, C, D : ndarray, shapes (n, n), (n, Y), (U, n), (U, Y)
+        Continuous state space, time in seconds.
     dt_s : float
+        Sampling period, seconds; positive (not checked).
 
     Returns
     -------
     A, B, C, D : ndarray
         Of the same shapes.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A pole at s = 2/dt, where z is infinite.
     """
     eye = np.eye(A.shape[0])
     half_step = A * dt_s / 2
@@ -490,7 +524,8 @@ def tustin(A: Real, B: Real, C: Real, D: Real, dt_s: float) -> tuple[Real, Real,
 def _rectangles(pattern: Boolean, count: int) -> list[tuple[Boolean, Boolean]]:
     """Rows (U,) and columns (Y,) of K that each of `count` blocks belongs to, as masks.
 
-    All of a full pattern (U, Y); else one actuator at a time, in turn, with the outputs that it may use.
+    All of a full pattern (U, Y); else one actuator at a time, in turn, with the outputs that it may use. A
+    pattern without any entry is a ZeroDivisionError, unless count is 0.
     """
     inputs, outputs = pattern.shape
     if pattern.all():

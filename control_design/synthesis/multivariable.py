@@ -40,41 +40,50 @@ from ident.data.shown import Shown
 # a full and for a decentralised controller, after six rounds of eight steps: other valleys of the same
 # search.
 
-# Damping ratio below which poles of loop and controller have frequencies of their own in every check.
+# Damping ratio below which poles of loop and controller have frequencies of their own in every check: wider
+# ones have several points of the dense grid in their width. Chosen.
 _LIGHT = 0.3
-# Where they have them, in half-widths (damping ratio times frequency) from the pole.
+# Where they have them, in half-widths (damping ratio times frequency) from the pole: a peak between two of
+# the inner points is missed by 2 % at most. Chosen.
 _AROUND = np.array([-3, -1.5, -0.7, -0.3, 0, 0.3, 0.7, 1.5, 3])
-# Least damping ratio that such a half-width is made of.
+# Least damping ratio that such a half-width is made of: its points stay apart by far more than rounding.
+# Chosen.
 _LEAST_DAMPING = 1e-5
 # Damping ratio of a plant's mode that its grid is made for, at least: narrower ones have no points inside.
+# Chosen.
 _LEAST_MODE_DAMPING = 1e-4
 # Highest frequency of a grid over Nyquist, where Tustin's s is infinite.
 _BELOW_NYQUIST = 0.9999
 # Relative excess of the dense check over the lean grid that is accepted, as of one joint
 # (EXCHANGE_TOLERANCE).
 _EXCESS = 5e-4
-# Relative accuracy of gamma in every check.
+# Relative accuracy of gamma in every check: far below the excess that is accepted.
 _ACCURACY = 1e-6
-# Lowest frequency of the grids over the slowest corner of a weight.
+# Lowest frequency of the grids over the slowest corner of a weight: a decade below, the weight is constant to
+# a half per cent.
 _BELOW_CORNERS = 0.1
-# Scale over Nyquist, where no joint has a bandwidth or a tracking weight.
+# Scale over Nyquist, where no joint has a bandwidth or a tracking weight: that of one joint (`Grids`).
+# Chosen.
 _SCALE_OF_NYQUIST = 0.1
 # Unit of the form's corners over the scale. Doubled: 7 and 33 %.
 _FORM_SCALE = 2
 # Lowest corner of a block over the lowest frequency of the grids, which has to see the corner. Doubled,
 # nothing moves.
 _SLOWEST_CORNER = 2
-# Frequencies over the scale at which a static gain inverts the plant.
+# Frequencies over the scale at which a static gain inverts the plant: half decades around it, more of them
+# above, where stiff joints are inverted. Chosen.
 _INVERTED_AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)
 # Lags, in half turns, by which the plant is turned before: plants that integrate lag by a half of one.
 _LAGS = (0.0, 0.25, 0.5)
-# Gains over the inverse that are tried, the largest first: 16 down to 2^-13.
+# Gains over the inverse that are tried, the largest first: 16 down to 2^-13. Chosen: a loop gain of 16 is
+# mostly unstable, and one of 1e-4 does nothing.
 _GAINS = 2.0 ** np.arange(4.0, -14.0, -1.0)
 # Corner of integral action over the frequency of inversion. Doubled, nothing moves, with integrators either.
 _INTEGRAL_CORNER = 0.1
-# Relative difference of worst cases below which two static gains count as one.
+# Relative difference of worst cases below which two static gains count as one: three digits of a start.
 _SAME = 1e-3
-# What the ball puts in, over the references, in the weighted plant of an H-infinity start.
+# What the ball puts in, over the references, in the weighted plant of an H-infinity start: each gives another
+# start, of which the best counts. Chosen, half decades.
 _SCALINGS = (0.03, 0.1, 0.3, 1.0)
 # Lowest corner of the blocks that do nothing yet, over the form's unit. Doubled: 4 and 33 %.
 _LOWEST_IDLE_CORNER = 0.1
@@ -84,7 +93,8 @@ _HIGHEST_IDLE_CORNER = 30.0
 _IDLE_DAMPING = 0.7
 # Violated frequencies that are added in a round, of each plant. Doubled, nothing moves.
 _MOST_ADDED = 15
-# Points around a mode in the dense grid over those in the lean one.
+# Points around a mode in the dense grid over those in the lean one. Chosen; the logarithmic points of both
+# are options, ten to one by default.
 _DENSE_OVER_LEAN = 5
 
 
@@ -102,9 +112,9 @@ class MultivariableResult(Shown):
     worst : dict of str to float
         Worst case of each requirement, by name.
     blocking : tuple of BlockingPoint
-        Where each requirement is worst, the largest first.
+        Where each requirement is worst, the largest first: plant, frequency in rad/s, value and joint.
     steps : int
-        Of all descents.
+        Of all descents, also those not accepted.
     """
 
     outcome: Outcome
@@ -127,7 +137,7 @@ def synthesise_multivariable(
     Parameters
     ----------
     plants : MultivariablePlant or sequence of MultivariablePlant
-        Operating points; all share dt, U and Y.
+        Operating points; all share dt, U and Y. None at all is an IndexError.
     specification : MultivariableSpecification
         What is asked of each joint, order and structure of K.
     options : MultivariableOptions, optional
@@ -178,8 +188,11 @@ class Programme:
     Parameters
     ----------
     plants : tuple of MultivariablePlant
+        At least one (an IndexError without).
     specification : MultivariableSpecification
+        Its `joints` (bandwidth, weights, integrator of each), order, structure, delay and limits.
     options : MultivariableOptions
+        Sizes of the grids, rounds and steps.
 
     Raises
     ------
@@ -235,7 +248,7 @@ class Programme:
         """Frequencies (F,) of one plant, rad/s: so many logarithmic points, and so many around each mode.
 
         Zeros count as modes: a controller may cancel them. Of a plant that is known on its own frequencies
-        only, those.
+        only, those below Nyquist, and the numbers do not count.
         """
         if plant.own_grid is not None:
             below_nyquist = plant.own_grid < self.nyquist_rad_s
@@ -253,10 +266,13 @@ class Programme:
     def _scale(self) -> float:
         """Frequency, rad/s, around which the controller has to act.
 
-        The geometric mean of the joints' bandwidths and of where their tracking weights fall to one.
+        The geometric mean of the joints' bandwidths and of where their tracking weights fall to one; without
+        any, `_SCALE_OF_NYQUIST` of Nyquist.
         """
         bandwidths = [joint.bandwidth_rad_s for joint in self.spec.joints]
         frequencies = [bandwidth for bandwidth in bandwidths if bandwidth is not None]
+        # Eighty points a decade: the frequency of a weight is known to 3 %, which a scale need not be. Up to
+        # .99 of Nyquist, where Tustin's s is infinite.
         omega = np.geomspace(1e-5, 0.99, 400) * np.pi / self.dt_s
         for joint in self.spec.joints:
             weight = joint.sensitivity_weight
@@ -270,7 +286,8 @@ class Programme:
         return float(np.exp(np.mean(np.log(frequencies))))
 
     def _form(self, order: int) -> ModalForm:
-        """Map between parameters and a controller with so many states."""
+        """Map between parameters and a controller with so many states; `ModalForm` refuses an order that is
+        not one for each integrator and two for each block (ValueError)."""
         joints = self.spec.joints[: self.plants[0].outputs]
         return ModalForm(
             self.pattern,
@@ -312,6 +329,7 @@ class Programme:
                     K = central_controller(P)
                     if K is None or K.A.shape[0] < self.form.order:
                         continue
+                    # Up to Tustin's s of half of Nyquist, 2/dt: beyond it nothing of K is asked.
                     K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
                     x = self.form.realised(*K)
                     if x is not None:
@@ -389,7 +407,7 @@ class Programme:
         Parameters
         ----------
         x : ndarray, shape (n,)
-            Where to begin.
+            Where to begin; from one that is not robustly stable it returns at once.
         tell : callable
             Called with (fraction, message) at every round.
 
@@ -428,10 +446,12 @@ class Programme:
                 # Else once more from the same point, with the frequencies that were missing.
                 x = end
             grids_agree = worst <= reached * (1 + _EXCESS)
+            # A round that gains less than half of the excess accepted is as good as ended.
             has_ended = steps < self.options.steps or gain < _EXCESS / 2
             if (grids_agree and has_ended) or least <= self.options.sufficient_gamma:
                 break
 
+            # Half of the excess accepted, so that what just passed does not come back in the next round.
             limit = reached * (1 + 0.5 * _EXCESS)
             for i, (omega, value) in enumerate(checked):
                 maxima = [k for k in local_maxima(value) if value[k] > limit]
@@ -442,7 +462,10 @@ class Programme:
         return best, least
 
     def worst(self, x: Real) -> float:
-        """Worst case of parameters x (n,) on the dense grid; inf for an unstable nominal loop."""
+        """Worst case of parameters x (n,) on the dense grid and around light poles.
+
+        inf for an unstable nominal loop, or where some row shows no robust stability.
+        """
         a, b, c, d = self.form.discrete(x)
         if not all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops):
             return float("inf")
@@ -454,7 +477,7 @@ class Programme:
         Parameters
         ----------
         x : ndarray, shape (n,)
-            With stable nominal loops.
+            With stable nominal loops (not checked: of an unstable one the values mean nothing).
 
         Returns
         -------
@@ -483,14 +506,15 @@ class Programme:
         return checked
 
     def _gamma(self, x: Real, stack: StackedRows) -> Real:
-        """Worst case (R,) of every row of a stack under parameters x (n,)."""
+        """Worst case (R,) of every row of a stack under parameters x (n,); inf where no robust stability is
+        shown. The stack's rows and its `s` (R,), Tustin's s, are what counts."""
         K = self.form.response(x[None], stack.s)[0]
         return scaled_bound(stack.rows, K, accuracy=_ACCURACY).gamma
 
     def _light(self, x: Real) -> list[Real]:
         """Frequencies (F,), rad/s, around lightly damped poles of each plant's loop and of the controller.
 
-        None for plants that are known on their own frequencies only.
+        Empty where no pole is light, and for plants that are known on their own frequencies only.
         """
         abcd = self.form.discrete(x)
         controller_poles = np.linalg.eigvals(abcd[0])
@@ -515,12 +539,19 @@ class Programme:
         Parameters
         ----------
         gamma : float
-            Worst case on the dense grid; inf: the controller means nothing.
+            Worst case on the dense grid; inf: the controller means nothing. It is taken as given; `worst` and
+            `blocking` are computed anew.
         x : ndarray, shape (n,)
 
         Returns
         -------
         MultivariableResult
+            Its outcome: met up to 1, not met above, not converged for inf.
+
+        Raises
+        ------
+        ValueError
+            No anti-windup gain exists for the limits, from `Controller`.
         """
         stack = self.dense
         K = self.form.response(x[None], stack.s)[0]

@@ -44,9 +44,10 @@ from control_design.synthesis.modal_controller import ModalForm
 # Shift of a parameter in the difference quotient of slopes, in natural units. The quotient errs by about the
 # shift times the third derivative, and by rounding over the shift: 1e-5 and 1e-11.
 _SHIFT = 1e-5
-# Relative accuracy of gamma in a step.
+# Relative accuracy of gamma in a step: half of what is the least gain of one.
 _ACCURACY = 1e-6
-# Factor on the box where the programme of a step fails, mostly by rounding.
+# Factor on the box where the programme of a step fails, mostly by rounding. Chosen; seven of them end a
+# descent.
 _SHORTER = 0.3
 # Predicted fall of log gamma^2 that is not worth a step: 1e-6 of gamma, as accurate as it is known.
 _LEAST_GAIN = 2e-6
@@ -64,18 +65,22 @@ _CUTS = 4
 # Share of the predicted fall by which the largest eigenvalue may exceed the programme's level; beyond it, a
 # direction is added. Doubled: 6 and 2 %.
 _MISSED = 0.05
-# Share of the largest multiplier below which a row does not enter the curvature. Doubled: nothing.
+# Share of the largest multiplier below which a row does not enter the curvature, which each row makes dearer.
+# Doubled: nothing.
 _ACTIVE = 1e-4
-# A step that gains less than this share of what it promised is corrected to second order.
+# A step that gains less than this share of what it promised is corrected to second order. Chosen: it is the
+# share above which the box grows.
 _CORRECTED_BELOW = 0.7
-# No division by zero where no row near the worst depends on a parameter.
+# Least steepest slope by a parameter: no division by zero where no row near the worst depends on it. Its unit
+# is that of the form then.
 _NO_SLOPE = 1e-12
 # Sections of an interval in the search for a scaling: each leaves .55 of it, 14 of them 2e-4.
 _SECTIONS = 14
-# Ends of the overlapping sections, over the interval.
+# Left inner point of the interval, as a share of it; where the value is larger here, the right part stays.
 _LEFT_SECTION = 0.45
 
-# The right end. They overlap by a tenth, so that a minimum on the border is in both sections.
+# Right inner point. The two parts overlap by a tenth, so that a minimum between the points is in both.
+# Chosen.
 _RIGHT_SECTION = 0.55
 
 
@@ -86,7 +91,9 @@ class StackedRows:
     Attributes
     ----------
     rows : BoundRows
-        R rows, as `scaled_bound` takes them.
+        R rows, as `scaled_bound` takes them: plant G (R, Y, U), Gram matrices `seen` (R, N, U, U) and
+        `entering` (R, N, Y, Y) of how each block sees the actuators and enters the outputs, and V_y (R, Y,
+        Y), V_u (R, U, U) of the weights on outputs and actuators.
     s : ndarray, shape (R,)
         Tustin's s at the row's frequency, where `ModalForm.response` evaluates K.
     omega_rad_s : ndarray, shape (R,)
@@ -104,7 +111,10 @@ class StackedRows:
 
 
 class _RowArrays(NamedTuple):
-    """Arrays of some rows, first axis: rows; named as in `BoundRows` and `StackedRows`."""
+    """Arrays of some rows, first axis: rows; named as in `BoundRows` and `StackedRows`.
+
+    G (r, Y, U), seen (r, N, U, U), entering (r, N, Y, Y), V_y (r, Y, Y), V_u (r, U, U); the others (r,).
+    """
 
     G: Complex
     seen: Complex
@@ -129,11 +139,12 @@ def stacked_rows(
     Parameters
     ----------
     plants : sequence of MultivariablePlant
-        Nominal plant, ball and errors of channels.
+        Nominal plant, ball and errors of channels; at least one, all of U inputs and Y outputs (not checked
+        here: the caller's `Programme` has).
     specification : MultivariableSpecification
         Weights of each requirement, on S (outputs) or on K S (actuators).
     grids : sequence of ndarray, shape (F,)
-        Of each plant, rad/s, below Nyquist.
+        Of each plant, rad/s, positive and below Nyquist, where Tustin's s is infinite (not checked).
     together : bool
         As of `BoundRows`: uncertainty grows with 1 / gamma (mu) instead of keeping its size.
 
@@ -141,6 +152,12 @@ def stacked_rows(
     -------
     StackedRows
         Without rows of weights on S that an earlier requirement covers in every output.
+
+    Raises
+    ------
+    ValueError
+        Plants and grids differ in number, or a ball that is known on its own frequencies only is asked at
+        another one.
     """
     delay = specification.computational_delay_samples
     parts: list[_RowArrays] = []
@@ -205,7 +222,8 @@ class _NearWorst:
 class _Move(NamedTuple):
     """A step (n,) in natural units, the predicted fall of log gamma^2, and multipliers (r, w, w).
 
-    The multipliers of one row are sum_u z_u u u^H over its directions u, in the row's basis.
+    The multipliers of one row are sum_u z_u u u^H over its directions u (w,), in the row's basis, with z_u
+    the multiplier of the programme's row u^H M u <= s; all z_u add up to one.
     """
 
     step: Real
@@ -225,7 +243,12 @@ class MatrixDescent:
     stack : StackedRows
         Of the lean grid.
     loops : sequence of NominalLoop
-        One for each plant: closed-loop poles of a discrete controller.
+        One for each plant: its `poles(A, B, C, D)` are the closed-loop poles in z under a discrete
+        controller.
+
+    Notes
+    -----
+    The parts are not checked against one another: `Programme` builds them from one specification.
     """
 
     def __init__(self, form: ModalForm, stack: StackedRows, loops: Sequence[NominalLoop]) -> None:
@@ -236,7 +259,10 @@ class MatrixDescent:
         self._low, self._high = form.bounds()
 
     def stable(self, x: Real) -> bool:
-        """Whether all nominal loops are stable under parameters x (n,): poles strictly inside the circle."""
+        """Whether all nominal loops are stable under parameters x (n,): poles strictly inside the circle.
+
+        False for an algebraic loop, whose pole is infinite.
+        """
         a, b, c, d = self.form.discrete(x)
         return all(np.all(np.abs(loop.poles(a, b, c, d)) < 1.0) for loop in self.loops)
 
@@ -267,6 +293,7 @@ class MatrixDescent:
         Parameters
         ----------
         start : ndarray, shape (n,)
+            Clipped to the bounds of the form first.
         steps : int
             At most; steps that are not accepted count.
 
@@ -275,7 +302,7 @@ class MatrixDescent:
         x : ndarray, shape (n,)
             Parameters where it ended.
         gamma : float
-            Worst case on the grid there; inf: the start is not robustly stable.
+            Worst case on the grid there; inf: the start is not robustly stable, and x is the clipped start.
         taken : int
             Steps taken.
 
@@ -340,7 +367,11 @@ class MatrixDescent:
         return x, float(np.exp(0.5 * best)), taken
 
     def _local(self, x: Real, bound: Bound) -> _NearWorst:
-        """First-order model of the rows near the worst at parameters x (n,), with the scalings of `bound`."""
+        """First-order model of the rows near the worst at parameters x (n,).
+
+        bound: at x; its gamma (R,), finite and positive, says which rows are near, its log_t (R, N) are the
+        scalings that are held.
+        """
         log = 2 * np.log(bound.gamma)
         index = np.flatnonzero(log > np.max(log) - _FAR_BELOW)
         rows = self.stack.rows.part(index)
@@ -358,7 +389,7 @@ class MatrixDescent:
         right = first_order.right @ basis
 
         def slopes(i: int, j: int) -> Complex:
-            """left_i^H dK right_j by parameter, (r, n)."""
+            """left_i^H dK right_j by parameter, (r, n), of eigenvectors i and j of each row."""
             by_parameter = self.form.slopes(x[None], s, left[None, :, :, i], right[None, :, :, j])
             return np.asarray(by_parameter[0])
 
@@ -381,6 +412,7 @@ class MatrixDescent:
         """Model of the rows with what it missed at x + change (n,) added to its values.
 
         A second-order correction: the next step from the same point follows a curved edge between rows.
+        after: the bound at x + change, with gamma finite; box: half width, in natural units.
         """
         width = local.basis.shape[2]
         at_change = local.value + local.slope @ change
@@ -397,10 +429,13 @@ class MatrixDescent:
 
         The multipliers are those of the step before, in coordinates of the outputs; None: the first step,
         which is taken without curvature. Negative curvature is left out, so that the programme is convex.
+        bound and local are those of x; unit (n,) are natural units. Where no row of the model has a
+        multiplier the result is zero.
         """
         n = x.size
         if multipliers is None:
             return np.zeros((n, n))
+        # 1e-300: an empty model has no largest one.
         size = np.trace(multipliers[local.index], axis1=1, axis2=2).real
         use = np.flatnonzero(size > _ACTIVE * np.max(size, initial=1e-300))
         index = local.index[use]
@@ -441,7 +476,8 @@ class MatrixDescent:
         """Step from x (n,) within a box, with the smallest largest row of the model; None where it fails.
 
         curvature (n, n) is in natural units (unit, (n,)), in which the box is stated. Rows of the programme
-        are u^H M u for directions u of every matrix M; the worst directions are added in rounds.
+        are u^H M u for directions u of every matrix M; the worst directions are added in rounds. None where
+        `minimax_step` fails, mostly by rounding.
         """
         value = local.value
         change = local.slope * unit
@@ -519,7 +555,7 @@ class MatrixDescent:
 
 
 def _largest_log(bound: Bound) -> float:
-    """log gamma^2 of the worst row."""
+    """log gamma^2 of the worst row; -inf where every gamma is 0."""
     return 2 * float(np.log(np.max(bound.gamma)))
 
 
@@ -541,7 +577,7 @@ def _entries(matrix: Complex) -> Real:
 
 
 def _weights(u: Complex) -> Real:
-    """Weights (r, w^2) with which u^H M u is a sum of M's `_entries`, for directions u (r, w)."""
+    """Weights (r, w^2) with which u^H M u is a sum of M's `_entries` (r, w^2), for directions u (r, w)."""
     width = u.shape[1]
     weights = [np.abs(u[:, i]) ** 2 for i in range(width)]
     for i, j in combinations(range(width), 2):
@@ -568,8 +604,8 @@ def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Co
     """Largest eigenvalues (r,) of matrices, lowered by their scalings, and the eigenvectors (r, w).
 
     value (r, w^2) are the entries of the matrices, fall (r, w^2, N) their slopes by log t; each log t moves
-    within +-room. One scaling after the other is set by a search in sections (the largest eigenvalue is
-    convex in it), several scalings twice.
+    within +-room, room >= 0. One scaling after the other is set by a search in sections (the largest
+    eigenvalue is convex in it), several scalings twice; width is w. Nothing is checked.
     """
     shift = np.zeros((value.shape[0], fall.shape[2]))
 

@@ -30,15 +30,18 @@ from control_design.synthesis.rows import Rows
 from control_design.synthesis.synthesis_options import SynthesisOptions
 
 # Damping ratio below which a pole or zero gets points of its own in the dense check; wider resonances do not
-# fit between the points of a dense grid.
+# fit between the points of a dense grid: a width of 2 zeta, 10 %, holds dozens of its thousands of points.
 _LIGHT = 0.05
-# Points around such a pole or zero.
+# Points around such a pole or zero, spaced like sinh out to twenty half-widths: six lie within one
+# half-width, so a peak between two of them is missed by a per cent.
 _POINTS_OF_MODE = 25
-# Points a decade below the grids, where nothing but slow real poles and zeros is.
+# Points a decade below the grids, where nothing but slow real poles and zeros is, whose responses change over
+# a decade. Chosen.
 _PER_DECADE = 10
-# Distance from -1 asked of delayed copies: stability with something to spare.
+# Distance from -1 asked of copies behind the delay margin: stability with something to spare. Chosen.
 _DELAY_COPY_MODULUS = 0.1
-# Violated frequencies that one controller puts on the grid of one plant.
+# Violated frequencies that one controller puts on the grid of one plant in one check: every one makes each
+# later step dearer. Chosen.
 _MOST_ADDED = 12
 # No division by zero where 1 + G K vanishes.
 _TINY = 1e-300
@@ -50,16 +53,21 @@ class Problem(Grids):
     Parameters
     ----------
     plants : tuple of UncertainPlant
-        At least one; all of one sampling time.
+        At least one; all of one sampling time (an IndexError without any; times are not compared here:
+        `Specification.check_against` has).
     specification : Specification
+        What is asked of the loop: weights, delay margin, controller damping; and limits and delay of the
+        controller.
     options : SynthesisOptions
         Sizes of the grids.
     guards : tuple of Guard
-        Responses (F,) of a plant that have to be stable beside its ellipses.
+        Responses (F,) of a plant, with its number and their own frequencies, that have to be stable beside
+        its ellipses.
 
     Notes
     -----
-    The lean grids `grids` grow by exchange; the rest is fixed.
+    The lean grids `grids`, one array (F,) in rad/s for each plant, grow by exchange; the rest is fixed. Also
+    from `Grids`: `dense`, the `PlantData` of every plant on its dense grid, and `scale_rad_s`.
     """
 
     def __init__(
@@ -96,7 +104,8 @@ class Problem(Grids):
         Parameters
         ----------
         grids : sequence of ndarray, shape (F,), optional
-            Of each plant; by default the lean grids as they are now.
+            Of each plant, rad/s; by default the lean grids as they are now. A plant that is known on its own
+            frequencies only refuses others (ValueError).
 
         Returns
         -------
@@ -125,11 +134,11 @@ class Problem(Grids):
         ----------
         cascade : Cascade
         parameters : ndarray, shape (n,)
-            Of the controller that is checked.
+            Of the controller that is checked; it need not be stable.
         gamma_grid : float
-            Its worst case on the lean grids.
+            Its worst case on the lean grids, finite: with inf nothing exceeds it and nothing is added.
         most : int
-            Local maxima that are added at most, of each check.
+            Local maxima that are added at most, of each check and each guard.
 
         Returns
         -------
@@ -144,7 +153,9 @@ class Problem(Grids):
             worst = worst_of(data.weighted(k))
             covered = ~np.isfinite(worst)
             if np.any(covered):
-                # Ellipses over -1 have no worst case: a value above all others, the deepest the largest.
+                # Ellipses over -1 have no worst case: a value above all others, the deepest the largest. An
+                # ellipse that just reaches -1 (scale 1) has depth 1, one whose centre lies on it (0) has 2;
+                # so values are two to four times the largest finite one.
                 scale = scale_to_minus_one(k * data.delay, data.ellipses)[covered]
                 depth = 2.0 - np.minimum(scale, 1.0)
                 largest_finite = np.max(worst[~covered], initial=limit)
@@ -161,7 +172,8 @@ class Problem(Grids):
     def _add(self, position: int, omega: Real, value: Real, limit: float, most: int) -> int:
         """Put the largest local maxima of value (F,) above the limit on the lean grid of one plant.
 
-        Returns how many were new. position: number of the plant; omega (F,), rad/s.
+        Returns how many were new. position: number of the plant; omega (F,), rad/s, ascending; at most `most`
+        maxima. Nothing is added where no value exceeds the limit.
         """
         before = self.grids[position]
         after = with_violations(before, omega, value, limit, most)
@@ -181,8 +193,9 @@ class Problem(Grids):
         Returns
         -------
         float
-            inf if some nominal loop is unstable, an ellipse reaches -1, or the controller rings by itself
-            more than it may.
+            inf if some nominal loop or guard is unstable, an ellipse reaches -1, no anti-windup gain exists,
+            or the controller rings by itself more than it may. Raises ValueError for another number of
+            parameters.
         """
         asked = self.spec.controller_damping
         if asked is not None and not cascade.least_damping(parameters) >= asked * (1 - SOLVER_SLACK):
@@ -209,7 +222,8 @@ class Problem(Grids):
         list of (int, PlantData)
             Number of the plant, and its ellipses and weights on a grid: the dense grids first; then, for
             plants that need them, points around lightly damped poles and zeros of the controller and poles
-            of its loops, and below the grid where one of them is slower.
+            of its loops, and below the grid where one of them is slower. A plant that is known on its own
+            frequencies only has its dense grid alone.
 
         Notes
         -----
@@ -258,7 +272,7 @@ class Problem(Grids):
     def stable(self, cascade: Cascade, parameters: Real) -> bool:
         """Whether every nominal loop and every guard is stable under parameters (n,).
 
-        Poles of the full state space have to lie strictly inside the circle.
+        Poles of the full state space have to lie strictly inside the circle; an algebraic loop is unstable.
         """
         poles_of_loops = self.closed_loop_poles(cascade, parameters)
         loops_are_stable = all(np.all(np.abs(poles) < 1.0) for poles in poles_of_loops)
@@ -272,7 +286,7 @@ class Problem(Grids):
         cascade : Cascade
         parameters : ndarray, shape (n,)
         guards : sequence of Guard, optional
-            By default those of the problem.
+            By default those of the problem; without any the answer is True.
 
         Returns
         -------
@@ -294,7 +308,11 @@ class Problem(Grids):
         return True
 
     def closed_loop_poles(self, cascade: Cascade, parameters: Real) -> list[Complex]:
-        """Poles (m,) in z of every nominal loop; one infinite pole for an algebraic loop."""
+        """Poles (m,) in z of every nominal loop under parameters (n,), m states of plant, delay and
+        controller.
+
+        One infinite pole for an algebraic loop.
+        """
         a, b, c, d = cascade.state_space(parameters)
         return [loop.poles(a, b, c, d) for loop in self._loops]
 
@@ -326,10 +344,13 @@ class Problem(Grids):
         return np.asarray(np.exp(-1j * omega_rad_s * self.dt_s * samples), dtype=np.complex128)
 
     def delayed_response(self, cascade: Cascade, parameters: Real, omega_rad_s: Real) -> Complex:
-        """K with its computational delay (F,) at omega (F,), rad/s."""
+        """K of parameters (n,) with its computational delay (F,) at omega (F,), rad/s, up to Nyquist."""
         return cascade.response(parameters, omega_rad_s) * self.delay(omega_rad_s)
 
 
 def _modulus(value: float, ellipses: Ellipses) -> tuple[tuple[LoopFunction, Real], ...]:
-    """Weights of `Rows` that ask for nothing but a distance of at least `value` from -1: |S| <= 1 / value."""
+    """Weights of `Rows` that ask for nothing but a distance of at least `value` from -1: |S| <= 1 / value.
+
+    One weight on S, of `value` > 0 at each of the F frequencies of the ellipses.
+    """
     return ((LoopFunction.SENSITIVITY, np.full(ellipses.omega_rad_s.size, value)),)

@@ -29,24 +29,29 @@ if TYPE_CHECKING:
     import control
 
 # Norm of the closed loop over the smallest one, at which the search for it ends. Nearer to the smallest,
-# the controller has faster and faster poles.
+# the controller has faster and faster poles. Chosen: a start need not be nearer.
 _CLOSE = 1.02
-# Where the smallest norm is looked for. Weights are about one where they matter, so norms are, too.
+# Lower end of the search for the smallest norm. Weights are about one where they matter, so norms are, too.
 _LOWEST_GAMMA = 1e-2
 
 # The upper end: a norm of a thousand is a specification that nothing meets, and no start.
 _HIGHEST_GAMMA = 1e3
 # Weight where none is asked: on an output, and on an actuator over the plant's smallest gain at the scale.
-# The theorem needs every actuator in z; this one is too cheap to decide anything.
+# The theorem needs every actuator in z; this one is too cheap to decide anything. Chosen.
 _CHEAP = 0.03
 # How far below zero, of the largest entry, an eigenvalue of a Riccati solution counts as zero: rounding.
 _NEARLY_ZERO = 1e-9
-# Frequencies of the quadrature of the Gramians, logarithmic: of seven decades, some eighty a decade.
+# Frequencies of the quadrature of the Gramians, logarithmic: of seven decades, some eighty a decade, so that
+# a resonance of damping ratio .05 has four of them in its width.
 _QUADRATURE_POINTS = 600
 
 
 class System(NamedTuple):
-    """Continuous state space: x' = A x + B u, y = C x + D u."""
+    """Continuous state space: x' = A x + B u, y = C x + D u; A (n, n), B (n, m), C (p, n), D (p, m); time in
+    seconds.
+
+    Shapes are not checked.
+    """
 
     A: Real
     B: Real
@@ -58,6 +63,8 @@ class WeightedPlant(NamedTuple):
     """System from (d, u) to (z, e), to be closed by u = K e.
 
     x' = A x + B1 d + B2 u,   z = C1 x + D11 d + D12 u,   e = C2 x + D21 d + D22 u.
+
+    A (n, n); d has n_d, u U, z n_z and e Y entries, and the matrices the shapes that follow. Not checked.
     """
 
     A: Real
@@ -83,15 +90,17 @@ def weighted_plant(
     Parameters
     ----------
     plant : MultivariablePlant
-        Nominal plant (Y outputs, U inputs) and its ball.
+        Nominal plant (Y outputs, U inputs) and its ball, whose `radius` scales what Lo puts in at the outputs
+        for what Li sees of the actuators.
     specification : MultivariableSpecification
-        A strong weight on tracking replaces the constant one on the modulus.
+        Its weights of "tracking" and "modulus" on each output, of "effort" on each actuator. One on tracking
+        replaces the constant one on the modulus.
     scaling : float
-        Of what the ball puts in, over the references.
+        Of what the ball puts in, over the references; positive (not checked).
     scale_rad_s : float
         Frequency around which the controller acts, where actuators without a weight get one.
     slowest_rad_s : float
-        Poles lie this much further to the left than they do, so that none is on the axis.
+        Poles lie this much, rad/s, further to the left than they do, so that none is on the axis.
 
     Returns
     -------
@@ -102,7 +111,7 @@ def weighted_plant(
     Raises
     ------
     numpy.linalg.LinAlgError
-        The plant has a pole at z = -1.
+        The plant has a pole at z = -1, or one at s = j scale_rad_s.
 
     Notes
     -----
@@ -176,11 +185,17 @@ def central_controller(P: WeightedPlant) -> System | None:
     Parameters
     ----------
     P : WeightedPlant
+        D12 of full column rank and D21 of full row rank, as `weighted_plant` builds them.
 
     Returns
     -------
     System or None
         As many states as P. None where no norm up to 1000 is reached, or none that can be told from rounding.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A matrix of the theorem is singular, by rounding or by a D12 or D21 without full rank.
 
     Notes
     -----
@@ -216,12 +231,19 @@ def controller_below(P: WeightedPlant, gamma: float) -> System | None:
     Parameters
     ----------
     P : WeightedPlant
+        D12 of full column rank and D21 of full row rank; its D22 is not looked at.
     gamma : float
+        Positive, in the unit of P's weights.
 
     Returns
     -------
     System or None
         None without one: a direct term, a Riccati equation or their coupling forbids it.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A matrix is singular, or the freedom that is left is not positive definite, by rounding.
 
     Notes
     -----
@@ -300,7 +322,8 @@ def _stabilising(A: Real, B: Real, Q: Real, R: Real, S: Real) -> Real | None:
     """Semidefinite X (n, n) with A'X + XA - (XB + S) R^-1 (B'X + S') + Q = 0 and a stable loop; None without.
 
     A (n, n), B and S (n, m), Q (n, n), R (m, m) indefinite. From the stable subspace of the Hamiltonian
-    matrix: scipy's solver rejects X = 0.
+    matrix: scipy's solver rejects X = 0. Without means: an eigenvalue on the axis, a subspace without X, or
+    an X below zero. Raises LinAlgError for a singular R.
     """
     n = A.shape[0]
     a = A - B @ np.linalg.solve(R, S.T)
@@ -325,17 +348,23 @@ def reduced(K: System, P: WeightedPlant, order: int, low_rad_s: float, high_rad_
     Parameters
     ----------
     K : System
-        Stabilises P; at least `order` states.
+        Stabilises P; at least `order` states, else the matrices do not fit (numpy's ValueError).
     P : WeightedPlant
+        What the error of K moves, by z.
     order : int
         States that stay.
     low_rad_s, high_rad_s : float
-        Between which the error counts, with equal weight per rad/s.
+        Between which the error counts, with equal weight per rad/s; 0 < low < high.
 
     Returns
     -------
     System
         Stability of the closed loop is not ensured.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        A pole of P or K lies on the axis at a frequency of the quadrature.
 
     Notes
     -----
@@ -386,7 +415,7 @@ def continuous(system: control.StateSpace) -> System:
     Parameters
     ----------
     system : control.StateSpace
-        Discrete, dt in seconds.
+        Discrete, dt in seconds (not checked).
 
     Returns
     -------
@@ -413,7 +442,7 @@ def continuous(system: control.StateSpace) -> System:
 
 
 def _resolvent(A: Real, B: Real, s: Complex) -> Complex:
-    """(s I - A)^-1 B (F, n, m) at s (F,), for A (n, n) and B (n, m)."""
+    """(s I - A)^-1 B (F, n, m) at s (F,), for A (n, n) and B (n, m); LinAlgError at an eigenvalue of A."""
     shifted = s[:, None, None] * np.eye(A.shape[0]) - A
     return np.asarray(np.linalg.solve(shifted, B + 0j))
 
@@ -425,7 +454,10 @@ def _root(gramian: Real) -> Real:
 
 
 def _diagonal(weights: Sequence[RationalWeight]) -> System:
-    """Weights of one channel each, side by side: a system of as many inputs and outputs."""
+    """Weights of one channel each, side by side: a system of as many inputs and outputs.
+
+    Each is proper, which `RationalWeight` ensures, and stable; an empty list raises IndexError in `control`.
+    """
     import control  # here, because it brings a plotting library with it
 
     parts = []

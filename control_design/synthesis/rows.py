@@ -31,14 +31,16 @@ from control_design.plants.ellipses import Complex, Ellipses, Integer, Real
 from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import COMPILED, INSIDE
 
-# Points of a boundary, every 9 degrees; parabola and Newton steps go on from the worst.
+# Points of a boundary, every 9 degrees; parabola and Newton steps go on from the worst. Chosen: with the two
+# refinements below they are enough for the 1e-3 stated there.
 _BOUNDARY = 40
 # Newton steps from the vertex of the parabola to the worst member. With two, the worst case agrees with the
 # exact geometry to 1e-3 or better (tests of the descent).
 _REFINEMENTS = 2
 # Bend along a boundary, or share of the largest multiplier, below which it bends no row: rounding.
 _NOTHING = 1e-9
-# Rows whose curvature is taken in one call: more are not often active, and each costs the same.
+# Rows whose curvature is taken in one call: more are not often active, and a row of multiplier 0 that fills
+# up a call costs as much as another. Decides time only.
 _ROWS_PER_CALL = 8
 # No logarithm of zero; far below any value of a row.
 _TINY = 1e-300
@@ -55,7 +57,8 @@ class Rows:
     delay : ndarray, shape (F,)
         z^-d, times a delay copy's own; multiplies K.
     weights : tuple of (LoopFunction, ndarray of shape (F,))
-        Magnitude of the weights on functions of the members; 0: no row.
+        Magnitude of the weights on functions of the members (S, K S, G S, T); 0: no row. Not negative; no
+        shape is checked.
     """
 
     ellipses: Ellipses
@@ -70,6 +73,8 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
     Parameters
     ----------
     sections : tuple of SectionKind
+        At least one, else n = 0. Kept for the 64 structures used last, as building takes longer than a
+        descent step.
 
     Returns
     -------
@@ -148,7 +153,7 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
 def _polynomial(coefficients: list[Any], far: Any, near: Any) -> tuple[Any, Any]:
     """Real and imaginary part of a section's polynomial in p = j far / near, times near^degree.
 
-    coefficients: two or three numbers or symbols, highest power first.
+    coefficients: two or three numbers or symbols, highest power first; another count is not a section's.
     """
     *highest, linear, constant = coefficients
     if not highest:
@@ -168,7 +173,7 @@ class _Mapped:
     ----------
     function : casadi.Function
     n : int
-        Columns of each call.
+        Columns of each call; at least 1.
     summed : bool
         The outputs of all columns are added, into one row.
     """
@@ -187,7 +192,11 @@ class _Mapped:
             self._buffer.set_res(number, array.data)
 
     def __call__(self, *values: Real) -> list[Real]:
-        """Outputs for the first few inputs; the others stay. The next call writes over the outputs."""
+        """Outputs, each (n, entries) or (1, entries) where summed, for the first few inputs; the others stay.
+
+        Shapes have to be those of `inputs`, or broadcast to them (numpy's ValueError). The next call writes
+        over the outputs.
+        """
         for array, value in zip(self.inputs, values, strict=False):
             array[...] = value
         self._run()
@@ -219,7 +228,8 @@ class LoopRows:
     ----------
     cascade : Cascade
     plants : sequence of Rows
-        All sampled as the cascade is.
+        All sampled as the cascade is (not checked); at least one, with a weight above 0 somewhere, else
+        numpy's ValueError of nothing to concatenate.
 
     Notes
     -----
@@ -298,7 +308,10 @@ class LoopRows:
         return bool(np.any(inside))
 
     def rows(self, x: Real) -> Real:
-        """Logarithms (R,) of all weighted values under x (n,)."""
+        """Logarithms (R,) of all weighted values under x (n,); log 1e-300 for a value of 0.
+
+        Of boundaries only, and without regard to stability: see `covers_minus_one`.
+        """
         return self._at(x).logs
 
     def slopes(self, x: Real) -> Real:
@@ -308,7 +321,10 @@ class LoopRows:
         return slope.reshape(-1, x.size).copy()
 
     def curvature(self, x: Real, multipliers: Real) -> Real:
-        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,), at x (n,)."""
+        """Second derivative (n, n) of the rows' sum weighted by multipliers (R,), at x (n,).
+
+        Multipliers below `_NOTHING` of the largest are left out; all zero give a zero matrix.
+        """
         angles = self._at(x).angles
         total = np.zeros((x.size, x.size))
         active = np.flatnonzero(multipliers > _NOTHING * np.max(multipliers))
@@ -357,7 +373,7 @@ def _worst_members(
     The worst member has the largest |1/(1 + G K)|, or |G/(1 + G K)| if of_plant; k (F,) is K with its delay,
     index (D,) says which frequencies, and the ellipses are (F,) each. Best boundary point, vertex of the
     parabola through it and its neighbours, Newton from there. A point that does not gain on the boundary's
-    best is not taken.
+    best is not taken. A loop on -1 has the value 1 / sqrt(1e-300); nothing is checked.
     """
     width = 2 * np.pi / _BOUNDARY
     cos = np.empty(_BOUNDARY)
@@ -384,7 +400,8 @@ def _worst_members(
         after = values[(top + 1) % _BOUNDARY]
         best_angle = top * width
 
-        # Vertex of the parabola through three points, at most half a step away.
+        # Vertex of the parabola through three points, at most half a step (width) away: beyond it a neighbour
+        # would have been the best. Newton's steps keep within half a width for the same reason.
         change = _vertex(0.5 * (after - before), before - 2 * best_value + after)
         angle = best_angle + width * min(max(change, -0.5), 0.5)
         for _ in range(_REFINEMENTS + 1):
@@ -415,7 +432,10 @@ def _worst_members(
 
 @numba.njit(**INSIDE)
 def _size(g: complex, k: complex, of_plant: bool) -> Any:
-    """|1/(1 + g k)|, or |g/(1 + g k)|; in squares, since a modulus costs more than all the rest."""
+    """|1/(1 + g k)|, or |g/(1 + g k)| if of_plant; in squares, since a modulus costs more than all the rest.
+
+    g: a member of the plant, k: the controller with its delay. At most 1e150 (|g| times), where g k = -1.
+    """
     back = 1.0 + g * k
     above = g.real * g.real + g.imag * g.imag if of_plant else 1.0
     return np.sqrt(above / max(back.real * back.real + back.imag * back.imag, _TINY))

@@ -32,12 +32,14 @@ from ident.data.arrays import real_rows
 
 # Shaped starts. Figures below: best worst case of 100 shaped loops, mean of four seeds, where an arm is to be
 # damped (1.32 as it stands), and where a link and a hub are to track (15.7 and .70). A descent follows each,
-# so a tenth more or less decides nothing.
+# so a tenth more or less decides nothing. The few figures that are better by more (1.08, 1.09, 12) are of one
+# plant and four seeds each, before any descent: no reason to move a value.
 
-# Factor on the gain of a shaped loop that is unstable, before it is given up. Halved or doubled: 1.34, 1.38.
+# Factor on the gain of a shaped loop that is unstable, once, before it is given up. Halved or doubled: 1.34,
+# 1.38.
 _RETRY_GAIN = 0.4
 # Two shaped loops count as one where their nominal sensitivities differ by less than this on average. It
-# changes how many loops there are to start from, not the best one.
+# changes how many loops there are to start from, not the best one. Chosen.
 _SAME_SENSITIVITY = 0.05
 # Damping ratio of random pairs of poles, as powers of ten. Half or twice as wide: 1.43, 1.46.
 _POLE_DAMPING_DECADES = (-1.0, 0.1)
@@ -63,13 +65,15 @@ _QUIET_DECADES = (-1.5, 0.0)
 # Plant gain above which "small elsewhere" weighs no heavier: an integrator's grows without end. Halved or
 # doubled, nothing moves.
 _LARGEST_PLANT_GAIN = 1e3
-# Of Nyquist, up to which wishes are stated: the Tustin frequency has its pole there.
+# Of Nyquist, up to which wishes are stated: the Tustin frequency has its pole at Nyquist, and is eight times
+# Nyquist itself here. Chosen.
 _HIGHEST_WISH = 0.95
 # Lowest corner of random poles over the lowest frequency that matters. Halved or doubled: 1.48, 1.09.
 _LOWEST_CORNER_RATIO = 0.3
 # Highest corner of random poles over the highest frequency that matters. Halved or doubled: 1.45, 1.27.
 _HIGHEST_CORNER_RATIO = 3.0
-# Of Nyquist, above which no frequency matters to corners: Tustin's frequency runs to infinity there.
+# Share of Nyquist that caps the highest frequency that matters: Tustin's frequency runs to infinity at
+# Nyquist, and is four times Nyquist here. Chosen.
 _HIGHEST_CORNER_OF_NYQUIST = 0.9
 
 # Random starts. Figures below: median worst case of 25 starts of a hub that tracks (2.5 as it stands), an arm
@@ -82,14 +86,14 @@ _CORNER_DECADES = (-0.7, 0.7)
 _SECTION_DAMPING = (0.3, 1.0)
 # Standard deviation of a random section's numerator, relative to its denominator. Doubled: 5.1 and 34.
 _NUMERATOR_JITTER = 0.3
-# Integral gain of a random section over its corner: slow, as a fast one destabilises.
+# Integral gain of a random section over its corner: slow, as a fast one destabilises. Chosen.
 _INTEGRAL_SHARE = 0.1
 # Crossover of a loop of little gain, as powers of ten of the scale. Over half or twice the range 2.6 and 3.0.
 _LOW_CROSSOVER_DECADES = (-1.5, -0.3)
 # Crossover of the first lead around two integrators, as powers of ten of the scale. Over half or twice the
 # range 6.3 and 6.7.
 _LEAD_CROSSOVER_DECADES = (-0.7, 0.0)
-# Its factor from trial to trial. Halved: 9.2.
+# Factor on the crossover of that lead from trial to trial. Halved: 9.2.
 _SLOWER_LEAD = 0.6
 # Trials of a random start. Nothing moves with 6.
 _TRIALS = 12
@@ -110,7 +114,8 @@ _LEAD_JITTER = 0.1
 # Zero of the PI section over the crossover: it costs 3 degrees of phase there. Halved or doubled: 7.4 and
 # 8.0, 7.5 and 2.0.
 _PI_ZERO = 0.05
-# Damping term of the numerator of an idle notch over its corner; its denominator has 2: nearly no notch.
+# Damping term of the numerator of an idle notch over its corner; its denominator has 2: nearly no notch, but
+# not none, so that the slopes of a descent do not vanish. Chosen.
 _IDLE_NOTCH = 1.8
 
 # Starts for unstable plants. Halved or doubled, the numbers up to `_UNSTABLE_GAIN_DECADES` move the best
@@ -119,7 +124,7 @@ _IDLE_NOTCH = 1.8
 
 # Loops around the unstable poles that are drawn.
 _DRAWN_UNSTABLE = 400
-# The best of them that are led to stability, at most.
+# How many of the drawn loops, those of least cost, are led to stability at most.
 _FOLLOWED = 12
 # Crossover over the fastest unstable pole, as powers of ten: a loop slower than the pole does not catch it.
 _UNSTABLE_CROSSOVER_DECADES = (-0.1, 0.9)
@@ -129,26 +134,28 @@ _UNSTABLE_CROSSOVER_OF_NYQUIST = 0.6
 _UNSTABLE_GAIN_DECADES = (-0.2, 0.5)
 # Where tracking is asked without an integrator: share of draws with a slow lag in its place.
 _SLOW_LAG_SHARE = 0.6
-# Draws below this share that are no slow lag are leads; the others have random sections.
+# One uniform number in [0, 1) says the kind of a draw: below `_SLOW_LAG_SHARE` a slow lag where there may be
+# one, else below this share a lead, else random sections.
 _LEAD_SHARE = 0.8
 # Pole of the slow lag over the crossover, as powers of ten: its gain at low frequency stands for an
 # integrator.
 _SLOW_POLE_DECADES = (-5.0, -2.0)
 # Zeros of the slow lag over the crossover, as powers of ten: its phase is back at the crossover.
 _LAG_ZERO_DECADES = (-1.3, -0.3)
-# Fast pole of the slow lag over the crossover.
+# Fast pole of the slow lag over the crossover: beyond it, where it costs little phase.
 _FAST_POLE_RATIOS = (3.0, 10.0)
 # Edge of the first simplex: this share of a parameter ..
 _SIMPLEX_SHARE = 0.2
 # .. or so much, where the parameter, a logarithm, is near zero.
 _SIMPLEX_EDGE = 0.1
-# Size up to which a parameter is near zero.
+# Size up to which a parameter is near zero: a fifth of it would hardly move the loop.
 _NEAR_ZERO = 1e-3
 # Evaluations for each parameter, until the loop is stable: a limit, the simplex may converge before.
 _RADIUS_EVALUATIONS = 200
 # Evaluations for each parameter, of the worst case from there: a descent goes on.
 _WORST_CASE_EVALUATIONS = 60
-# Cost of a loop of which nothing finite is known; larger than any pole modulus that is seen.
+# Cost in place of one that is infinite or larger, as the simplex needs finite ones: an algebraic loop, or a
+# score of inf. No pole modulus that is seen comes near.
 _LARGEST_COST = 1e6
 
 # Damping of drawn pairs over what is asked of the controller's own poles: clear of the bound by 1 %.
@@ -158,7 +165,8 @@ _TINY = 1e-300
 
 
 class _Wishes(NamedTuple):
-    """Controller values that are wished for: K and the weight of a miss, each (n,), at omega (n,)."""
+    """Controller values that are wished for: K (command per error), without the computational delay, and
+    the weight of a miss |K - wish|, each (n,), at omega (n,) in rad/s."""
 
     omega_rad_s: Real
     controller: Complex
@@ -173,7 +181,8 @@ class StartMaker:
     cascade : Cascade
         Kinds of sections, sampling time and scale of the parameter vectors (n,).
     data : sequence of PlantData
-        Every plant on a lean grid: ellipses (centre and semi-axes (F,)), computational delay (F,), weights.
+        Every plant, at least one, on a lean grid: `ellipses` (omega, centre and semi-axes (F,)), `delay`
+        (F,), e^{-j w delay} of the computational delay, and `sensitivity` (F,), the largest weight on S.
     integrators : int
         Integrators of the loop, of controller and plant together.
     score : callable
@@ -183,6 +192,10 @@ class StartMaker:
         Least damping ratio asked of the controller's own pairs of poles.
     keeps_sign : bool
         The gain at low frequency has to be positive (tracking or integrators).
+
+    Notes
+    -----
+    Nothing is checked: cascade, plants and score belong to one `Problem`, which has checked them.
     """
 
     def __init__(
@@ -217,13 +230,14 @@ class StartMaker:
         draws : int
             Loops that are drawn; each costs about 1 ms.
         most : int
-            Loops that are returned at most.
+            Loops that are returned at most; at least 1 (not checked).
 
         Returns
         -------
         list of (parameters (n,), score)
-            Empty for structures with notches, whose zeros are not free, and for two integrators or more in
-            the loop: least squares does not see stability, and seldom finds the lead that they need.
+            Empty where no draw is stable or nothing is wished for; also for structures with notches, whose
+            zeros are not free, and for two integrators or more in the loop: least squares does not see
+            stability, and seldom finds the lead that they need.
         """
         if "notch" in self.cascade.sections or self.integrators >= 2:
             return []
@@ -244,7 +258,8 @@ class StartMaker:
     def _different(self, pool: Sequence[tuple[Real, float]], most: int) -> list[tuple[Real, float]]:
         """At most `most` entries (parameters, score) of a pool sorted by score, without near duplicates.
 
-        An entry is left out whose nominal sensitivity of the first plant is nearly that of a better one.
+        An entry is left out whose nominal sensitivity of the first plant is nearly that of a better one: the
+        mean over its lean grid of the modulus of their difference counts. An empty pool gives an empty list.
         """
         selected: list[tuple[Real, float]] = []
         sensitivities: list[Complex] = []
@@ -266,6 +281,7 @@ class StartMaker:
 
         Wishes and poles are drawn; the numerator of the whole cascade is the least-squares answer to the
         wishes of all plants together, and its roots are dealt to the sections. Nothing makes it stable.
+        None also where a wish is not finite: a plant whose centre vanishes there.
         """
         wishes = [self._wishes(data) for data in self.data]
         omega = np.concatenate([part.omega_rad_s for part in wishes])
@@ -299,18 +315,23 @@ class StartMaker:
         # Columns of one size, so that the cut-off of small singular values means the same for each.
         column_sizes = np.linalg.norm(columns, axis=0)
         scaled_rows = real_rows(columns) / column_sizes
+        # Singular values below 1e-9 of the largest would give coefficients that cancel one another. Chosen.
         solution = np.linalg.lstsq(scaled_rows, real_rows(wanted * weight), rcond=1e-9)[0]
         return in_sections(self.cascade.sections, solution / column_sizes, denominators)
 
     def _wishes(self, data: PlantData) -> _Wishes:
         """What K should be for one plant, at frequencies of its lean grid; one draw.
 
-        A wish for the loop gain L is one for K = L / (G e^{-j w delay}), and its weight makes a relative miss
-        count the same everywhere. Frequencies may come twice, with different wishes.
+        A wish for the loop gain L is one for K = L / (G e^{-j w delay}), weighted by 1/|K| so that a relative
+        miss counts the same at each; the wish K = 0 elsewhere has weights of its own. Frequencies may come
+        twice, with different wishes. G = 0 at a wish gives an infinite one; not guarded, as a plant has its
+        zeros beside the grid.
         """
         grid = data.ellipses.omega_rad_s
         usable = grid < _HIGHEST_WISH * data.plant.nyquist_rad_s
         plant = data.ellipses.centre * data.delay
+        # Open loop over allowed, (F,): weight on G S times |G| of the centre; 0 where no mode is to be
+        # damped.
         peak = data.open_loop_disturbance
         omega: list[Real] = []
         wanted: list[Complex] = []
@@ -349,7 +370,8 @@ class StartMaker:
         against_controller = np.maximum(data.largest(LoopFunction.EFFORT), small_loop)
         quiet_weight = strength * against_controller[quiet]
         if peak.max(initial=0.0) > 1.0:
-            # Where the mode is to be damped, a large L is no harm.
+            # Where the mode is to be damped, a large L is no harm. Over the peak, a loop gain of the peak's
+            # size would cost what a loop gain of one costs beside the mode; over its square, less. Chosen.
             quiet_weight = quiet_weight / np.maximum(1.0, peak[quiet]) ** 2
         omega.append(grid[quiet])
         wanted.append(np.zeros(int(np.sum(quiet)), dtype=np.complex128))
@@ -359,7 +381,8 @@ class StartMaker:
     def _corner_range(self) -> tuple[float, float]:
         """Lowest and highest corner of random poles, in units of the scale.
 
-        They enclose the scale, the first mode of each plant and the bands in which damping is asked.
+        They enclose the scale, the first mode of each plant and the bands in which damping is asked, by the
+        two ratios above; the highest stays below Nyquist. Nothing can fail: the scale alone is enough.
         """
         relevant: list[float] = [self.cascade.scale_rad_s]
         for data in self.data:
@@ -382,7 +405,8 @@ class StartMaker:
         """Parameters (n,) of a random cascade of little gain, whose nominal loops are mostly stable.
 
         Until they are, the gain is halved; with two integrators, which less gain does not stabilise, a lead
-        around a slower and slower crossover is drawn. After 12 trials the last one is returned as it is.
+        around a slower and slower crossover is drawn. After `_TRIALS` trials the last one is returned as it
+        is, stable or not: the descent from it ends at once.
         """
         crossover = 10 ** self.rng.uniform(*_LEAD_CROSSOVER_DECADES)
         parameters = self._random_sections()
@@ -406,9 +430,10 @@ class StartMaker:
         Parameters
         ----------
         radius : callable
-            Largest pole modulus of the nominal loops of a parameter vector (n,).
+            Largest pole modulus of the nominal loops of a parameter vector (n,); inf for an algebraic loop.
         most : int
-            Parameter vectors that are returned at most; no more are led on once so many are stable.
+            Parameter vectors that are returned at most, at least 1; no more are led on once so many are
+            stable.
 
         Returns
         -------
@@ -424,7 +449,8 @@ class StartMaker:
         """
 
         def cost(x: Real) -> float:
-            """What is minimised: the radius plus missing damping, or, where stable, at most 1."""
+            """What is minimised, at x (n,): the radius plus missing damping; where stable and damped 1 minus
+            the smallest share of |1 + L|, at most 1. nan of the radius counts as unstable."""
             ringing = max(self.least_damping - self.cascade.least_damping(x), 0.0)
             pole_radius = radius(x)
             if not pole_radius < 1.0 or ringing > 0:
@@ -440,7 +466,7 @@ class StartMaker:
             return 1.0 - smallest_share
 
         def log_worst_case(x: Real) -> float:
-            """Logarithm of the score, finite also where the loop is unstable."""
+            """Logarithm of the score at x (n,), finite also where the loop is unstable."""
             return float(np.log(min(self.score(x), _LARGEST_COST)))
 
         candidates = [self._around_unstable_poles() for _ in range(_DRAWN_UNSTABLE)]
@@ -467,7 +493,8 @@ class StartMaker:
         """Parameters (n,) of one draw with its crossover near the unstable poles, and a gain of either sign.
 
         Kinds of draws: a slow lag (only where tracking is asked without an integrator), leads, and random
-        sections (not for notches).
+        sections (not for notches). Only called where some plant is unstable: without an unstable pole the
+        crossover would be 0 rad/s.
         """
         fastest_logs = []
         for data in self.data:
@@ -495,7 +522,8 @@ class StartMaker:
         """Parameters (n,) of lead sections around a crossover, of which one is a slow lag instead.
 
         Its slow real pole stands in for an integrator, which tracking without one needs. crossover: in units
-        of the scale. The lag is the first section of second order, else the first of first order.
+        of the scale, positive. The lag is the first section of second order, else the first of first order; a
+        cascade of notches alone keeps its leads.
         """
         x = self._lead_sections(crossover)
         slow_pole = crossover * 10 ** self.rng.uniform(*_SLOW_POLE_DECADES)
@@ -516,7 +544,8 @@ class StartMaker:
     def _random_sections(self) -> Real:
         """Parameters (n,) of sections with corners around the scale and numerators near their denominators.
 
-        Gains are about one; the parameters of each kind of section are described in `biquads`.
+        Gains are about one. Parameters of a section: numerator coefficients (of a notch the logarithm of its
+        damping term), then logarithms of the denominator's, as `biquads` has them. No cascade is refused.
         """
         x: list[float] = []
         for kind in self.cascade.sections:
@@ -530,7 +559,8 @@ class StartMaker:
             elif kind == "first_order":
                 x += [jitter[0], corner * abs(jitter[1]), np.log(corner)]
             elif kind == "notch":
-                # The numerator's damping is 1: a wide notch at the corner.
+                # First the numerator's damping term, then the denominator's, of damping ratio 1: a wide
+                # notch.
                 damping_term = np.log(2 * damping * corner)
                 x += [damping_term, np.log(2 * corner), 2 * np.log(corner)]
             else:
@@ -541,8 +571,9 @@ class StartMaker:
     def _lead_sections(self, crossover: float) -> Real:
         """Parameters (n,) of a lead around a crossover, a PI far below it, and other sections near one.
 
-        crossover: in units of the scale. The first section that can be the lead is: zero at a quarter of the
-        crossover, poles at four times; of second order with two poles and one zero.
+        crossover: in units of the scale, positive (its logarithm is taken). The first section that can be the
+        lead is: zero at `_LEAD_ZERO` of the crossover, poles at `_LEAD_POLES` times it; of second order with
+        two poles and one zero. A cascade of notches alone gets none.
         """
         x: list[float] = []
         lead_is_missing = True
@@ -570,10 +601,11 @@ class StartMaker:
         return np.array(x)
 
     def _low_gain(self, parameters: Real) -> float:
-        """Signed factor that puts the crossover of the nominal loop at a random frequency below the scale."""
+        """Signed factor on parameters (n,) that puts the first plant's crossover at a random frequency below
+        the scale; of either sign, evenly, unless the sign is to be kept."""
         crossover = self.cascade.scale_rad_s * 10 ** self.rng.uniform(*_LOW_CROSSOVER_DECADES)
         gain = self._crossover_gain(parameters, crossover)
-        # Pure damping knows no sign.
+        # Pure damping knows no sign: half of the draws turn it.
         if not self.keeps_sign and self.rng.uniform() >= 0.5:
             gain *= -1.0
         return gain
@@ -582,7 +614,8 @@ class StartMaker:
         """Signed factor that makes |L| = 1 of the first plant's centre at the crossover.
 
         The sign makes L at the lowest frequency of the grid that of a positive gain times 1 / (j w)^i, with i
-        integrators in the loop. The delay is left out: it turns L, and does not change |L|.
+        integrators in the loop. The delay is left out: it turns L, and does not change |L|. crossover_rad_s:
+        the nearest frequency of the grid is taken, also for one outside of it.
         """
         ellipses = self.data[0].ellipses
         omega = ellipses.omega_rad_s
@@ -591,12 +624,15 @@ class StartMaker:
         size = float(np.abs(loop[nearest]))
         turned_back = (loop[0] * 1j**self.integrators).real
         sign = 1.0 if turned_back >= 0 else -1.0
-        # A loop that vanishes at the crossover gets a large gain and is dropped as unstable.
+        # A loop that vanishes at the crossover gets a large gain, 1e12, and is dropped as unstable.
         return sign / max(size, 1e-12)
 
 
 def _simplex(cost: Callable[[Real], float], start: Real, evaluations: int) -> Real:
-    """Parameters (n,) of the least cost that Nelder and Mead's simplex finds from a simplex (n + 1, n)."""
+    """Parameters (n,) of the least cost that Nelder and Mead's simplex finds from a simplex (n + 1, n).
+
+    evaluations: of the cost, at most. The cost has to be finite or inf; that of nan is not defined.
+    """
     from scipy.optimize import minimize  # here: every command would wait for it
 
     # Costs are of the order of one; differences of 1e-4 decide nothing.
@@ -612,12 +648,15 @@ def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:
     ----------
     cascade : Cascade
     parameters : ndarray, shape (n,)
+        The first section's numerator carries the gain.
     factor : float
+        Of either sign.
 
     Returns
     -------
     ndarray, shape (n,)
-        A copy; unchanged where the first section is a notch, which has no gain of its own.
+        A copy; unchanged where the first section is a notch, which has no gain of its own. The length is not
+        checked; a cascade without sections is an IndexError.
     """
     numerator_sizes = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}
     numerator_size = numerator_sizes[cascade.sections[0]]
@@ -642,8 +681,8 @@ def with_cancelling_section(
     rng : numpy.random.Generator
         Draws the corner of the new section, within a factor 5 of the scale.
     damping : float
-        Damping ratio of the new pair of poles: at least what is asked of the controller's own poles. The
-        default, .8, has no resonance.
+        Damping ratio of the new pair of poles, positive (not checked): at least what is asked of the
+        controller's own poles. The default has no resonance and no pole far apart from the other. Chosen.
 
     Returns
     -------
@@ -673,11 +712,12 @@ def in_sections(
     Parameters
     ----------
     sections : sequence of SectionKind
-        No notch, whose numerator is not free.
+        No notch, whose numerator is not free (not checked).
     numerator : ndarray, shape (order + 1,)
         Coefficients in p, highest power first.
     denominators : sequence of ndarray
-        Of each section, in p, highest power first, monic.
+        Of each section, (2,) or (3,), in p, highest power first, monic; the others positive but for an
+        integrator's 0, since their logarithms are the parameters. One for each section, else ValueError.
 
     Returns
     -------
@@ -693,7 +733,7 @@ def in_sections(
     largest = float(np.max(np.abs(numerator), initial=0.0))
     if not (np.isfinite(largest) and largest > 0):
         return None
-    # Coefficients that are rounding would become roots far outside.
+    # Coefficients that are rounding, below 1e-12 of the largest, would become roots far outside.
     is_significant = np.abs(numerator) > 1e-12 * largest
     significant = np.where(is_significant, numerator, 0.0)
     trimmed = np.trim_zeros(significant, "f")
