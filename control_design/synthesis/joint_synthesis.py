@@ -24,7 +24,7 @@ from control_design.synthesis.synthesis_result import Outcome, SynthesisResult
 from ident.data.shown import Shown
 
 # Guards that are added for each plant in a round, from far apart: each is one more set of rows in every
-# descent.
+# descent. Chosen.
 _MOST_GUARDS = 6
 # Standard deviations of the count of unstable draws that are added before it counts as few enough: fresh
 # draws shall confirm the share. Two are a one-sided level of 98 %.
@@ -38,12 +38,14 @@ class JointDesign(Shown):
     Attributes
     ----------
     result : SynthesisResult
+        Its `outcome` and `gamma` say what the design reaches; not converged: nothing kept the first guards.
     guards : tuple of Guard
-        Responses that the design had to keep stable.
+        Responses that the design had to keep stable; empty for the first design.
     draws : int
         Responses that were drawn after each design.
     unstable : tuple of int
         Unstable ones among them, for the first design and each better one; the last is that of `result`.
+        Empty where the first design did not converge.
     reached : bool
         That count, and two standard deviations of it more, are within the share that may be unstable.
     """
@@ -74,16 +76,20 @@ def synthesise_jointly(
     plants : sequence of UncertainPlant
         With uncertainties that can be drawn from.
     specification : Specification
+        What every design is asked.
     options : SynthesisOptions, optional
         Of every design (`synthesise`).
     rng : numpy.random.Generator
         Draws starts and responses.
     stable_share : float
-        Of the sampled responses that must be stable.
+        Of the sampled responses that must be stable, in (0, 1). The default is far above the level of the
+        ellipses (.95), since an unstable loop is worse than a missed weight.
     draws : int
-        Responses drawn after every design, fresh ones each time.
+        Responses drawn after every design, fresh ones each time; by default ten may be unstable, so that the
+        count means something beside its scatter.
     rounds : int
-        Designs with guards, at most.
+        Designs with guards, at most; 0: the first design is counted only. The default is chosen: each costs a
+        whole synthesis.
     first : SynthesisResult, optional
         The design without guards, where it is known already.
     progress : callable, optional

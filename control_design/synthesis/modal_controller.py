@@ -43,7 +43,7 @@ _REAL = 1e-9
 # norms of C and B. Chosen: a start only.
 _TURNS = 24
 # Condition number of coordinates beyond which they are no basis: two poles coincide, or the angle is unlucky.
-# Half of the digits are left there.
+# Seven digits are left there.
 _WORST_CONDITION = 1e9
 
 

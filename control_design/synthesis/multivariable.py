@@ -70,8 +70,8 @@ _FORM_SCALE = 2
 # Lowest corner of a block over the lowest frequency of the grids, which has to see the corner. Doubled,
 # nothing moves.
 _SLOWEST_CORNER = 2
-# Frequencies over the scale at which a static gain inverts the plant: half decades around it, more of them
-# above, where stiff joints are inverted. Chosen.
+# Frequencies over the scale at which a static gain inverts the plant: half decades from a tenth of the scale
+# to thirty times it. Chosen.
 _INVERTED_AT = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1)
 # Lags, in half turns, by which the plant is turned before: plants that integrate lag by a half of one.
 _LAGS = (0.0, 0.25, 0.5)
@@ -329,7 +329,7 @@ class Programme:
                     K = central_controller(P)
                     if K is None or K.A.shape[0] < self.form.order:
                         continue
-                    # Up to Tustin's s of half of Nyquist, 2/dt: beyond it nothing of K is asked.
+                    # Up to 2/dt, Tustin's frequency of half of Nyquist. Chosen.
                     K = reduced(K, plain, self.form.order, self.lowest_rad_s, 2 / self.dt_s)
                     x = self.form.realised(*K)
                     if x is not None:
@@ -407,7 +407,7 @@ class Programme:
         Parameters
         ----------
         x : ndarray, shape (n,)
-            Where to begin; from one that is not robustly stable it returns at once.
+            Where to begin; one that is not robustly stable on the lean grids is returned at once.
         tell : callable
             Called with (fraction, message) at every round.
 
@@ -451,7 +451,7 @@ class Programme:
             if (grids_agree and has_ended) or least <= self.options.sufficient_gamma:
                 break
 
-            # Half of the excess accepted, so that what just passed does not come back in the next round.
+            # Half of the excess accepted: what would just pass joins the grid as well.
             limit = reached * (1 + 0.5 * _EXCESS)
             for i, (omega, value) in enumerate(checked):
                 maxima = [k for k in local_maxima(value) if value[k] > limit]

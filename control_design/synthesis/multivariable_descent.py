@@ -44,7 +44,7 @@ from control_design.synthesis.modal_controller import ModalForm
 # Shift of a parameter in the difference quotient of slopes, in natural units. The quotient errs by about the
 # shift times the third derivative, and by rounding over the shift: 1e-5 and 1e-11.
 _SHIFT = 1e-5
-# Relative accuracy of gamma in a step: half of what is the least gain of one.
+# Relative accuracy of gamma in a step: that of the least gain that is worth one.
 _ACCURACY = 1e-6
 # Factor on the box where the programme of a step fails, mostly by rounding. Chosen; seven of them end a
 # descent.

@@ -56,31 +56,36 @@ _HALVINGS = 20
 # Rounds for ends that are good on the lean grid and not robustly stable between its points. Doubled, nothing
 # moves.
 _RETRIEVALS = 3
-# Factor on the gain of such an end, again and again until it is stable on the finer grid.
+# Factor on the gain of an end that is to be retrieved, again and again until it is stable on the finer grid:
+# less gain moves most loops away from -1. Chosen.
 _RETREAT = 0.8
-# How often at most: 1 % of the gain is left then.
+# How often that factor is applied at most: 1 % of the gain is left then.
 _RETREATS = 20
-# Rounds of exchange for the best end by itself: a limit for grids that never agree.
+# Rounds of exchange for the best end by itself: a limit for grids that never agree. Chosen.
 _FINISHING = 10
 # Ratio of two worst cases up to which both count as the same local minimum: twice what the exchange accepts
 # (EXCHANGE_TOLERANCE).
 _AGREE = 1.001
 # Least damping ratio of fitted poles: a narrow resonance of a start stays, and hides between grid points.
+# Chosen.
 _NO_RESONANCE = 0.3
-# Rounds of fits with random weights, after the one with the weights of the bound.
+# Rounds of fits with random weights, after the one with the weights of the bound: frequencies that a low
+# order can do without. Chosen.
 _WEIGHTED_ROUNDS = 3
 # Steps that every fit gets before the best of a round goes on alone. Read off the paths of random designs 0
 # to 21: after ten it mostly, not always, leads to the best end of its round; after five less often.
 _TRIAL_STEPS = 10
 # Shaped loops that are drawn where ten steps choose between them. Doubled, nothing moves.
 _ROUGH_DRAWS = 50
-# Worst case over that of the small Youla problem (`youla_starts`) at which a search may end: near enough.
+# Worst case over that of the small Youla problem (`youla_starts`) at which a search may end: what a further
+# search could gain is at most these 3 %. Chosen.
 _NEAR = 1.03
-# Worst case over that of the small Youla problem where several ends agree before all kinds of starts were
-# tried.
+# Worst case over that of the small Youla problem up to which agreeing ends may end the search before all
+# kinds of starts were tried: agreement allows for a little more than `_NEAR`. Chosen.
 _FAIR = 1.05
-# How far the small problem's worst case lies above that of the default one, at most. A design below both
-# shows that the small problem has ended in a valley of its own, and that its value is no bound.
+# How far the small problem's worst case lies above that of the default one, at most: 8 % were seen
+# (`youla_starts`). A design below both shows that the small problem has ended in a valley of its own, and
+# that its value is no bound.
 _FINER = 1.1
 
 
@@ -131,12 +136,14 @@ class OrderSearch:
     Parameters
     ----------
     problem : Problem
-        Plants, requirements, and lean grids `grids`, which grow while this searches.
+        Plants, requirements (`spec`), effort (`options`), and lean grids `grids`, one array in rad/s for each
+        plant, which grow while this searches.
     cascade : Cascade
         Sections of the controller.
     rng : numpy.random.Generator
         All starts and hops are drawn from it.
     tell : Progress
+        Called with the share that is done and a message.
     known_starts : sequence of ndarray, shape (n,)
         Parameter vectors that are good already, from a lower order; the first is checked before any descent.
     """
@@ -169,7 +176,8 @@ class OrderSearch:
         Returns
         -------
         OrderResult
-            Ends early where a controller is good enough (`options.sufficient_gamma`).
+            Ends early where a controller is good enough (`options.sufficient_gamma`). There always is a
+            start, as options ask for at least one. Without a best where nothing is robustly stable.
         """
         ends: list[TriedController] = []
         for x in self.known_starts[:1]:
@@ -179,7 +187,8 @@ class OrderSearch:
             return OrderResult(ends[0], (), (ends[0].gamma,))
 
         starts = self._starts()
-        # Agreement counts not before half of the starts were tried: the first ones are of one kind.
+        # Agreement counts not before half of the starts, and three, were tried: the first ones may be of one
+        # kind.
         drawn = len(starts) - len(self.known_starts)
         fewest_starts = len(self.known_starts) + max((drawn + 1) // 2, min(drawn, 3))
         ends_of_starts: list[TriedController] = []
@@ -205,11 +214,13 @@ class OrderSearch:
         Parameters
         ----------
         free : FreeControllers
-            Responses of controllers of any order, and `gamma`, the worst case that they reach.
+            Responses of controllers of any order, and `gamma`, the worst case that they reach; inf: none is
+            known, nothing counts as near it.
 
         Returns
         -------
         result : OrderResult
+            Without a best where no start led to a loop that is robustly stable on the dense grid.
         settled : bool
             The result is good enough, or lies within `_NEAR` of `free.gamma`, or meets the specification with
             as many ends agreeing on it as are asked.
@@ -225,11 +236,13 @@ class OrderSearch:
         ends: list[TriedController] = []
 
         def near_free(gamma: float) -> bool:
-            """Whether a worst case is as good as an order can hope for, and the bound to be trusted."""
+            """Whether a worst case is within `_NEAR` of the bound, and not so far below it (`_FINER`) that
+            the bound cannot be one; False for an infinite bound."""
             return free.gamma / _FINER <= gamma <= _NEAR * free.gamma < np.inf
 
         def agreed(gamma: float, fair: float = np.inf) -> bool:
-            """Whether several ends agree and gamma meets the specification, within fair times the bound."""
+            """Whether enough ends agree and gamma meets the specification, within fair times the bound (by
+            default whatever the bound)."""
             return gamma <= min(1.0, fair * free.gamma) and self._agree(ends)
 
         rounds = _WEIGHTED_ROUNDS + 2
@@ -259,10 +272,12 @@ class OrderSearch:
         Parameters
         ----------
         free : FreeControllers
+            Its responses; the bound itself does not count.
 
         Returns
         -------
         OrderResult
+            Without a best, and without a nearest, where nothing is robustly stable on the dense grid.
         """
         starts = [*self.known_starts, *self._fits(free, weighted=False)]
         ends = self._retrieved(self._checked(self._raced(starts)))
@@ -273,7 +288,11 @@ class OrderSearch:
     # Starts
 
     def _fits(self, free: FreeControllers, *, weighted: bool) -> list[Real]:
-        """Parameters (n,) of a stable fit of each free controller that has one; weighted: at random."""
+        """Parameters (n,) of a stable fit of each free controller that has one, if with less gain.
+
+        weighted: errors are weighted over frequency at random, else all relative errors alike. No fit for a
+        cascade with notches.
+        """
         # Clear of the bound on the controller's damping by 1 %.
         asked_damping = self.spec.controller_damping or 0.0
         damping = max(1.01 * asked_damping, _NO_RESONANCE)
@@ -361,8 +380,8 @@ class OrderSearch:
     def _raced(self, starts: Sequence[Real]) -> list[TriedController]:
         """Where `_TRIAL_STEPS` steps lead from each start, and for the best of them a whole descent.
 
-        In ascending order of gamma_grid after the trial steps. Not checked on the dense grid, unless the best
-        is good enough on the lean one to end the search.
+        In ascending order of gamma_grid after the trial steps; empty without starts. Not checked on the dense
+        grid, unless the best is good enough on the lean one to end the search.
         """
         trials = [self._end(x, _TRIAL_STEPS, checked=False) for x in starts]
         trials.sort(key=lambda end: end.gamma_grid)
@@ -390,13 +409,15 @@ class OrderSearch:
         return checked
 
     def _good_enough(self, ends: Sequence[TriedController]) -> bool:
-        """Whether the smallest dense gamma is one at which the user wants the search to stop."""
+        """Whether the smallest dense gamma is one at which the user wants the search to stop: at most
+        `sufficient_gamma`, which is 0 by default, for never. False without ends."""
         return min((end.gamma for end in ends), default=np.inf) <= self.options.sufficient_gamma
 
     def _agree(self, ends: Sequence[TriedController]) -> bool:
         """Whether enough descents ended at the best value: more of them would hardly find another.
 
-        There must be an end that is stable on the lean grid.
+        Enough are `agreeing_starts` within `_AGREE` of the smallest gamma_grid. Without a stable end none
+        agrees, and the answer is False.
         """
         stable = [end.gamma_grid for end in ends if np.isfinite(end.gamma_grid)]
         agreeing = sum(gamma <= min(stable) * _AGREE for gamma in stable)
@@ -405,13 +426,15 @@ class OrderSearch:
     def _nearest(self, ends: Sequence[TriedController]) -> Real:
         """Parameters (n,) of the end nearest to a robustly stable loop.
 
-        That is the smallest gamma_grid; where none is stable on the lean grid, the smallest pole modulus.
+        That is the smallest gamma_grid; where none is stable on the lean grid, the smallest pole modulus. At
+        least one end, else ValueError of an empty minimum.
         """
         nearest = min(ends, key=lambda end: (end.gamma_grid, self._radius(end.parameters)))
         return nearest.parameters
 
     def _radius(self, parameters: Real) -> float:
-        """Largest pole modulus of all nominal loops, in z; below 1: stable."""
+        """Largest pole modulus of all nominal loops, in z, under parameters (n,); below 1: stable, inf for an
+        algebraic loop."""
         poles_of_loops = self.problem.closed_loop_poles(self.cascade, parameters)
         return max(float(np.max(np.abs(poles), initial=0.0)) for poles in poles_of_loops)
 
@@ -441,7 +464,11 @@ class OrderSearch:
         return sorted(stable, key=lambda end: end.gamma)
 
     def _retreat(self, parameters: Real) -> Real | None:
-        """Parameters (n,) with as little less gain as makes them stable on the lean grids; None: never."""
+        """Parameters (n,) with as little less gain as makes them stable on the lean grids.
+
+        None where `_RETREATS` steps do not, as of unstable plants, and of a notch first, whose gain does not
+        change.
+        """
         for number in range(1, _RETREATS + 1):
             trial = with_gain(self.cascade, parameters, _RETREAT**number)
             if np.isfinite(self._descent().value(trial)):
@@ -512,7 +539,8 @@ class OrderSearch:
         return OrderResult(best, tuple(self.reports), tuple(history))
 
     def _finished(self, best: TriedController) -> TriedController:
-        """Best of an end and its improvements, by exchange until dense check and lean grid agree."""
+        """Best of an end (gamma finite) and its improvements, by exchange until dense check and lean grid
+        agree, at most `_FINISHING` times, or an improvement is not robustly stable between grid points."""
         current = best
         for _ in range(_FINISHING):
             grids_agree = current.gamma <= current.gamma_grid * (1 + EXCHANGE_TOLERANCE)
@@ -528,8 +556,9 @@ class OrderSearch:
     def _hop(self, parameters: Real) -> Real:
         """Random neighbour (n,) of parameters (n,), moved by a tenth to one natural unit in every parameter.
 
-        Moved less until it is stable, at most `_HALVINGS` times.
+        Moved less until it is stable, at most `_HALVINGS` times; then it is nearly where it began.
         """
+        # A tenth to one: less leads back to the same minimum, more is mostly unstable. Chosen.
         size = 10 ** self.rng.uniform(-1.0, 0.0)
         direction = self.rng.standard_normal(parameters.size) * natural_units(self.cascade, parameters)
         for _ in range(_HALVINGS):
@@ -553,7 +582,7 @@ def different(
     ----------
     candidates : sequence of TriedController
     most : int
-        Candidates that are returned at most.
+        Candidates that are returned at most; at least 1, as 0 is no limit.
     on_grid : bool
         Judged by `gamma_grid` instead of `gamma`.
 
@@ -561,7 +590,8 @@ def different(
     -------
     list of TriedController
         Of two whose worst cases differ by less than .1 % only the better one: the same minimum twice teaches
-        nothing.
+        nothing. Of infinite ones at most one, at the end. Worst cases are positive: a better one of 0 is a
+        division by zero.
     """
     gamma = attrgetter("gamma_grid" if on_grid else "gamma")
     selected: list[TriedController] = []

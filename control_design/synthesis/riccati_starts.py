@@ -456,7 +456,8 @@ def _root(gramian: Real) -> Real:
 def _diagonal(weights: Sequence[RationalWeight]) -> System:
     """Weights of one channel each, side by side: a system of as many inputs and outputs.
 
-    Each is proper, which `RationalWeight` ensures, and stable; an empty list raises IndexError in `control`.
+    At least one weight. Each is proper, which `RationalWeight` ensures; poles on the axis pass, and are moved
+    by the caller.
     """
     import control  # here, because it brings a plotting library with it
 

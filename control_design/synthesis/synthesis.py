@@ -34,37 +34,43 @@ from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome, StartReport, SynthesisResult
 from control_design.synthesis.youla_starts import FreeController, FreeControllers, free_controllers
 
-# Share of the worst case from which a weighted maximum blocks the specification, too.
+# Share of the worst case from which a weighted maximum blocks the specification, too: a minimax stands on
+# several maxima that are equal but for what the search leaves. Chosen.
 _STILL_BLOCKING = 0.98
-# Weighted worst case above which a loop stands on the edge of stability: its digits mean nothing.
+# Weighted worst case above which a loop stands on the edge of stability: its digits mean nothing, as 1 + L is
+# the 1e-4 that is left of numbers near one. Chosen.
 _MEANINGLESS = 1e4
 # Largest damping ratio that is asked of the controller where data are sparse: wider than that is no
 # resonance.
 _MOST_DAMPING = 0.3
 # Ways in which a cancelling section is added to the result of the order below: they differ in its corner.
+# Chosen.
 _EMBEDDINGS = 3
-# Damping ratio of such a section: no resonance.
+# Damping ratio of such a section: no resonance, and no two poles far apart. Chosen.
 _EMBEDDED_DAMPING = 0.8
-# Lowest order of the ladder up to the asked one; with tracking, as two states rarely track and damp.
+# Lowest order of the ladder up to the asked one: one pair of poles.
 _LOWEST_ORDER = 2
 
-# The lowest order with tracking.
+# The lowest order with tracking, as two states rarely track and damp.
 _LOWEST_TRACKING_ORDER = 3
-# Worst case over the Youla bound that the order "auto" may leave.
+# Worst case over the Youla bound that the order "auto" may leave: the 2 % that the specification's field
+# `controller_order` promises.
 _WITHIN = 1.02
-# Two more states that leave more than this share of gamma end the search for "auto".
+# Two more states that leave more than this share of gamma end the search for "auto"; also how much of the
+# best gamma a lower order may miss. Chosen: less than a per cent is not worth two states.
 _GAINS = 0.99
-# Orders that "auto" tries: the first, and the highest.
+# The order that "auto" tries first: an integrator and two pairs, of which it goes up or down. Chosen.
 _FIRST_AUTO_ORDER = 5
 
 # The highest order that "auto" tries: a bound on time. Chosen.
 _HIGHEST_AUTO_ORDER = 12
-# Frequencies of each plant that are named where an ellipse lies over -1.
+# Frequencies of each plant that are named where an ellipse lies over -1. Chosen: more would not be read.
 _MOST_PLACES = 5
-# Maxima of one requirement that may block, of each plant.
+# Maxima of one requirement that may block, of each plant: a limit on the list. Chosen.
 _MOST_MAXIMA = 10
 
-# What a controller without a weighted worst case fails on: `BlockingPoint.weight`.
+# What a controller without a weighted worst case fails on: `BlockingPoint.weight`. Pages and files show these
+# words.
 NOMINAL = "stability of the nominal loop"
 ROBUST = "stability over the ellipse"
 DELAYED = "stability with the extra delay"
@@ -110,8 +116,8 @@ def synthesise(
     Raises
     ------
     SpecificationError
-        Specification and plants contradict each other (before optimising), or the order is "auto" and no
-        Youla bound is known.
+        There is no plant, or specification and plants contradict each other (before optimising), or the order
+        is "auto" and no Youla bound is known.
 
     Notes
     -----
@@ -152,7 +158,10 @@ def synthesise(
 
 
 def _is_better(new: TriedController | None, old: TriedController | None) -> bool:
-    """Whether a new best controller replaces an old one; where there is no old one it does, even by None."""
+    """Whether a new best controller replaces an old one: by a dense gamma that is not larger.
+
+    Where there is no old one it does, even if it is None.
+    """
     if old is None:
         return True
     return new is not None and new.gamma <= old.gamma
@@ -170,13 +179,13 @@ class _TriedOrder:
 def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: bool) -> SynthesisResult:
     """Design of the lowest order within `_WITHIN` of the Youla bound, as far as fits of its controllers tell.
 
-    root: seed; each order has its own generator. Orders are tried from a middle one upwards, or downwards
-    where that is enough, each from these fits and from the result of two states fewer: a longer search may
-    reach the bound with one state less. States are added as long as two of them gain, or (thorough) while a
-    specification is missed that the bound meets. Where no order reaches the bound, the lowest one nearly as
-    good as the best that was tried. Several plants may have bounds that no common controller reaches; a
-    damping asked of the controller is not part of the bound. Raises SpecificationError where no bound is
-    known.
+    root: seed; each order has its own generator. Orders are tried from `_FIRST_AUTO_ORDER` upwards in twos,
+    or downwards where that one is enough, each from fits of the bound's controllers and from the result of
+    two states fewer; a longer search may reach the bound with one state less. States are added as long as two
+    of them gain, or (thorough) while a specification is missed that the bound meets. Where no order reaches
+    the bound, the lowest one is taken that is nearly as good as the best that was tried: several plants may
+    have bounds that no common controller reaches, and a damping asked of the controller is not part of the
+    bound. Raises SpecificationError where no bound is known.
     """
     specification = problem.spec
     tell(0.0, "bound for any order")
@@ -191,7 +200,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
     tried_orders: dict[int, _TriedOrder] = {}
 
     def gamma(order: int) -> float:
-        """Worst case that fits of one order lead to; the order joins those tried."""
+        """Worst case that fits of one order lead to, inf for nothing stable; the order joins those tried."""
         sections = specification.model_copy(update={"controller_order": order}).sections()
         cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
         part = part_of(tell, len(tried_orders), _HIGHEST_AUTO_ORDER, f"order {order}: ")
@@ -211,7 +220,8 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
         return reached
 
     def acceptable() -> float:
-        """Worst case that the lowest order may have: enough, or nearly the best of those tried."""
+        """Worst case that the lowest order may have: enough, or within `_GAINS` of the best of those
+        tried."""
         best = min(attempt.gamma for attempt in tried_orders.values())
         return max(enough, best / _GAINS)
 
@@ -259,18 +269,24 @@ def synthesise_near(
     ----------
     controller : Controller
         Of any order, e.g. for a specification somewhat different; fitted by one of the asked order, or for
-        "auto" of its own.
+        "auto" of its own. Sampled as the plants (not checked: at another period its response is fitted all
+        the same, up to their Nyquist frequency).
     plants : sequence of UncertainPlant
+        At least one.
     specification : Specification
+        What is asked, with order and structure of the new controller.
     options : SynthesisOptions, optional
+        Sizes of grids and rounds of exchange; its numbers of starts do not count.
     rng : numpy.random.Generator
+        Not drawn from in the search as it is.
     progress : callable, optional
         Called with (fraction, message).
 
     Returns
     -------
     SynthesisResult
-        Without `plants` and `specification`.
+        Without `plants` and `specification`. Not converged, without a blocking point, where the fit leads to
+        nothing stable, as of notches, which are not fitted.
 
     Raises
     ------
@@ -296,7 +312,8 @@ def _result(
 ) -> SynthesisResult:
     """Result of a synthesis for the best controller of a search, or for none.
 
-    Anti-windup gains are chosen so that the nominal loops hold at the limits (`with_safe_limits`).
+    Anti-windup gains are chosen so that the nominal loops hold at the limits (`with_safe_limits`). No best,
+    or one with a worst case of `_MEANINGLESS` or more, is a result without a controller.
     """
     best = result.best
     if best is None or best.gamma >= _MEANINGLESS:
@@ -327,8 +344,10 @@ def _climbed(
 ) -> OrderResult:
     """Result of the last order of a ladder, each order started from the one before and from its own starts.
 
-    root: seed; each order has its own generator. The last order starts from the fitted controller, too. The
-    descents that were run are added to `reports`.
+    ladder: sections of each order, ascending. root: seed; each order has its own generator. The last order
+    starts from the fitted controller, too, if there is one. The descents that were run are added to
+    `reports`. Where an order finds nothing stable, the next has its own starts only. An empty ladder gives no
+    best.
     """
     result = OrderResult(None, (), ())
     lower: Cascade | None = None
@@ -350,7 +369,11 @@ def _climbed(
 def _embedded(
     problem: Problem, lower: Cascade, best: TriedController, higher: Cascade, rng: np.random.Generator
 ) -> list[Real]:
-    """Parameters of the best of a lower order with a section more that cancels itself, in several ways."""
+    """Parameters of the best of a lower order with a section more that cancels itself, in several ways.
+
+    `_EMBEDDINGS` vectors of the higher cascade, whose sections are those of `lower` and one of order two
+    more; any other raises ValueError (`with_cancelling_section`).
+    """
     # Clear of the bound on the controller's damping by 1 %.
     asked_damping = problem.spec.controller_damping or 0.0
     damping = max(_EMBEDDED_DAMPING, 1.01 * asked_damping)
@@ -365,7 +388,8 @@ def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPl
 
     A plant that is known on its own frequencies only needs one: a resonance narrower than their spacing would
     stand between them, unseen. A pair of poles is as wide as 2 zeta of its frequency, so half of the widest
-    relative spacing is asked. A damping that was asked already stays.
+    relative spacing is asked, at most `_MOST_DAMPING`. A damping that was asked already stays, and without
+    such a plant the specification is the one given.
     """
     own_grids = [plant.own_grid for plant in plants if plant.own_grid is not None]
     if specification.controller_damping is not None or not own_grids:
@@ -376,7 +400,11 @@ def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPl
 
 
 def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[SectionKind, ...]]:
-    """Section lists from the lowest order (at least `lowest`) to the asked one, one section more each."""
+    """Section lists from the lowest order (at least `lowest`) to the asked one, one section more each.
+
+    Sections of second order and notches stand last and are left out from the end; the asked list is always
+    among them, also where its order is below `lowest`.
+    """
     rungs = [sections]
     while rungs[0][-1] in ("second_order", "notch"):
         shorter = rungs[0][:-1]
@@ -396,13 +424,14 @@ def part_of(tell: Progress, number: int, count: int, head: str = "") -> Progress
     number : int
         Of the part, from 0.
     count : int
-        Number of parts.
+        Number of parts, not 0.
     head : str
         Stands before every message.
 
     Returns
     -------
     Progress
+        Its fraction, 0 to 1, is of the part.
     """
     return lambda fraction, message: tell((number + fraction) / count, head + message)
 
@@ -417,7 +446,8 @@ def _nothing_stable(
     """Result without a controller, and with what fails where the search came nearest to one.
 
     nearest: parameters (n,) of that controller, if any. edge: one that is stable with a worst case so large
-    that it means nothing; its requirements block where nothing else fails.
+    that it means nothing; its requirements block where nothing else fails. The controller of the result is
+    u = 0, named so, and gamma inf.
     """
     nothing = Controller.proportional(
         0.0,
@@ -433,7 +463,11 @@ def _nothing_stable(
 
 
 def _blocking(problem: Problem, cascade: Cascade, best: TriedController) -> tuple[BlockingPoint, ...]:
-    """Local maxima of the weighted worst cases within 2 % of gamma, the largest first."""
+    """Local maxima of the weighted worst cases within 2 % of gamma, the largest first.
+
+    best: its `gamma`, finite, and parameters of the cascade count. Points are at the frequencies of
+    `Problem.checks`, rad/s.
+    """
     points = []
     for _, data in problem.checks(cascade, best.parameters):
         omega = data.ellipses.omega_rad_s
@@ -453,9 +487,11 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
     Parameters
     ----------
     problem : Problem
+        Its plants, guards and checks.
     cascade : Cascade
+        Structure of the controller.
     parameters : ndarray, shape (n,)
-        Of the controller.
+        Of the controller; another number of them is a ValueError (`Cascade.split`).
 
     Returns
     -------
@@ -500,7 +536,10 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
 
 
 def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:
-    """Points at which guards that are not stable come nearest to -1, one for each such guard."""
+    """Points at which guards that are not stable come nearest to -1, one for each such guard.
+
+    parameters (n,) of the cascade; frequencies in rad/s, value inf; empty without such a guard.
+    """
     points = []
     for guard in problem.guards:
         if problem.guarded(cascade, parameters, [guard]):
@@ -516,7 +555,8 @@ def _guards(problem: Problem, cascade: Cascade, parameters: Real) -> list[Blocki
 def _ringing(problem: Problem, cascade: Cascade, parameters: Real) -> list[BlockingPoint]:
     """The controller's own least damped pair, if it has less damping than is asked; else nothing.
 
-    The value is the damping asked over that of the pair.
+    parameters (n,) of the cascade. The value is the damping asked over that of the pair, the frequency the
+    pair's corner in the Tustin plane, rad/s. Empty also where no damping is asked.
     """
     asked = problem.spec.controller_damping
     least = cascade.least_damping(parameters)

@@ -13,7 +13,11 @@ from ident.data.settings import Settings
 
 
 class SynthesisOptions(GridOptions):
-    """Effort of the search; the defaults solve an order-5 design in about a second."""
+    """Effort of the search; the defaults solve an order-5 design in about a second.
+
+    Sizes of the grids come from `GridOptions`. A value out of its bounds or an unknown key is refused by
+    pydantic (ValueError). The defaults are chosen for that time.
+    """
 
     starts: int = Field(
         default=6,
@@ -34,7 +38,10 @@ class SynthesisOptions(GridOptions):
 
 
 class MultivariableOptions(Settings):
-    """Effort of the search for one controller of several joints; the defaults take seconds for two joints."""
+    """Effort of the search for one controller of several joints; the defaults take seconds for two joints.
+
+    Chosen for that time. A value out of its bounds or an unknown key is refused by pydantic (ValueError).
+    """
 
     starts: int = Field(default=1, ge=1, le=50, description="starts to go down from; the best counts")
     rounds: int = Field(default=40, ge=1, le=100, description="rounds of descent, with exchange")

@@ -16,7 +16,8 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from ident.data.shown import NOT_STORED, Shown
 
-# What a descent that found no stable loop reports in place of infinity, which JSON does not know.
+# What a descent that found no stable loop reports in place of infinity, which JSON does not know: near the
+# largest double, above every worst case.
 LARGEST_GAMMA = 1e300
 
 
@@ -43,8 +44,9 @@ class BlockingPoint:
         Name of a weighted requirement; without a stable design, one of the words of `synthesis`, such as
         `NOMINAL`.
     omega_rad_s : float
+        Where, rad/s; of an unstable pole its |ln z|/dt.
     value : float
-        Weighted worst case there; inf where the loop or a member of the ellipse is unstable.
+        Weighted worst case there, no unit; inf where the loop or a member of the ellipse is unstable.
     joint : int or None
         Index of the joint it lies at, of several.
     """
@@ -94,11 +96,12 @@ class SynthesisResult(Shown):
         Says what gamma means.
     controller : Controller
     gamma : float
-        Largest weighted worst case over plants, ellipses and the dense grid.
+        Largest weighted worst case over plants, ellipses and the dense grid; inf where nothing stable was
+        found. Nothing of this class is checked: a synthesis fills it.
     blocking : tuple of BlockingPoint
         Where and by which weight gamma is reached, worst first.
     starts : tuple of StartReport
-        All runs of a solver.
+        All runs of a solver, in their order.
     gamma_history : tuple of float
         Dense gamma of the best point after the starts and each exchange round.
     grid_points : int

@@ -30,7 +30,8 @@ from control_design.specification import Specification
 from control_design.synthesis.starts import in_sections
 from ident.data.arrays import real_rows
 
-# A sixth of the time of the default bound, and 1 to 8 % above it on links with long ellipses.
+# Basis and grids of the small problem, each about a third of the default ones, no exchange of frequencies: a
+# sixth of the time of the default bound, and 1 to 8 % above it on links with long ellipses.
 _SMALL = YoulaOptions(
     real_poles=12,
     mirrored_poles=0,
@@ -42,22 +43,25 @@ _SMALL = YoulaOptions(
 )
 # Relative accuracy of the small problems: a tenth of the 3 % that the search asks of them.
 _ACCURACY = 3e-3
-# Relocations of the poles; the fifth already moves them by less than a per cent.
+# Relocations of the poles; the fifth already moves them by less than a per cent, the others are for slow
+# cases.
 _RELOCATIONS = 12
-# First poles, in units of the scale: real, over two decades around it.
+# Slowest of the first poles, in units of the scale: they are real, over two decades around it, where a
+# controller acts. Relocation moves them from wherever they begin. Chosen.
 _SLOWEST_POLE = 0.1
 
-# The fastest of the first poles.
+# The fastest of the first poles, in units of the scale.
 _FASTEST_POLE = 10.0
-# Standard deviation of the logarithms of random weights: factors of 4.5 up and down are usual.
+# Standard deviation of the logarithms of random weights: factors of 4.5 up and down are usual. Chosen.
 _SPREAD = 1.5
 # Frequencies at which they are drawn; over four decades two a decade: weights bend, and do not jitter.
 _KNOTS = 8
-# |p| towards Nyquist, where nothing of the fit is left.
+# |p| from which on a frequency is left out: p is infinite at Nyquist, and its powers would overflow the
+# columns. 1e6 scales is within a millionth of Nyquist.
 _HIGHEST = 1e6
 # Least modulus of a pole, in units of the scale: one at 0 would be an integrator that nobody asked for.
 _LEAST_POLE = 1e-9
-# Singular values below this share of the largest are rounding.
+# Singular values below this share of the largest are rounding: some thousand times that of one number.
 _ROUNDING = 1e-12
 # No division by zero.
 _TINY = 1e-300
@@ -70,9 +74,9 @@ class FreeController:
     Attributes
     ----------
     omega_rad_s : ndarray, shape (F,)
-        Ascending.
+        Ascending, positive, up to Nyquist.
     k : ndarray, shape (F,)
-        Without the computational delay.
+        K, command per error, without the computational delay. Nothing is checked.
     """
 
     omega_rad_s: Real
@@ -86,7 +90,7 @@ class FreeControllers:
     Attributes
     ----------
     each : tuple of FreeController
-        Up to three of each plant.
+        Up to three of each plant: for its ellipses, enclosing and inscribed discs, where the value is finite.
     gamma : float
         Largest of their worst cases over the ellipses, one for each plant; inf: some plant has none.
     """
@@ -103,14 +107,17 @@ def free_controllers(
     Parameters
     ----------
     plants : sequence of UncertainPlant
+        Without any, gamma is 0 and there are no controllers.
     specification : Specification
+        Its weighted requirements count; damping of the controller and delay margin are not part of the bound.
     options : YoulaOptions
         By default a small basis and coarse grids.
 
     Returns
     -------
     FreeControllers
-        Where a plant has no such bound, gamma is inf, and the plants that follow are left out.
+        Where a plant has no such bound (its problem raises ValueError or ArithmeticError), gamma is inf, and
+        the plants that follow are left out.
     """
     controllers: list[FreeController] = []
     gamma = 0.0
@@ -140,16 +147,22 @@ def fitted(
     cascade : Cascade
         Structure, scale and sampling time of the fit.
     free : FreeController
+        Finite, at more frequencies than the fit has coefficients (neither is checked).
     least_damping : float
-        Damping ratio that no pair of poles goes below.
+        Damping ratio that no pair of poles goes below; from 1 on all poles are real.
     rng : numpy.random.Generator, optional
         Draws weights over frequency; without it all relative errors count the same.
 
     Returns
     -------
     ndarray, shape (parameters,), or None
-        None for structures with notches, whose zeros are not free, or a fit that degenerates. Poles are
-        stable; the loop need not be.
+        None for structures with notches, whose zeros are not free, or a fit that degenerates: a relocation
+        that does not converge, or a numerator that vanishes. Poles are stable; the loop need not be.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        The numerator's least squares do not converge; a response that is not finite gives this or None.
     """
     if "notch" in cascade.sections:
         return None
@@ -193,8 +206,8 @@ def fitted(
 def _functions(p: Complex, poles: Complex) -> Complex:
     """Partial fractions (F, n) of poles (n,) at p (F,), with real coefficients for real responses.
 
-    1/(p - a) of real poles. Of a pair, whose poles stand next to each other, the sum of both fractions, and j
-    times their difference.
+    1/(p - a) of real poles. Of a pair, whose poles stand next to each other, the upper one first, the sum of
+    both fractions, and j times their difference. p on a pole gives inf, which stable poles exclude.
     """
     fractions = 1.0 / (p[:, None] - poles)
     upper = poles.imag > 0
@@ -210,8 +223,8 @@ def _functions(p: Complex, poles: Complex) -> Complex:
 def _zeros(poles: Complex, coefficients: Real) -> Complex:
     """Zeros (n,) of 1 + sum of coefficients (n,) times `_functions` of poles (n,).
 
-    Eigenvalues of A - b c with A, b of the real realisation of the partial fractions. Raises LinAlgError
-    where they are not finite.
+    Eigenvalues of A - b c with A, b of the real realisation of the partial fractions: b is 1 for a real pole,
+    (2, 0) for a pair. Raises LinAlgError where they are not finite.
     """
     a = np.diag(poles.real)
     is_upper = poles.imag > 0
@@ -226,7 +239,8 @@ def _zeros(poles: Complex, coefficients: Real) -> Complex:
 def _usable(roots: Complex, least_damping: float) -> Complex:
     """Roots (n,) mirrored into the left half plane, pairs next to each other and damped as asked.
 
-    A pair whose damping would exceed 1 becomes a double real pole.
+    A pair whose damping would reach 1, as asked, becomes a double real pole. Moduli below `_LEAST_POLE` are
+    raised to it; roots come in conjugates (not checked), of which the lower ones are left out and made anew.
     """
     poles: list[complex] = []
     upper_or_real = roots.imag >= 0
@@ -247,6 +261,8 @@ def _dealt(cascade: Cascade, poles: Complex) -> list[Real]:
     """Denominators of the sections, highest power of p first: poles (n,) dealt to them.
 
     Pairs go to sections of second order, and where there are fewer pairs, the slowest real poles in twos.
+    Each is monic: (2,) or (3,). Poles of another number, or more pairs than sections of second order, are an
+    IndexError; with at most one section of first order, as specifications have, neither happens.
     """
     upper_poles = [pole for pole in poles if pole.imag > 0]
     pairs = [np.real(np.poly([pole, pole.conjugate()])) for pole in upper_poles]
@@ -270,7 +286,8 @@ def _dealt(cascade: Cascade, poles: Complex) -> list[Real]:
 def _least_squares(columns: Complex, right: Complex) -> Real:
     """Real coefficients (n,) with which complex columns (F, n) come nearest to the right side (F,).
 
-    Columns are scaled to one size first. Raises LinAlgError where the solution does not converge.
+    Columns are scaled to one size first; directions below `_ROUNDING` of the largest are left out. Raises
+    LinAlgError where the solution does not converge.
     """
     rows = real_rows(columns)
     size = np.maximum(np.linalg.norm(rows, axis=0), _TINY)
