@@ -20,27 +20,30 @@ import numpy as np
 from control_design.controllers.law import in_sections
 from control_design.plants.ellipses import Complex, Real
 
-# Frequencies at which V is looked at, on a logarithmic scale: 40 a decade, several across a damped mode.
+# Frequencies at which V is looked at, on a logarithmic scale: 40 a decade, several across a mode of damping
+# ratio .1.
 _LOG_POINTS = 200
 # Share of the Nyquist frequency at which they begin: 0.03 rad/s at 1 kHz, below the band of any loop.
 _LOWEST_SHARE = 1e-5
 # Midpoints on a linear scale for the mean of log |V|, which sets a bound only; twice as many move it by 1 %.
 _LINEAR_POINTS = 400
 # Largest |V| on the circle. The limited command enters the wanted one by I - V, so at most threefold. With 1
-# nothing but clipping is left; a large value corrects within a sample, on noise, too.
+# nothing but clipping is left; a large value corrects within a sample, on noise, too. Chosen between the two.
 _LARGEST_V = 2.0
 # Ratio of two reference gains tried first: V changes little within a decade.
 _SCAN_FACTOR = 10.0
 # Halvings of that decade (of its logarithm): the reference gain is then known within a third.
 _HALVINGS = 3
-# Distance from z = 1 below which a pole counts as an integrator in the test of V: 0.1 rad/s at 1 kHz.
+# Distance from z = 1 below which a pole counts as an integrator in the test of V: 0.1 rad/s at 1 kHz, a
+# decade below loops of machines. Chosen.
 _SLOW = 1e-4
 # Of |V|, by which Re V may fall below zero: an integrator makes both zero at z = 1, and next to it rounding
 # of a companion form decides the sign. 0.06 deg of phase beyond 90 deg.
 _ROUNDING = 1e-3
-# Distance from z = -1 below which a pole (of a derivative by the trapezoidal rule) has no place in s.
+# Distance from z = -1 below which a pole (of a derivative by the trapezoidal rule) has no place in s: its
+# value there would be more than a million times that of the others.
 _AT_MINUS_ONE = 1e-6
-# Rounds of scaling rows and columns in turn; each at least halves what is left of their differences.
+# Rounds of scaling rows and columns in turn; each at least halves what is left of their differences: to 1e-6.
 _BALANCING_ROUNDS = 20
 
 
@@ -49,7 +52,8 @@ class SectionedLaw:
     """The controller in sections (real Schur form), commands and errors in units in which gains compare.
 
     A (n, n) triangular but for pairs; B (n, Y); C (U, n); D (U, Y); states: T (n, n), whose columns are these
-    states in the controller's own; command_unit (U,).
+    states in the controller's own; command_unit (U,), units of the controller's commands per one of these.
+    Built by `of`; nothing is checked.
     """
 
     A: Real
@@ -62,10 +66,16 @@ class SectionedLaw:
     @classmethod
     def of(cls, A: Real, B: Real, C: Real, D: Real) -> SectionedLaw:
         """The law with rows and columns of K scaled to one size (Sinkhorn), so that its singular values do
-        not depend on the units of commands and errors either."""
+        not depend on the units of commands and errors either.
+
+        A (n, n), B (n, Y), C (U, n), D (U, Y) in the controller's own states and units, finite: `Controller`
+        has checked them. LinAlgError for an eigenvalue of A on a frequency of `logarithmic_circle`.
+        """
         sections, states, back = in_sections(A)
         plain = cls(sections, back @ B, C @ states, D, states, np.ones(D.shape[0]))
         size = np.median(np.abs(plain.response(logarithmic_circle())), axis=0)
+        # An entry of K that vanishes counts as 1e-12 of the largest, far below any that matters: no row or
+        # column of zeros to divide by.
         size = np.maximum(size, 1e-12 * (np.max(size) or 1.0))
         command = np.ones(size.shape[0])
         error = np.ones(size.shape[1])
@@ -82,11 +92,14 @@ class SectionedLaw:
         )
 
     def response(self, z: Complex) -> Complex:
-        """K(z), (F, U, Y)."""
+        """K(z), (F, U, Y), at z (F,) in these units; LinAlgError at an eigenvalue of A."""
         return self.C @ self._from_states(self.B, z) + self.D
 
     def correction(self, gain: Real, z: Complex) -> Complex:
-        """V(z) = (I + C (zI - A)^-1 M)^-1, (F, U, U), of a gain (n, U) in these states and units."""
+        """V(z) = (I + C (zI - A)^-1 M)^-1, (F, U, U), at z (F,) of a gain (n, U) in these states and units.
+
+        LinAlgError, or inf for one command, at an eigenvalue of A - M C.
+        """
         commands = self.C.shape[0]
         if commands == 1:  # a ratio of two polynomials: tens of times faster by their roots
             zeros = np.linalg.eigvals(self.A)
@@ -95,17 +108,19 @@ class SectionedLaw:
         return np.asarray(np.linalg.inv(np.eye(commands) + self.C @ self._from_states(gain, z)))
 
     def _from_states(self, entering: Real, z: Complex) -> Complex:
-        """(zI - A)^-1 times a matrix that enters the states, (F, n, ...)."""
+        """(zI - A)^-1 times a matrix (n, m) that enters the states, (F, n, m), at z (F,); LinAlgError at an
+        eigenvalue of A."""
         shifted = z[:, None, None] * np.eye(self.A.shape[0]) - self.A
         return np.asarray(np.linalg.solve(shifted, np.broadcast_to(entering, (z.size, *entering.shape))))
 
     def radius(self, gain: Real) -> float:
-        """Largest |eigenvalue| of A - M C."""
+        """Largest |eigenvalue| of A - M C, M: gain (n, U) in these states, finite; 0 without states."""
         return float(np.max(np.abs(np.linalg.eigvals(self.A - gain @ self.C)), initial=0.0))
 
 
 def logarithmic_circle() -> Complex:
-    """Points z = e^{j omega dt} up to just below the Nyquist frequency, (F,)."""
+    """Points z = e^{j omega dt}, (F,), from `_LOWEST_SHARE` to .999 of the Nyquist frequency, where the
+    trapezoidal rule puts zeros and poles."""
     return np.asarray(np.exp(1j * np.pi * np.geomspace(_LOWEST_SHARE, 0.999, _LOG_POINTS)))
 
 
@@ -115,9 +130,10 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
     Parameters
     ----------
     A, B, C, D : arrays (n, n), (n, Y), (U, n), (U, Y)
-        The controller, in any states; rows of C and D: the commands that have limits.
+        The controller, in any states, finite (not checked); rows of C and D: the commands that have limits.
     slower : float
-        Factor on the reference gain k0 of the notes: above 1 the states follow the limit more slowly.
+        Factor on the reference gain k0 of the notes: above 1 the states follow the limit more slowly. Where
+        it has no solution the gain of factor 1 stands.
 
     Returns
     -------
@@ -158,7 +174,8 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
     extra_integrators = max(slow_poles - 1, 0) if C.shape[0] == 1 else 0
 
     def violation(gain: Real) -> float:
-        """How far V + V* is below zero, relative to |V|; at most `_ROUNDING` where V is positive real."""
+        """How far V + V* is below zero, relative to |V|, for a gain (n, U) in the law's states; at most
+        `_ROUNDING` where V is positive real."""
         correction = law.correction(gain, z)
         if extra_integrators:
             closed = np.linalg.eigvals(law.A - gain @ law.C)
@@ -218,16 +235,18 @@ def anti_windup_gain(A: Real, B: Real, C: Real, D: Real, *, slower: float = 1.0)
 def _least_reference(law: SectionedLaw) -> float:
     """Reference gain k0 at which |V| reaches `_LARGEST_V` on the circle.
 
-    The mean of log det V V* is 0 there, so with V V* = c (I + K K*/k0^2)^-1 and U commands U log c is the
-    mean of log det(I + K K*/k0^2).
+    Positive, in the law's units; 1 where K vanishes. The mean of log det V V* is 0 there, so with
+    V V* = c (I + K K*/k0^2)^-1 and U commands U log c is the mean of log det(I + K K*/k0^2).
     """
     angles = np.pi * (np.arange(_LINEAR_POINTS) + 0.5) / _LINEAR_POINTS
     gains = np.linalg.svd(law.response(np.exp(1j * angles)), compute_uv=False)
     largest = float(np.max(gains))
     if largest == 0.0:
         return 1.0
-    below = np.log(largest) - 40.0  # V is that large for certain there ...
-    above = np.log(largest) + 5.0  # ... and 1 here
+    # Logarithms of k0. At e^-40 of the largest gain |V| is large for certain, at e^5 of it V is 1 but for
+    # 2e-5; known within 1 %, as it only ends a search in factors of ten.
+    below = np.log(largest) - 40.0
+    above = np.log(largest) + 5.0
     while above - below > 0.01:
         middle = 0.5 * (below + above)
         mean = float(np.mean(np.sum(np.log1p((gains / np.exp(middle)) ** 2), axis=1))) / law.C.shape[0]
@@ -242,7 +261,8 @@ def _spectral_gain(law: SectionedLaw, reference: float) -> Real | None:
     """M (n, U) in the law's sections whose V has V V* = c (I + K K*/k0^2)^-1 with k0 the reference gain; None
     where the Riccati equation has no stabilising solution.
 
-    Solved in the plane s = (z - 1)/((z + 1) scale), in which slow poles of a fast controller lie apart.
+    Solved in the plane s = (z - 1)/((z + 1) scale), in which slow poles of a fast controller lie apart; in z
+    where a pole lies at z = -1. None also where rounding spoils it. reference: positive, in the law's units.
     """
     from scipy.linalg import solve_continuous_are, solve_discrete_are
 
@@ -284,7 +304,10 @@ def _spectral_gain(law: SectionedLaw, reference: float) -> Real | None:
 
 
 def anti_windup_radius(A: Real, C: Real, gain: Real) -> float:
-    """Largest |eigenvalue| of A - M C, (n, n), C (U, n), M (n, U): infinite where it is not finite."""
+    """Largest |eigenvalue| of A - M C for A (n, n), C (U, n) and gain M (n, U); 0 without states.
+
+    Infinite where A - M C is not finite. Shapes have to fit (numpy's ValueError).
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         if not np.all(np.isfinite(A - gain @ C)):
             return float("inf")

@@ -31,11 +31,12 @@ _DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "sec
 # Kinds with a pair of poles, whose denominator has the parameters (a, b).
 _PAIR_KINDS = ("second_order", "notch")
 
-# Relative amount by which a bound on the denominators may be missed: ten times the solver's acceptable
-# tolerance.
+# Relative amount by which a bound on the denominators may be missed before a controller is refused: a
+# thousand times the 1e-6 by which a step of a descent may leave its programme, and no damping ratio is stated
+# to 1e-3.
 SOLVER_SLACK = 1e-3
 
-# A root of p nearer to 1/h than this is at infinity in z: it is what a missing zero becomes.
+# A root of h p nearer to 1 than this is at infinity in z: what a missing zero becomes, but for rounding.
 _INFINITE_ROOT_DISTANCE = 1e-12
 
 
@@ -46,11 +47,16 @@ class Cascade:
     Parameters
     ----------
     sections : tuple of SectionKind
-        In the order of the parameter vector and of the signal.
+        In the order of the parameter vector and of the signal; without any the controller is 1.
     dt_s : float
-        Sampling period in seconds.
+        Sampling period in seconds, positive.
     scale_rad_s : float
-        Frequency at which p = j, about that of the controller's corners: parameters are of size one.
+        Frequency, positive, at which p = j, about that of the controller's corners: parameters are of size
+        one.
+
+    Notes
+    -----
+    Nothing is checked but the length of parameter vectors; a kind that is no `SectionKind` is a KeyError.
     """
 
     sections: tuple[SectionKind, ...]
@@ -59,7 +65,7 @@ class Cascade:
 
     @property
     def order(self) -> int:
-        """Number of states: two for each section with a pair of poles, one for each other."""
+        """Number of states: two for each section with a pair of poles, one for each other section."""
         return sum(2 if kind in _PAIR_KINDS else 1 for kind in self.sections)
 
     @property
@@ -80,8 +86,8 @@ class Cascade:
         return tuple(positions)
 
     def least_damping(self, x: Sequence[float] | Real) -> float:
-        """Smallest damping ratio of the pairs of poles in p, e^a/(2 e^(b/2)); infinite without any. x
-        (P,)."""
+        """Smallest damping ratio of the pairs of poles in p, e^a/(2 e^(b/2)), above 1 for two real poles;
+        infinite without any. x (P,): a longer one passes, a shorter one is an IndexError."""
         values = np.asarray(x, dtype=np.float64)
         ratios = []
         for position in self.pair_positions:
@@ -93,7 +99,7 @@ class Cascade:
     def split(self, x: Sequence[float] | Real) -> list[tuple[Real, Real]]:
         """Numerator and denominator of every section: coefficients of p, highest power first, of one length.
 
-        x : (P,) parameter vector. Raises ValueError for another length.
+        x : (P,) parameter vector. Raises ValueError for another length; nan or infinite parameters pass.
         """
         values = np.asarray(x, dtype=np.float64)
         if values.shape != (self.parameters,):
@@ -128,7 +134,8 @@ class Cascade:
 
     def response(self, x: Sequence[float] | Real, omega_rad_s: Real) -> Complex:
         """K(e^{j omega dt}), (F,) complex, for parameters x (P,) and omega (F,) in rad/s up to pi/dt. At
-        Nyquist p is infinite, and the limit is used."""
+        Nyquist p is infinite, and the limit is used. At 0 an integrator is nan (numpy warns). Raises
+        ValueError for another length of x."""
         p = 1j * tustin_frequency(omega_rad_s, self.dt_s) / self.scale_rad_s
         value = np.ones(p.shape, dtype=np.complex128)
         for numerator, denominator in self.split(x):
@@ -146,7 +153,8 @@ class Cascade:
 
     def roots(self, x: Sequence[float] | Real) -> Complex:
         """Zeros and poles of all sections in z, (N,) complex together, for parameters x (P,); those at
-        infinity are left out. z = (1 + h p)/(1 - h p) with h = dt scale/2."""
+        infinity are left out. z = (1 + h p)/(1 - h p) with h = dt scale/2. A parameter that is not finite is
+        numpy's LinAlgError, another length of x a ValueError."""
         h = self.dt_s * self.scale_rad_s / 2.0
         roots = []
         for numerator, denominator in self.split(x):
@@ -161,7 +169,8 @@ class Cascade:
         """Discrete state space A (n, n), B (n, 1), C (1, n), D (1, 1) of the cascade, for parameters x (P,).
 
         Every section is taken to z by the trapezoidal rule: x' = F x + g u becomes A = (I - F h)^-1 (I + F
-        h), with h = dt scale/2. The states are those of the sections in their order.
+        h), with h = dt scale/2. The states are those of the sections in their order. Raises ValueError for
+        another length of x.
         """
         h = self.dt_s * self.scale_rad_s / 2.0
         a: Real = np.zeros((0, 0))
@@ -181,13 +190,13 @@ class Cascade:
 
 def tustin_frequency(omega_rad_s: Real, dt_s: float) -> Real:
     """v = (2/dt) tan(omega dt/2) in rad/s, (F,): where omega (F,) in rad/s lies on the imaginary axis of the
-    Tustin plane."""
+    Tustin plane. Some 1e16/dt at Nyquist, by rounding; beyond it the sign turns (not checked)."""
     return np.asarray(2.0 / dt_s * np.tan(np.asarray(omega_rad_s) * dt_s / 2.0), dtype=np.float64)
 
 
 def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
     """s = j (2/dt) tan(omega dt/2), (F,) complex in rad/s, where weights and sections are evaluated at omega
-    (F,)."""
+    (F,) in rad/s, up to Nyquist as of `tustin_frequency`."""
     return np.asarray(1j * tustin_frequency(omega_rad_s, dt_s), dtype=np.complex128)
 
 
@@ -197,7 +206,9 @@ def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real,
     numerator, denominator : (2,) or (3,) coefficients, highest power first, the denominator's first one is 1.
     It is a balanced companion form, mapped by the trapezoidal rule with step 2 h. The rule needs (I - h
     F)^-1; for one or two states it is written out, since searches build many loops. The symmetric split
-    sqrt(2 h) on input and output keeps both of one size.
+    sqrt(2 h) on input and output keeps both of one size. h : half a sample in units of 1/scale, dt scale/2,
+    positive. Coefficients are those of `Cascade.split`: of a denominator of degree two the last one is
+    positive.
     """
     direct = float(numerator[0])
     # Numerator of what is left beside the direct term.

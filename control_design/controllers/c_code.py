@@ -29,13 +29,16 @@ Number = Literal["double", "float"]
 # leave.
 _LARGEST_ROUNDING_SHARE = 0.01
 
-# Written for an actuator without a limit beside others that have one: close to the largest float.
+# Written for an actuator without a limit beside others that have one, and where a value is clipped to single
+# precision: close to the largest float, 3.4e38.
 _NO_LIMIT = 3e38
 
-# Frequencies at which single precision is compared with double: from 1e-4 of Nyquist on, a hundred a decade.
+# Frequencies at which single precision is compared with double: from 1e-4 of Nyquist on, a hundred a decade,
+# two across a resonance of damping ratio .02.
 _COMPARED_FREQUENCIES = 400
 
 # Share of the Nyquist frequency at which they begin: 0.3 rad/s at 1 kHz, below the band of most loops.
+# Chosen.
 _LOWEST_NYQUIST_SHARE = 1e-4
 
 
@@ -51,7 +54,7 @@ class Dialect:
     number: Number = "double"
 
     def __post_init__(self) -> None:
-        """Check both."""
+        """Check both (ValueError)."""
         if self.number not in get_args(Number):
             raise ValueError(f"number must be 'double' or 'float'; got {self.number!r:.80}")
         if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", self.prefix):
@@ -59,7 +62,8 @@ class Dialect:
 
     def beside(self, name: str) -> Dialect:
         """Dialect of a second piece of code, called `name`, in the same program: its names begin with another
-        prefix."""
+        prefix, `name` beside the default one, else both with an underscore. Raises ValueError if that is no C
+        identifier."""
         prefix = name
         if self.prefix != "controller":
             prefix = f"{self.prefix}_{name}"
@@ -145,7 +149,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         suffix = "f"
 
     def literal(value: float) -> str:
-        """Shortest decimal that reads back as the same number of the C type."""
+        """Shortest decimal that reads back as the same number of the C type; one too large for it
+        becomes no number of C, which `law_in` has refused but for a law without states."""
         with np.errstate(over="ignore", under="ignore"):
             text = str(number_type(value))
         # A C literal without point and exponent would be an integer.
@@ -154,7 +159,8 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         return text + suffix
 
     def constant(what: str, value: float) -> str:
-        """Literal of a value that must neither overflow nor vanish in the C type; raises ValueError."""
+        """Literal of a value that must neither overflow nor vanish in the C type: ValueError naming
+        `what`."""
         with np.errstate(over="ignore", under="ignore"):
             rounded = abs(float(number_type(value)))
         if value and not 0 < rounded < np.inf:
@@ -231,11 +237,17 @@ def law_in(number: Number, controller: Controller) -> Controller:
     controller : Controller
         Any order.
 
+    Returns
+    -------
+    Controller
+        Of the same response, limits and name, in double precision; the one given for `double`, an order of 0,
+        or where its own states survive rounding.
+
     Raises
     ------
     ValueError
         Where single precision changes the response by more than 1 %, or lets a pole leave the circle, in both
-        forms.
+        forms. numpy's LinAlgError where a pole lies on one of the compared frequencies.
     """
     if number == "double" or controller.order == 0:
         return controller
@@ -271,7 +283,10 @@ def law_in(number: Number, controller: Controller) -> Controller:
 
 
 def _radius(law: Controller) -> float:
-    """Largest modulus of the law's poles: those of A, and those of A - M C while a limit is active."""
+    """Largest modulus of the law's poles: those of A, and those of A - M C while a limit is active.
+
+    At least one state (else numpy's ValueError of an empty maximum); `law_in` asks for nothing less.
+    """
     assert law.anti_windup_gain is not None
     limited_a = law.A - law.anti_windup_gain @ law.C
     return float(np.max(np.abs(np.linalg.eigvals([law.A, limited_a]))))
@@ -281,7 +296,8 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
     """Text of a template file with its values.
 
     A line that begins with `@what:` is written for controllers that have it, with `@!what:` for those that
-    have it not; several conditions, with commas, must all hold.
+    have it not; several conditions, with commas, must all hold. A condition or a placeholder that is not
+    known is a KeyError: the templates belong to this package, no user writes them.
     """
     feedforward = controller.feedforward
     has = {
@@ -319,5 +335,5 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
 
 @cache
 def _template(name: str) -> tuple[str, ...]:
-    """Lines of a template file of this package, with their line ends."""
+    """Lines of a template file of this package, with their line ends; FileNotFoundError for another name."""
     return tuple((files("control_design.controllers") / name).read_text("ascii").splitlines(keepends=True))

@@ -38,16 +38,18 @@ class Controller(Law):
     Parameters
     ----------
     A, B, C, D : (n, n), (n, Y), (U, n), (U, Y) array
-        The law that a processor runs, `K_without_delay`: the machine adds the computational delay. Margins
-        and certificates are about `K_with_delay` = z^-computational_delay_samples K_without_delay.
+        Finite. The law that a processor runs, `K_without_delay`: the machine adds the computational delay.
+        Margins and certificates are about `K_with_delay` = z^-computational_delay_samples K_without_delay.
     dt_s : float
         Sampling period in seconds, positive.
     computational_delay_samples : int
-        From measurement to command.
+        From measurement to command; whole, not negative. By default 1: a real-time loop writes its command
+        one sample after it has read the sensor.
     input_limit : float, tuple of them, or None
-        Saturation of the command, both signs, in its units; with U > 1 a tuple.
+        Saturation of the command, both signs, in its units, positive; with U > 1 a tuple of U, None for an
+        actuator without.
     rate_limit : float, tuple of them, or None
-        Largest change of the command per second; with U > 1 a tuple.
+        Largest change of the command per second, likewise.
     anti_windup_gain : (n, U) array or None
         M: what an active limit does to the states, with A - M C stable; None takes that of `anti_windup`.
     name : str
@@ -78,7 +80,8 @@ class Controller(Law):
     signals: str = field(default="", metadata={"since": 8})
 
     def __post_init__(self) -> None:
-        """Check limits and delay, and find the anti-windup gain where none is stated."""
+        """Check limits and delay, and find the anti-windup gain where none is stated (ValueError, see the
+        class; where no gain is found it is raised by `anti_windup_gain`)."""
         super().__post_init__()
         delay = self.computational_delay_samples
         if not (delay >= 0 and int(delay) == delay):
@@ -132,8 +135,8 @@ class Controller(Law):
     def gain_for_limits(self, slower: float = 1.0) -> Real:
         """Anti-windup gain (n, U) that suits the limits; zero for commands without one.
 
-        slower : the factor of `anti_windup.anti_windup_gain` by which the states follow a limit more slowly.
-        Raises ValueError where no gain makes A - M C stable.
+        slower : the factor of `anti_windup.anti_windup_gain` by which the states follow a limit more slowly,
+        positive. Raises ValueError where no gain makes A - M C stable.
         """
         gain = np.zeros((self.order, self.D.shape[0]))
         limited = self.limited_commands
@@ -158,7 +161,10 @@ class Controller(Law):
 
     @classmethod
     def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
-        """Controller u = gain e without states at a period dt_s in seconds; settings are further fields."""
+        """Controller u = gain e without states at a period dt_s in seconds; settings are further fields.
+
+        Raises ValueError as the class does, for a gain or a period that is not finite among others.
+        """
         no_states = np.zeros((0, 0))
         no_input = np.zeros((0, 1))
         no_output = np.zeros((1, 0))
@@ -167,7 +173,8 @@ class Controller(Law):
     def response(self, omega_rad_s: Real, *, with_delay: bool = True) -> Complex:
         """K(e^{j omega dt}) at omega (F,) in rad/s: (F,) complex, of several errors or commands (F, U, Y).
 
-        With its computational delay, `K_with_delay`, unless with_delay is False.
+        With its computational delay, `K_with_delay`, unless with_delay is False. Limits and feed-forward do
+        not count. At a pole on the circle (an integrator's at 0) numpy's LinAlgError.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         value = super().response(omega)
@@ -179,8 +186,8 @@ class Controller(Law):
         return value
 
     def limits(self, name: str) -> Real:
-        """Limits of every actuator (U,), infinite where there is none; name: "input_limit" or
-        "rate_limit"."""
+        """Limits of every actuator (U,), infinite where there is none, in units of the command or in these
+        per second; name: "input_limit" or "rate_limit" (AttributeError for a name that is no field)."""
         value = getattr(self, name)
         limits = value if isinstance(value, tuple) else (value,) * self.D.shape[0]
         return np.array([np.inf if limit is None else limit for limit in limits], dtype=np.float64)
@@ -189,7 +196,8 @@ class Controller(Law):
         """Controller of the same machine with its signals in other units.
 
         error : (Y,) array, old error over new one. command : (U,) array, old command over new one. Factors
-        may be negative: a signal that counts the other way.
+        may be negative: a signal that counts the other way. A command of 0 and NaN make matrices that the
+        class refuses (ValueError); an error of 0 passes, as a controller that sees nothing of it.
         """
         limits: dict[str, Any] = {}
         for name in ("input_limit", "rate_limit"):
@@ -268,7 +276,7 @@ class Controller(Law):
         return super().from_dict({"signals": "", **data, "feedforward": feedforward})
 
     def stepper(self) -> ControllerStepper:
-        """A running instance of the controller, at rest."""
+        """A running instance of the controller, at rest; each call gives another one."""
         return ControllerStepper(self)
 
 
@@ -302,10 +310,11 @@ class ControllerStepper:
         Parameters
         ----------
         error : float or (Y,) array
-            Reference minus measurement. One that is not finite gives NaN, whatever the limits, which the
-            states keep until `reset`.
+            Reference minus measurement; another length is numpy's ValueError. One that is not finite gives
+            NaN, whatever the limits, which the states keep until `reset`.
         reference : float
-            The set point, which the feed-forward (if any) looks at; it rested at zero before.
+            The set point, which the feed-forward (if any) looks at; it rested at zero before. One that is not
+            finite makes the smoothed friction NaN until `reset`.
 
         Notes
         -----
@@ -383,7 +392,8 @@ class FrictionFeedforward:
     fall: float = 1.0
 
     def __post_init__(self) -> None:
-        """Take numpy scalars as numbers of Python, and check all values."""
+        """Take numpy scalars, which JSON and C write otherwise, as numbers of Python, and check all
+        values."""
         for name, value in vars(self).items():
             if isinstance(value, np.generic):
                 object.__setattr__(self, name, value.item())
@@ -395,7 +405,8 @@ class FrictionFeedforward:
             )
 
     def share(self, dt_s: float) -> float:
-        """Share of its way that the lag goes in a sample of dt_s seconds, 1 - exp(-dt_s/lag_s)."""
+        """Share, 0 to 1, of its way that the lag goes in a sample of dt_s seconds (positive, not checked),
+        1 - exp(-dt_s/lag_s)."""
         return float(-np.expm1(-dt_s / self.lag_s))
 
     def turn(self, dt_s: float) -> float:
@@ -405,14 +416,14 @@ class FrictionFeedforward:
 
     def friction(self, moved: Real, dt_s: float) -> Real:
         """Friction (T,) before the lag, in units of the command, for the motion (T,) of the reference in each
-        sample of dt_s seconds."""
+        sample of dt_s > 0 seconds; NaN for a motion that is NaN."""
         strength = self.level + self.excess * np.exp(-np.abs(moved) / (self.fall * dt_s))
         smooth_sign = np.minimum(np.maximum(moved / self.turn(dt_s), -1.0), 1.0)
         return np.asarray(smooth_sign * strength)
 
     def signal(self, reference: Real, dt_s: float) -> Real:
         """What joins the command, (T,) in its units, for a reference (T,) that rested at zero before, sampled
-        every dt_s seconds."""
+        every dt_s seconds; NaN from the first sample on that is NaN."""
         # Imported here: every command would wait for it.
         from scipy.signal import lfilter
 

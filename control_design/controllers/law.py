@@ -48,6 +48,7 @@ class Law:
     Notes
     -----
     A class of laws says what it is (`kind`) and what its fields mean (`equations`); both go into its files.
+    Arrays of other numbers are taken as float64; what is no number is numpy's ValueError or TypeError.
     """
 
     kind: ClassVar[str]
@@ -60,7 +61,7 @@ class Law:
     dt_s: float
 
     def __post_init__(self) -> None:
-        """Lock the matrices and check them."""
+        """Lock the matrices and check them (ValueError, see the class)."""
         lock(self, *"ABCD")
         n = self.A.shape[0]
         shapes = {name: getattr(self, name).shape for name in ("A", "B", "C", "D")}
@@ -82,7 +83,7 @@ class Law:
 
     @property
     def poles(self) -> Complex:
-        """Poles in z, (n,) complex."""
+        """Poles in z, (n,) complex, the eigenvalues of A; in no order."""
         if self.order == 0:
             return np.zeros(0, dtype=np.complex128)
         return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
@@ -96,7 +97,8 @@ class Law:
 
     def response(self, omega_rad_s: Real) -> Complex:
         """Response at z = e^{j omega dt} for omega (F,) in rad/s: (F,) complex for one input and one output,
-        else (F, U, Y)."""
+        else (F, U, Y). Raises numpy's LinAlgError exactly at a pole on the circle, such as 0 of an
+        integrator."""
         response = matrix_response(self.to_control(), np.asarray(omega_rad_s, dtype=np.float64))
         if self.D.size == 1:
             return response[:, 0, 0]
@@ -113,12 +115,15 @@ class Law:
         return plain
 
     def named_systems(self) -> dict[str, dict[str, Any]]:
-        """State spaces (A, B, C, D, dt_s) that files hold by name beside the fields; reading ignores them."""
+        """State spaces (A, B, C, D, dt_s) that files hold by name beside the fields; reading ignores them.
+
+        None here: a class that has some overrides it.
+        """
         return {}
 
     @classmethod
     def format_name(cls) -> str:
-        """Name of the format that a file of this kind says it has."""
+        """Name of the format that a file of this kind says it has; the 1 is its version."""
         return f"flexlink-{cls.kind.replace(' ', '_')}-1"
 
     @classmethod
@@ -129,7 +134,9 @@ class Law:
         ------
         ValueError
             For another format, a key that is missing, or a value of the wrong type or size; the line names
-            it.
+            it. For shapes and values that do not fit, by the class. `data` has to be a mapping (not checked;
+            `from_json` does); keys that are no fields are passed over. Messages quote 80 characters of a
+            value at most, so that they stay one line.
         """
         if data.get("format") != cls.format_name():
             difference = f"format is {data.get('format')!r:.80}, expected {cls.format_name()!r}"
@@ -170,7 +177,10 @@ class Law:
             raise ValueError(f"{cls.kind} file: {name}: expected {expected}, got {value!r:.80}") from None
 
     def to_json(self) -> str:
-        """The law as readable JSON text, ending in a new line."""
+        """The law as readable JSON text, ending in a new line, one space an indent.
+
+        ValueError for a field that is nan or infinite, which JSON has not; matrices never are.
+        """
         return json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n"
 
     def to_mat(self) -> bytes:
@@ -208,6 +218,8 @@ class Law:
 def in_sections(A: Real) -> tuple[Real, Real, Real]:
     """Real Schur form of the states of A (n, n): matrices S, T and T^-1, each (n, n), with A = T S T^-1.
 
+    A has to be finite (scipy's ValueError); n may be 0.
+
     S is block triangular: sections of first and second order in a row, whose poles rounding moves by as much
     as it rounds, however close together they are.
     """
@@ -220,7 +232,8 @@ def in_sections(A: Real) -> tuple[Real, Real, Real]:
 
 
 def _holds_truth(value: Any) -> bool:
-    """Whether a value of JSON is or holds a `true` or `false`, which Python would take for a number."""
+    """Whether a value of JSON is or holds, at any depth, a `true` or `false`, which Python would take for a
+    number."""
     if isinstance(value, bool):
         return True
     if isinstance(value, dict):
