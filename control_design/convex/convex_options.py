@@ -14,7 +14,8 @@ from control_design.plants.frequency_grid import GridOptions
 
 class YoulaOptions(GridOptions):
     """Size of the basis of Q and of the grids of `youla_bracket`; the defaults take about two seconds a
-    plant."""
+    plant, and were chosen for that. Further fields (points of the dense check and the like) are those of
+    `GridOptions`. A value out of its bounds or an unknown key is refused by pydantic (ValueError)."""
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
     mirrored_poles: int = Field(
@@ -31,7 +32,11 @@ class YoulaOptions(GridOptions):
 
 
 class ReferenceFilterOptions(GridOptions):
-    """Order of the reference filter of `design_reference_filter` and how finely it is designed."""
+    """Order of the reference filter of `design_reference_filter` and how finely it is designed.
+
+    A value out of its bounds or an unknown key is refused by pydantic (ValueError); that decay rates lie
+    below Nyquist is checked by the design, which knows the sampling time.
+    """
 
     order: int = Field(
         default=1, ge=0, le=12, description="real poles, searched; unused if poles_rad_s is given"

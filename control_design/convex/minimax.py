@@ -23,15 +23,15 @@ from control_design.plants.ellipses import Complex, Integer, Real, quotient
 from control_design.plants.frequency_grid import with_violations
 
 # Radius r of the rounding sqrt(|p|^2 + r^2) of a numerator |p| at its kink, as a share of an active
-# numerator: it changes an active row by r^2/2 = 5e-7 of it.
+# numerator: it changes an active row by r^2/2 = 5e-7 of it, a twentieth of the accuracy asked by default.
 _NUMERATOR_ROUNDING_SHARE = 1e-3
 
 # Radius of the rounding of |C y + c|. Denominators are about one, so they are off by at most this, and at the
-# kink alone.
+# kink alone. Chosen.
 _REACH_ROUNDING = 1e-4
 
 # Radius of it while denominators are being made positive: their maximum may sit on the kink, where a smaller
-# one leaves Newton's method hardly any curvature to go by.
+# one leaves Newton's method hardly any curvature to go by. Chosen.
 _FEASIBILITY_ROUNDING = 1e-2
 
 # Relative excess of the dense check over the programme that ends an exchange of frequencies: what the last
@@ -57,22 +57,27 @@ _START_SHORTENING = 0.7
 # point has an infinite ratio.
 _START_MARGIN = 0.05
 
-# The search for a point with positive denominators ends when all exceed this.
+# The search for a point with positive denominators ends when all exceed this: ratios up to a thousand times
+# the numerators are finite enough for the next programme to lower. Chosen.
 _FEASIBLE_MARGIN = 1e-3
 
-# Share of the way to the boundary that a step of the interior point goes (usual: .99 to .9995).
+# Share of the way to the boundary that a step of the interior point goes (usual: .99 to .9995), the careful
+# end: rows bend.
 _TO_BOUNDARY_SHARE = 0.99
 
 # Smallest share of the gap that the centring of a step aims at, so that slacks do not fall to zero at once.
+# Chosen.
 _LEAST_CENTRING = 1e-3
 
 # Relative increase of the diagonal of the Newton system, some thousand times its rounding.
 _REGULARISATION_SHARE = 1e-13
 
-# Shortest step that is tried where rows bend away from their linearisation.
+# Shortest step that is tried where rows bend away from their linearisation: 26 halvings. Chosen; a step that
+# short ends nothing, the best point is kept.
 _SHORTEST_STEP = 1e-8
 
-# Steps to a boundary that is farther away than this many steps count as this long.
+# Steps to a boundary that is farther away than this many steps count as this long: a finite number for one
+# that is never reached. Lengths above 1 are cut to 1 anyway.
 _LONGEST_TO_BOUNDARY = 1e3
 
 
@@ -83,11 +88,15 @@ class PlaneRows:
     Parameters
     ----------
     at : (R,) integer array
-        Which of the F vectors each row looks at.
+        Which of the F vectors each row looks at, from 0.
     A, a : (R, 2, 2), (R, 2) array
         Numerator.
     e, E, C, c : (R,), (R, 2), (R, 2, 2), (R, 2) array
         Denominator.
+
+    Notes
+    -----
+    Real and finite; no shape is checked, and what does not fit is an error of numpy at the first evaluation.
     """
 
     at: Integer
@@ -100,7 +109,8 @@ class PlaneRows:
 
     @classmethod
     def stacked(cls, parts: Sequence[PlaneRows]) -> PlaneRows:
-        """Rows of all parts, which look at the same F vectors, one part after the other."""
+        """Rows of all parts, which look at the same F vectors, one part after the other; at least one part
+        (numpy's ValueError without)."""
         values = []
         for field in fields(cls):
             values.append(np.concatenate([getattr(part, field.name) for part in parts]))
@@ -112,7 +122,7 @@ class PlaneRows:
         return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))
 
     def denominator(self, y: Real) -> Real:
-        """e + E y - |C y + c|, (R,), for vectors y (F, 2)."""
+        """e + E y - |C y + c|, (R,), for vectors y (F, 2); a row counts as feasible where it is positive."""
         vector = np.einsum("rij,rj->ri", self.C, y[self.at]) + self.c
         level = self.e + np.einsum("rj,rj->r", self.E, y[self.at])
         return np.asarray(level - np.hypot(vector[:, 0], vector[:, 1]))
@@ -156,15 +166,20 @@ def smallest_ratio(
         Where to begin, if all denominators are positive there; else at the least-squares solution of the
         numerators, shortened until they are.
     most_rounds : int
-        Of Dinkelbach's iteration; 3 to 8 are usual.
+        Of Dinkelbach's iteration; 3 to 8 are usual, 30 a limit.
     accuracy : float
-        Relative, of gamma.
+        Relative, of gamma. The default is far below the per cents by which bounds are compared.
 
     Returns
     -------
     MinimaxPoint
         Its gamma is the exact largest ratio at its x. Infinite where no x with positive denominators was
         found.
+
+    Raises
+    ------
+    ValueError
+        Without rows, or for arrays that do not fit or are not finite, from numpy (LinAlgError among them).
     """
     programme = _Scaled(basis, rows, accuracy)
     if start is not None:
@@ -209,9 +224,9 @@ class Exchanged:
     x : (n,) array or None
         None: no round found a point with positive denominators.
     values : list of (F,) arrays
-        Values at x on every dense grid.
+        Values at x on every dense grid; empty with x.
     gamma : float
-        Of the last programme, on its lean grids.
+        Of the last programme with a finite one, on its lean grids; 0 where there was none.
     """
 
     x: Real | None
@@ -247,7 +262,7 @@ def exchanged(
     dense : sequence of (F,) arrays
         Dense grids in rad/s, one for each lean one.
     rounds : int
-        Exchanges at most; the programme is solved once more than that.
+        Exchanges at most, not negative; the programme is solved once more than that.
     most : int
         Largest maxima of each dense grid that are added in a round.
     start : (n,) array or None
@@ -257,7 +272,8 @@ def exchanged(
     -------
     Exchanged
         The point with the smallest worst value. Ends when no value exceeds gamma by more than
-        `EXCHANGE_TOLERANCE`.
+        `EXCHANGE_TOLERANCE`, or when a programme finds no point. One array of values for each dense grid, else
+        a ValueError; what `solve` and `check` raise goes up.
     """
     best = Exchanged(None, [], 0.0)
     for _ in range(rounds + 1):
@@ -285,7 +301,11 @@ class _Scaled:
     """
 
     def __init__(self, basis: Complex, rows: PlaneRows, accuracy: float) -> None:
-        """Coordinates for basis (F, n) complex and R rows; accuracy is that of gamma, relative."""
+        """Coordinates for basis (F, n) complex and R rows; accuracy is that of gamma, relative.
+
+        Directions of x that no row sees are left out, so m <= n. n = 0 is an IndexError, a basis or rows that
+        are not finite a LinAlgError.
+        """
         self.rows = rows
         self.accuracy = accuracy
         planar = np.stack([basis.real, basis.imag], axis=1)
@@ -337,7 +357,7 @@ class _Scaled:
         gamma : float
             Fixed in this programme.
         scale : (R,) array
-            Denominators m(y) at the point that gave gamma.
+            Denominators m(y) at the point that gave gamma; positive.
         stop_below : float
             The largest h below which the search ends.
         feasibility : bool
@@ -346,7 +366,7 @@ class _Scaled:
         Returns
         -------
         (m,) array
-            The best of the points passed.
+            The best of the points passed; z itself where none is better.
 
         Notes
         -----
@@ -366,7 +386,8 @@ class _Scaled:
         n = z.size
         h = self._values(z, weight, factor, scale)
         begin = float(np.max(h))
-        # Slacks to begin with are a tenth of the size of gamma, duals their inverses.
+        # Slacks to begin with are a tenth of the size of gamma, duals their inverses, scaled to the sum of
+        # one that the optimum has. Chosen.
         v = begin + 0.1 * factor
         slack = v - h
         dual = 1.0 / slack
@@ -408,6 +429,7 @@ class _Scaled:
                     predicted_slack = slack + min(1.0, primal_length) * slack_step
                     predicted_dual = dual + min(1.0, dual_length) * dual_step
                     predicted_gap = float(np.mean(predicted_slack * predicted_dual))
+                    # The cube is Mehrotra's.
                     share = min(1.0, max(predicted_gap / gap, 0.0)) ** 3
                     target = max(share, _LEAST_CENTRING) * gap - slack_step * dual_step
             # The system has become singular to working precision: the best point stands.
@@ -430,7 +452,9 @@ class _Scaled:
             if largest < best_value:
                 best = z
                 best_value = largest
-            # What gap and error end the programme: a fraction of the accuracy asked for, in units of gamma.
+            # What gap and error end the programme, in units of gamma: a third of the accuracy asked for in
+            # the last programme; before it a twentieth of what was gained, or a tenth of the accuracy.
+            # Chosen.
             if is_last_programme:
                 small = 0.3 * self.accuracy * factor
             else:
@@ -457,7 +481,11 @@ class _Scaled:
         return p, q, size_p, size_q, level
 
     def _values(self, z: Real, weight: float, gamma: float, scale: Real) -> Real:
-        """h (R,) of all rows at z (m,): (weight |A y + a| - gamma m(y))/scale with rounded kinks."""
+        """h (R,) of all rows at z (m,): (weight |A y + a| - gamma m(y))/scale with rounded kinks.
+
+        scale (R,), positive; weight is 1, or 0 to look at denominators only. Of gamma 0 numerators have no
+        rounding, and h is their size over the scale.
+        """
         rounding = _NUMERATOR_ROUNDING_SHARE * gamma * scale
         _, _, size_p, size_q, level = self._parts(z, rounding)
         return np.asarray((weight * size_p - gamma * (level - size_q)) / scale)
@@ -486,7 +514,8 @@ class _Scaled:
 
 
 def _summed(at: Integer, values: Real, count: int) -> Real:
-    """Sum of values (R, ...) over the rows that look at each of `count` vectors, (count, ...); at (R,)."""
+    """Sum of values (R, ...) over the rows that look at each of `count` vectors, (count, ...); at (R,) holds
+    numbers from 0 below count. Zero where no row looks."""
     flat = values.reshape(len(values), -1)
     columns = [np.bincount(at, weights=column, minlength=count) for column in flat.T]
     return np.asarray(np.stack(columns, axis=1).reshape(count, *values.shape[1:]), dtype=np.float64)
@@ -494,7 +523,8 @@ def _summed(at: Integer, values: Real, count: int) -> Real:
 
 def _half(blocks: Real, planar: Real) -> Real:
     """H (2 F, m) with H^T H = sum over F of P^T B P, for blocks B (F, 2, 2), symmetric and not negative, and
-    planar P (F, 2, m): each B by its Cholesky factor."""
+    planar P (F, 2, m): each B by its Cholesky factor. What rounding makes negative counts as 0; a negative
+    first entry gives nan."""
     first_root = np.sqrt(blocks[:, 0, 0])
     cross = np.divide(blocks[:, 0, 1], first_root, out=np.zeros_like(first_root), where=first_root > 0)
     second_root = np.sqrt(np.maximum(blocks[:, 1, 1] - cross**2, 0.0))
@@ -507,7 +537,7 @@ def _half(blocks: Real, planar: Real) -> Real:
 
 def _to_boundary(value: Real, step: Real) -> float:
     """Largest length of a step (R,) for which all positive values (R,) stay so, at most
-    `_LONGEST_TO_BOUNDARY`."""
+    `_LONGEST_TO_BOUNDARY`; entries of a step that are nan are passed over."""
     falling = step < 0
     return float(np.min(-value[falling] / step[falling], initial=_LONGEST_TO_BOUNDARY))
 
@@ -519,7 +549,8 @@ def _norm_derivatives(
     2).
 
     vector (R, 2) = forms (R, 2, 2) y + a constant; size (R,) = sqrt(|vector|^2 + rounding^2); weight (R,).
-    Where a vector is zero its direction does not matter, and the first axis is taken.
+    Where a vector is zero its direction does not matter, and the first axis is taken. A size of 0, a zero
+    vector without rounding, gives nan.
     """
     length = np.hypot(vector[:, 0], vector[:, 1])
     is_positive = length > 0

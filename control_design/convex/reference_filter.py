@@ -34,33 +34,36 @@ from ident.basis.poles import Poles
 from ident.data.arrays import factor_matrices, readonly
 
 # Points on the boundary of every ellipse in the programme; the search of poles takes half of them. The
-# inscribed polygon misses 1 - cos(pi/24) = 0.9 % of the half axis, and the dense check is exact.
+# inscribed polygon misses 1 - cos(pi/24) = 0.9 % of the half axis, and the dense check is exact. Chosen for
+# that.
 _BOUNDARY_SAMPLES = 24
 
-# Relative accuracy of the certified errors, which are rounded up.
+# Relative accuracy of the certified errors, which are rounded up: no digit that is shown.
 _ACCURACY = 1e-7
 
-# The search of poles takes every third frequency of the grids.
+# The search of poles takes every third frequency of the grids: the optimum is flat in the poles. Chosen.
 _SEARCH_THINNING = 3
 
-# Decay rates that are searched lie between these shares of the Nyquist frequency; starts keep the distance
-# from both ends in logarithms.
+# Slowest decay rate that is searched, as a share of the Nyquist frequency: 0.03 rad/s at 1 kHz, below any
+# model to follow. Chosen.
 _SLOWEST_SHARE = 1e-5
 
-# The fastest one: next to Nyquist a pole is a delay of one sample, which F does not need.
+# Fastest decay rate that is searched, as a share of the Nyquist frequency: next to it a pole is a delay of
+# one sample, which F does not need.
 _FASTEST_SHARE = 0.95
 
 # Distance of starts from both ends, in logarithms: a simplex that begins on a limit collapses onto it.
+# Chosen.
 _LOG_DISTANCE_FROM_ENDS = 0.1
 
-# Starts of the simplex: the poles are spread by factors of four around the model's corner times each of
-# these.
+# Factor from pole to pole of a start, around the model's corner times a start's own factor: apart enough to
+# tell the poles, near enough to act together. Chosen.
 _POLE_SPREAD = 4.0
 
 # Factors on the model's corner at which the three simplexes begin: below, at and above it by about four.
 _START_FACTORS = (0.3, 1.0, 4.0)
 
-# Evaluations of the simplex for each pole, and its tolerances: 1 % of a decay rate, 1e-4 of the error.
+# Evaluations of the simplex for each pole, at most. Chosen: it mostly ends by its tolerances before.
 _EVALUATIONS_PER_POLE = 30
 
 # The simplex ends within 1 % of a decay rate, which moves the error by its square only ...
@@ -69,7 +72,8 @@ _LOG_RATE_TOLERANCE = 1e-2
 # ... and within this part of the error, a fifth of what the exchange of frequencies accepts.
 _ERROR_TOLERANCE = 1e-4
 
-# Frequencies that are added to each plant's grid in a round, at most.
+# Frequencies that are added to each plant's grid in a round, at most: each makes the next programme dearer.
+# Chosen.
 _MOST_ADDED = 12
 
 
@@ -83,14 +87,15 @@ class ReferenceFilter(Law):
     ----------
     error_before, error_after : float
         Largest weighted model-matching error over all plants and ellipses, without a filter (F = 1) and with
-        it, on the dense grid.
+        it, on the dense grid; no unit.
     worst_rad_s : float
-        Frequency of the largest error with the filter.
+        Frequency of the largest error with the filter, rad/s.
 
     Raises
     ------
     ValueError
-        For a filter that is not stable, or a negative error or frequency.
+        For a filter that is not stable, an error or frequency that is negative or nan, or what `Law` refuses.
+        That it has one input and one output is not checked.
     """
 
     kind = "reference filter"
@@ -101,7 +106,7 @@ class ReferenceFilter(Law):
     worst_rad_s: float
 
     def __post_init__(self) -> None:
-        """Check stability and the reached errors."""
+        """Check stability and the reached errors (ValueError, see the class)."""
         super().__post_init__()
         if self.order and not np.max(np.abs(self.poles)) < 1:
             raise ValueError("the reference filter is not stable")
@@ -111,7 +116,7 @@ class ReferenceFilter(Law):
 
     def filtered(self, reference: Real) -> Real:
         """Reference (T,) behind the filter, from rest: what `closed_loop.simulate` takes. Raises ValueError
-        for an array of another shape."""
+        for an array of another shape; a value that is nan stays in all that follow."""
         reference = np.asarray(reference, dtype=np.float64)
         if reference.ndim != 1:
             raise ValueError(f"reference must be (T,); got {reference.shape}")
@@ -121,7 +126,8 @@ class ReferenceFilter(Law):
 @lru_cache(maxsize=8)
 def _filtered(law: ReferenceFilter, reference: bytes) -> Real:
     """Filtered reference (T,) for the bytes of a reference (T,) of doubles. Kept, because trials of one loop
-    have one reference, and stepping through it in Python takes longer than the loop."""
+    have one reference, and stepping through it in Python takes longer than the loop: the 8 used last, of a
+    few laws. Read-only, as all callers share it."""
     outputs = control.forced_response(law.to_control(), inputs=np.frombuffer(reference)).outputs
     return np.asarray(readonly(outputs))
 
@@ -130,7 +136,8 @@ def worst_matching_error(k: Complex, follow: Complex, model: Complex, ellipses: 
     """Largest |F G k/(1 + G k) - T_ref| over G in each ellipse, (F,); inf where a member puts the loop on -1.
 
     k, follow, model : (F,) complex arrays
-        Controller, reference filter F and model T_ref at the frequencies of the ellipses.
+        Controller with its delay, reference filter F and model T_ref at the frequencies of the ellipses; of
+        other shapes numpy's ValueError.
 
     The error is |(F - T_ref) k G - T_ref|/|1 + k G|, a `largest_ratio`.
     """
@@ -150,7 +157,7 @@ def design_reference_filter(
     Parameters
     ----------
     controller : Controller
-        Of a loop that is robustly stable with every plant.
+        Of a loop that is robustly stable with every plant; its response with the computational delay counts.
     plants : UncertainPlant or sequence of them
         With the controller's sampling period.
     model : RationalWeight
@@ -180,7 +187,11 @@ def design_reference_filter(
 
 
 class _Matching:
-    """Grids and loops of one reference filter design, and the programmes on them."""
+    """Grids and loops of one reference filter design, and the programmes on them.
+
+    `grids` holds the lean frequencies (G,) of every plant in rad/s, which grow by exchange, `dense` its
+    ellipses on the frequencies of the check.
+    """
 
     def __init__(
         self,
@@ -217,7 +228,8 @@ class _Matching:
                 )
 
     def solve(self) -> ReferenceFilter:
-        """The filter with the poles of the options, or searched ones."""
+        """The filter with the poles of the options, or searched ones; ValueError for stated poles outside of
+        (0, Nyquist)."""
         poles = self._stated_poles()
         if poles is None:
             poles = self._searched_poles()
@@ -255,7 +267,7 @@ class _Matching:
 
     def _searched_poles(self) -> Poles:
         """Real poles in z by a simplex over the logarithms of their decay rates, on thinned grids with half
-        the samples; the best of three starts."""
+        the samples; the best of three starts. At least one pole (`options.order`)."""
         thin_grids = [grid[::_SEARCH_THINNING] for grid in self.grids]
         n_samples = _BOUNDARY_SAMPLES // 2
         n_poles = self.options.order
@@ -275,7 +287,7 @@ class _Matching:
             return self._coefficients(poles_of(log_rates), thin_grids, n_samples).gamma + outside
 
         # Corner of the model: where |T_ref| has fallen by 3 dB from its value at the lowest grid frequency,
-        # or a tenth of the highest one where it falls nowhere.
+        # or a tenth of the highest one where it falls nowhere, as a start has to be somewhere.
         omega = self.grids[0]
         size = np.abs(self._model_at(omega))
         fallen = np.flatnonzero(size < size[0] / np.sqrt(2))
@@ -301,11 +313,11 @@ class _Matching:
         return poles_of(best.x)
 
     def _model_at(self, omega: Real) -> Complex:
-        """T_ref (F,) complex at omega (F,) in rad/s."""
+        """T_ref (F,) complex at omega (F,) in rad/s; infinite at a pole on the axis."""
         return self.model.at(imaginary_axis(omega, self.dt_s))
 
     def _weight_at(self, omega: Real) -> Complex:
-        """W (F,) complex at omega (F,) in rad/s."""
+        """W (F,) complex at omega (F,) in rad/s; infinite at a pole on the axis."""
         return self.weight.at(imaginary_axis(omega, self.dt_s))
 
     def _at_zero(self, poles: Poles) -> Real:
@@ -322,12 +334,13 @@ class _Matching:
         grids : sequence of (G,) arrays
             Frequencies of every plant in rad/s.
         samples : int
-            Points on the boundary of each ellipse.
+            Points on the boundary of each ellipse, at equal steps of its angle.
 
         Returns
         -------
         MinimaxPoint
-            With unit gain F = 1 + sum c_i (L_i - L_i(1)), x (B,); else F = c_0 + sum c_i L_i, x (1 + B,).
+            Its gamma is the largest weighted error at the samples, finite as denominators are constant. With
+            unit gain F = 1 + sum c_i (L_i - L_i(1)), x (B,); else F = c_0 + sum c_i L_i, x (1 + B,).
         """
         angle = 2 * np.pi * np.arange(samples) / samples
         parts = []
@@ -370,8 +383,8 @@ class _Matching:
         return smallest_ratio(whole_basis, rows)
 
     def _full(self, poles: Poles, x: Real) -> Real:
-        """Coefficients (1 + B,) of the constant and all basis functions for free coefficients x: with unit
-        gain the constant is what makes F(1) = 1."""
+        """Coefficients (1 + B,) of the constant and all basis functions for free coefficients x (B,) with
+        unit gain, where the constant is what makes F(1) = 1, else (1 + B,) as they are."""
         if not self.options.unit_gain:
             return x
         constant = 1.0 - float(x @ self._at_zero(poles)[1:])

@@ -40,7 +40,7 @@ from ident.data.arrays import factor_matrices
 from ident.data.shown import Shown
 
 # Turns of angles and Q at most; it ends earlier once a turn gains less than ten times the accuracy. A local
-# optimum that is not reached leaves a value that is a little too high, and still some controller's.
+# optimum that is not reached leaves a value that is a little too high, and still some controller's. Chosen.
 _ELLIPSE_ROUNDS = 20
 
 # The angles are searched by refinement: so many times, on so many points, each time within an eighth of the
@@ -54,13 +54,16 @@ _ANGLE_POINTS = 21
 # Factor by which each refinement is narrower; at most the half number of points, so that no maximum is lost.
 _ANGLE_NARROWING = 8.0
 
-# Ellipses whose centres differ from the base plant by less than this, relative to the loop, stand on it.
+# Largest |offset| of the ellipses' centres from the base plant, times |d(K S)/dQ|, up to which they stand on
+# it: rounding, which would make denominators depend on Q.
 _ON_BASE_SHARE = 1e-12
 
-# A pole nearer to the unit circle than this is not stable: the loop is parametrised by coprime factors.
+# A pole nearer to the unit circle than this is not stable: the loop is parametrised by coprime factors. Above
+# the rounding of an integrator's pole, below any distance that a machine has.
 _UNSTABLE_DISTANCE = 1e-9
 
-# Frequencies that are added to the programme's grid in a round, at most.
+# Frequencies that are added to the programme's grid in a round, at most: each makes the next programme
+# dearer. Chosen.
 _MOST_ADDED = 24
 
 Region = Literal["inscribed", "ellipse", "enclosing"]
@@ -71,10 +74,11 @@ Region = Literal["inscribed", "ellipse", "enclosing"]
 class PlantBracket:
     """What controllers reach on one plant: weighted worst cases, each the largest on the dense grid.
 
-    plant : its name. inscribed : no controller goes below. ellipse, enclosing : some controller reaches it.
-    Each is by a Q of the basis: a longer one may lie a little lower, by a per cent at most on the plants
-    tried. inf where nothing was found to be robustly stable. For unstable plants whose ellipses are not about
-    the nominal response, `inscribed` is a local optimum.
+    Values have no unit; 1 is what the specification asks. plant : its name. inscribed : no controller goes
+    below. ellipse, enclosing : some controller reaches it. Each is by a Q of the basis: a longer one may lie
+    a little lower, by a per cent at most on the plants tried. inf where nothing was found to be robustly
+    stable. For unstable plants whose ellipses are not about the nominal response, `inscribed` is a local
+    optimum.
     """
 
     plant: str
@@ -124,7 +128,7 @@ def youla_bracket(
     Parameters
     ----------
     plants : UncertainPlant or sequence of them
-        Each is bracketed by itself.
+        Each is bracketed by itself, with a grid and a basis of its own.
     specification : Specification
         Only its weighted requirements count, so that the values are lower bounds for what is asked further.
     options : YoulaOptions or None
@@ -140,7 +144,9 @@ def youla_bracket(
     Raises
     ------
     SpecificationError
-        If specification and plants contradict each other.
+        If there is no plant, or specification and plants contradict each other.
+    ValueError
+        If a plant has a mode on or outside the circle that no controller moves (`coprime_factors`).
 
     Notes
     -----
@@ -160,7 +166,11 @@ def youla_bracket(
 
 
 class BracketProblem:
-    """The three programmes of one plant, with its grids and the parametrisation of its controllers."""
+    """The three programmes of one plant, with its grids and the parametrisation of its controllers.
+
+    Q is expanded in n functions: the constant one and those of `poles`. `dense` is the plant's data on the
+    grid of the checks, `dense_loop` and `dense_basis` what depends on Q there.
+    """
 
     def __init__(
         self,
@@ -170,7 +180,9 @@ class BracketProblem:
         *,
         accuracy: float = 1e-5,
     ) -> None:
-        """Grids, loop and basis of one plant; accuracy is that of each programme's gamma, relative."""
+        """Grids, loop and basis of one plant; accuracy is that of each programme's gamma, relative: by
+        default a thousandth of the per cent by which bounds are compared. Raises ValueError for a mode on or
+        outside the circle that no controller moves (`coprime_factors`)."""
         self.plant = plant
         self.spec = specification
         self.options = options
@@ -200,7 +212,8 @@ class BracketProblem:
         )
 
     def answers(self) -> list[tuple[float, Real]]:
-        """(value, x (n,)) for ellipses, enclosing and inscribed discs, in this order; see `exchanged`."""
+        """(value, x (n,)) for ellipses, enclosing and inscribed discs, in this order: the worst case on the
+        dense grid, inf where nothing is robustly stable, and the coefficients of Q; see `exchanged`."""
         enclosing = self.exchanged("enclosing", None)
         inscribed = self.exchanged("inscribed", None)
         # Where the enclosing discs cannot be stabilised, the ellipses may be: started from the inscribed.
@@ -210,7 +223,10 @@ class BracketProblem:
         return [self.exchanged("ellipse", start), enclosing, inscribed]
 
     def controller(self, x: Real) -> tuple[Real, Complex]:
-        """Frequencies (F,) of the programme in rad/s and the controller's values K (F,) there, for x (n,)."""
+        """Frequencies (F,) of the programme in rad/s and the controller's values K (F,) there, for x (n,).
+
+        K is without the computational delay, command per error; infinite or nan where S vanishes.
+        """
         lean = self.grids.lean()[0]
         loop = self._loop(lean)
         q = self._basis(lean) @ x
@@ -225,7 +241,7 @@ class BracketProblem:
         """
 
         def solve(begin: Real | None) -> MinimaxPoint:
-            """Optimum on the lean grid as it is."""
+            """Optimum on the lean grid as it is, from x (n,) or None; gamma is inf where none was found."""
             lean = self.grids.lean()[0]
             if region == "ellipse":
                 return self._ellipse(lean, begin)
@@ -248,7 +264,8 @@ class BracketProblem:
 
     def _ellipse(self, data: PlantData, start: Real | None) -> MinimaxPoint:
         """Local optimum for the ellipses on the grid of `data`: the best normals for x, then the best x for
-        these normals, in turn. start : x (n,), or None: the normals begin along the real axis."""
+        these normals, in turn. start : x (n,), or None: the normals begin along the real axis. gamma is inf,
+        with x of zeros, where no x makes the loop robustly stable."""
         basis = self._basis(data)
         loop = self._loop(data)
         best = MinimaxPoint(np.zeros(basis.shape[1]), np.inf)
@@ -267,7 +284,8 @@ class BracketProblem:
         return best
 
     def _loop(self, data: PlantData) -> AffineLoop:
-        """How the loop depends on Q at the frequencies of `data`."""
+        """How the loop depends on Q at the frequencies of `data` (its `ellipses.omega_rad_s` (F,) count, for
+        a stable plant their centres and the computational delay, too)."""
         if self.factors is not None:
             return self.factors.loop(data.ellipses.omega_rad_s)
         # A stable plant needs no factors: M = Y = 1 and X = 0, hence K S = Q and S = 1 - G Q.
@@ -298,7 +316,14 @@ class BracketProblem:
         loop : AffineLoop
             K S and S as they depend on Q, at these frequencies.
         angles : (F,) array or None
-            t of the normal for the ellipse, radians; None: zero. Discs do not depend on it.
+            t of the normal for the ellipse, radians; None: zero, the best one for discs about the base
+            plant.
+
+        Returns
+        -------
+        PlaneRows
+            One for each weighted function and frequency with a weight above 0; a specification always weighs
+            S (modulus margin), so there are some.
 
         Notes
         -----
@@ -374,6 +399,7 @@ class BracketProblem:
         loop = self.dense_loop
         if region == "ellipse":
             sensitivity = loop.sensitivity + loop.sensitivity_slope * q
+            # Where S vanishes K is infinite: huge instead, whose worst case is infinite or huge as well.
             nonzero_sensitivity = np.where(sensitivity == 0, 1e-300, sensitivity)
             k = (loop.effort + loop.effort_slope * q) / nonzero_sensitivity
             return worst_of(self.dense.weighted(k))
@@ -385,13 +411,15 @@ class BracketProblem:
 
 def _best_angles(loop: AffineLoop, data: PlantData, y: Complex) -> Real:
     """Angles t (F,) in radians of the supporting normals that give the exact distance: those of the largest
-    m(t), for Q = y (F,) complex."""
+    m(t), for Q = y (F,) complex. Nan where y is not finite."""
     ellipses = data.ellipses
     q = loop.effort + loop.effort_slope * y
     # Centre and major axis of the ellipse of 1 + D q, as complex numbers.
     centre = 1.0 + (ellipses.centre * data.delay - loop.base) * q
     axis = q * ellipses.direction * data.delay
     angles = np.angle(centre)
+    # A quarter turn to either side of the centre's own direction: the best normal has a part along it
+    # wherever the ellipse leaves the origin out.
     width = np.pi / 2
     for _ in range(_ANGLE_REFINEMENTS):
         trial = angles[:, None] + width * np.linspace(-1, 1, _ANGLE_POINTS)

@@ -21,29 +21,33 @@ from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
 
 # Slowest mirrored pole as a share of the fastest real one: zeros of sampling lie as far from z = -1 as the
-# plant turns in a sample, and farther.
+# plant turns in a sample, and farther. Chosen.
 _SLOWEST_MIRRORED_SHARE = 3e-3
 
-# Fastest pole as a share of the Nyquist frequency, and slowest one as a share of the specification's
-# frequency: beyond them Q is constant for all that the requirements see.
+# Decay rate of the fastest real pole as a share of the Nyquist frequency: beyond it Q is constant for all
+# that the requirements see. Chosen.
 _FASTEST_SHARE = 0.95
 
-# The slowest real pole as a share of the specification's frequency, for plants without a slow corner.
+# Decay rate of the slowest real pole as a share of the specification's frequency, for plants without a slower
+# corner: the requirements have no slower corner of weight. Chosen.
 _SLOWEST_SHARE = 0.02
 
-# Poles of the plant slower than this share of the specification's frequency count as integrators.
+# Poles of the plant slower than this share of the specification's frequency count as integrators, which are
+# no corner that Q has to resolve. Chosen, three decades below what is asked.
 _INTEGRATOR_SHARE = 1e-3
 
-# A pole in z nearer to 0 than this is a delay: its decay rate would be infinite.
+# A pole in z nearer to 0 than this is a delay: its decay rate would be infinite, and counts as 14/dt, beyond
+# Nyquist.
 _DEADBEAT_BELOW = 1e-6
 
-# Damping ratios of the pairs at a mode: from a little above its own, within limits, to well damped.
+# First damping ratio of the pairs at a mode over the mode's own: a little above it, as a basis pole on the
+# mode itself adds nothing that the plant's factors do not have. Chosen.
 _OWN_DAMPING_FACTOR = 1.3
 
-# Smallest damping ratio that pairs begin at: less is narrower than the grid of frequencies resolves.
+# Smallest damping ratio that pairs begin at: less is narrower than the grid of frequencies resolves. Chosen.
 _LEAST_DAMPING = 0.005
 
-# Largest damping ratio that pairs begin at, so that a spread up to the last one is left.
+# Largest damping ratio that pairs begin at, so that a spread up to the last one is left. Chosen.
 _MOST_OWN_DAMPING = 0.3
 
 # Damping ratio of the last pair: without a resonance peak.
@@ -57,7 +61,8 @@ _STATE_WEIGHT_SHARE = 1e-6
 
 def with_constant(poles: Poles, omega_rad_s: Real, dt_s: float) -> Complex:
     """Values (F, 1 + B) complex at z = e^{j omega dt} of the constant one and of the B orthonormal basis
-    functions with the given poles; omega (F,) in rad/s."""
+    functions with the given poles in z, each a column of a real pole, two of a pair; omega (F,) in rad/s, up
+    to Nyquist. dt_s is that of the poles (not checked)."""
     z = np.exp(1j * np.asarray(omega_rad_s, dtype=np.float64) * dt_s)
     return np.hstack([np.ones((z.size, 1), np.complex128), basis_response(poles, z)])
 
@@ -70,9 +75,9 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOption
     plant : UncertainPlant
         Its poles, zeros, modes and sampling period.
     scale_rad_s : float
-        Frequency of the specification, its bandwidth or the like.
+        Frequency of the specification, its bandwidth or the like; positive (not checked).
     options : YoulaOptions
-        How many poles of each kind.
+        How many poles of each kind: `real_poles`, `mirrored_poles`, `pairs_per_mode`.
 
     Returns
     -------
@@ -80,7 +85,8 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOption
         Real ones spread logarithmically from the slowest corner of the plant to Nyquist; mirrored ones, at
         negative z next to Nyquist, where sampling puts zeros; and pairs at every mode and lightly damped
         zero, where Q inverts the plant, with damping ratios from their own to 0.7. More than three modes and
-        zeros share the pairs of three.
+        zeros share the pairs of three (two each at least), so that the basis hardly grows with them. Modes at
+        or above Nyquist are left out. All poles are stable.
     """
     dt = plant.dt_s
     decay_rates = np.abs(np.log(np.maximum(np.abs(plant.poles), _DEADBEAT_BELOW))) / dt
@@ -110,7 +116,8 @@ class AffineLoop:
     """K S and S as they depend on the free function Q, at F frequencies; all fields (F,) complex.
 
     base : the plant's response, with the computational delay. K S = effort + effort_slope Q and
-    S = sensitivity + sensitivity_slope Q, where K is the controller without that delay.
+    S = sensitivity + sensitivity_slope Q, where K is the controller without that delay. Nothing is checked;
+    at a pole of the plant on the circle base is infinite, the others are finite.
     """
 
     base: Complex
@@ -123,7 +130,8 @@ class AffineLoop:
 @dataclass(frozen=True, eq=False)
 class Factors:
     """Coprime factors of a plant G = N/M with N X + M Y = 1: four stable discrete systems, one input and one
-    output each. N and M share their states, X and Y theirs."""
+    output each. N and M share their states, X and Y theirs: `loop` relies on it, `coprime_factors` provides
+    it; nothing is checked."""
 
     N: control.StateSpace
     M: control.StateSpace
@@ -131,7 +139,8 @@ class Factors:
     Y: control.StateSpace
 
     def loop(self, omega_rad_s: Real) -> AffineLoop:
-        """The loop K S = M (X + M Q), S = M (Y - N Q) at omega (F,) in rad/s."""
+        """The loop K S = M (X + M Q), S = M (Y - N Q) at omega (F,) in rad/s, up to Nyquist. At a frequency
+        where M vanishes, a plant's pole on the circle, base is infinite or nan."""
         # N and M differ in their outputs only: one system with two outputs is evaluated.
         outputs = np.vstack([self.N.C, self.M.C])
         output_feedthrough = np.vstack([self.N.D, self.M.D])
@@ -157,7 +166,12 @@ def coprime_factors(plant: control.StateSpace) -> Factors:
     Parameters
     ----------
     plant : control.StateSpace
-        One input and one output, n states; any poles.
+        One input and one output, n states, discrete; any poles.
+
+    Returns
+    -------
+    Factors
+        N, M, X and Y with n states each and the plant's sampling time.
 
     Raises
     ------

@@ -500,7 +500,7 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
         (frequency of ln(z)/dt, the fastest growing first), then the frequencies at which an ellipse, or the
         ellipse behind the delay of the delay margin, lies deepest over -1. Where there are none: guards, by
         the frequency where each comes nearest to -1; and where there are none: the controller's own least
-        damped pair.
+        damped pair. The infinite pole of an algebraic loop is not named.
     """
     # Unstable poles, as (-modulus, point), and ellipses over -1, as (scale to reach -1, point).
     unstable_poles: list[tuple[float, BlockingPoint]] = []
