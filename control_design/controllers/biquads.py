@@ -76,7 +76,8 @@ class Cascade:
 
     @property
     def pair_positions(self) -> tuple[int, ...]:
-        """Positions in the parameter vector at which (a, b) of each section with a pair of poles starts."""
+        """Positions in the parameter vector at which (a, b) of each section with a pair of poles starts;
+        () without such a section."""
         positions = []
         section_start = 0
         for kind in self.sections:

@@ -155,7 +155,7 @@ class Controller(Law):
 
     @property
     def limited_commands(self) -> Boolean:
-        """Whether each command has a saturation or a rate limit, (U,)."""
+        """Whether each command has a saturation or a rate limit, (U,); an infinite limit is none."""
         smaller_limit = np.minimum(self.limits("input_limit"), self.limits("rate_limit"))
         return np.asarray(np.isfinite(smaller_limit))
 
@@ -411,7 +411,7 @@ class FrictionFeedforward:
 
     def turn(self, dt_s: float) -> float:
         """Motion of the reference in a sample of dt_s seconds, in its units, from which on the sign of its
-        speed counts in full."""
+        speed counts in full; dt_s positive (not checked)."""
         return self.width * dt_s / self.lag_s
 
     def friction(self, moved: Real, dt_s: float) -> Real:

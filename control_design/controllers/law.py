@@ -89,7 +89,7 @@ class Law:
         return np.asarray(np.linalg.eigvals(self.A), dtype=np.complex128)
 
     def to_control(self) -> control.StateSpace:
-        """The law as a discrete `control.StateSpace`."""
+        """The law as a discrete `control.StateSpace` of period dt_s, with matrices of its own (copies)."""
         # Imported here, because it brings a plotting library with it.
         import control
 

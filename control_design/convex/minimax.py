@@ -117,7 +117,7 @@ class PlaneRows:
         return cls(*values)
 
     def numerator(self, y: Real) -> Real:
-        """|A y + a|, (R,), for vectors y (F, 2)."""
+        """|A y + a|, (R,), for vectors y (F, 2), F above every number in `at` (else an IndexError)."""
         vector = np.einsum("rij,rj->ri", self.A, y[self.at]) + self.a
         return np.asarray(np.hypot(vector[:, 0], vector[:, 1]))
 
@@ -134,7 +134,8 @@ class PlaneRows:
 
 
 def plane(value: Complex) -> Real:
-    """Complex numbers (R,) as vectors of the plane (R, 2): real and imaginary part."""
+    """Complex numbers (R,) as vectors of the plane (R, 2): real and imaginary part. Any shape (...) gives
+    (..., 2)."""
     return np.stack([value.real, value.imag], axis=-1)
 
 
@@ -272,8 +273,8 @@ def exchanged(
     -------
     Exchanged
         The point with the smallest worst value. Ends when no value exceeds gamma by more than
-        `EXCHANGE_TOLERANCE`, or when a programme finds no point. One array of values for each dense grid, else
-        a ValueError; what `solve` and `check` raise goes up.
+        `EXCHANGE_TOLERANCE`, or when a programme finds no point. One array of values for each dense grid,
+        else a ValueError; what `solve` and `check` raise goes up.
     """
     best = Exchanged(None, [], 0.0)
     for _ in range(rounds + 1):
@@ -327,7 +328,7 @@ class _Scaled:
         self._fixed_reach = np.hypot(rows.c[:, 0], rows.c[:, 1])
 
     def least_squares(self) -> Real:
-        """z (m,) with the smallest sum of squared numerators."""
+        """z (m,) with the smallest sum of squared numerators; denominators may be of any sign there."""
         rows = self.rows
         seen = np.matmul(rows.A, self.planar[rows.at]).reshape(-1, self.planar.shape[2])
         return np.asarray(np.linalg.lstsq(seen, -rows.a.reshape(-1), rcond=None)[0])
@@ -337,11 +338,13 @@ class _Scaled:
         return float(np.max(self.rows.ratio(self.planar @ z)))
 
     def seen(self, z: Real) -> Real:
-        """Vector y that every row looks at, (R, 2), for z (m,)."""
+        """Vector y that every row looks at, (R, 2), for z (m,); linear, so for a step of z the step of y. z
+        of another length is numpy's ValueError, here and in what follows."""
         return np.asarray((self.planar @ z)[self.rows.at])
 
     def onto_z(self, vectors: Real) -> Real:
-        """Sum over the rows of the linear forms vectors (R, 2) of their y, as one linear form (m,) of z."""
+        """Sum over the rows of the linear forms vectors (R, 2) of their y, as one linear form (m,) of z: the
+        transpose of `seen`."""
         summed = _summed(self.rows.at, vectors, len(self.planar))
         return np.asarray(summed.reshape(-1) @ self.planar.reshape(-1, self.planar.shape[2]))
 
@@ -495,6 +498,7 @@ class _Scaled:
     ) -> tuple[Real, Real]:
         """Gradients (R, 2) of h by the y of each row, and dual (R,) times its Hessians (R, 2, 2), at z (m,).
 
+        weight, gamma and scale (R,) as of `_values`; dual (R,), positive: the multiplier of each row.
         The Hessian of size = sqrt(|p|^2 + r^2) is (w w^T + (r/size)^2 u u^T)/size, u along p and w across it.
         """
         rows = self.rows

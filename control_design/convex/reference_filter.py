@@ -276,7 +276,8 @@ class _Matching:
         high = np.log(_FASTEST_SHARE * nyquist)
 
         def poles_of(log_rates: Real) -> Poles:
-            """Poles in z for logarithms of decay rates (N,), which are brought into their limits."""
+            """Poles in z for logarithms of decay rates (N,), which are sorted and brought into their limits;
+            nan stays."""
             rates = np.exp(np.clip(np.sort(log_rates), low, high))
             return Poles(np.exp(-self.dt_s * rates))
 

@@ -90,7 +90,8 @@ class PlantBracket:
 @dataclass(frozen=True, repr=False)
 class YoulaBracket(Shown):
     """What any controller could reach, the worst over the plants. Each may need a Q of its own, so that with
-    several plants these are lower bounds of what one controller can do."""
+    several plants these are lower bounds of what one controller can do. At least one plant; inf where one of
+    them has none that is robustly stable."""
 
     plants: tuple[PlantBracket, ...]
 
@@ -299,7 +300,7 @@ class BracketProblem:
         )
 
     def _basis(self, data: PlantData) -> Complex:
-        """Values (F, n) of the basis of Q at the frequencies of `data`."""
+        """Values (F, n) of the basis of Q at the frequencies of `data`, its `ellipses.omega_rad_s` (F,)."""
         return with_constant(self.poles, data.ellipses.omega_rad_s, self.plant.dt_s)
 
     def _rows(
@@ -394,7 +395,7 @@ class BracketProblem:
 
     def _dense_values(self, x: Real, region: Region) -> Real:
         """Worst case (F,) at each frequency of the dense grid for x (n,): by exact geometry for the ellipse,
-        by the rows for discs."""
+        by the rows for discs; inf where the region is not robustly stable."""
         q = self.dense_basis @ x
         loop = self.dense_loop
         if region == "ellipse":

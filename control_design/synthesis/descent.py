@@ -77,7 +77,8 @@ class MinimaxDescent:
         *,
         controller_damping: float | None = None,
     ) -> None:
-        """Build the rows, the bounds of all parameters, and the side conditions on damping."""
+        """Build the rows, the bounds of all parameters, and the side conditions on damping, of which there
+        are none without pairs of poles or a damping asked."""
         self.cascade = cascade
         self.stable = stable
         self.rows = LoopRows(cascade, plants)

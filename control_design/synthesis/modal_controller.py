@@ -108,7 +108,8 @@ class ModalForm:
         dt_s: float,
         damping: float,
     ) -> None:
-        """Find the free entries of every part, and where each part stands in the parameter vector."""
+        """Find the free entries of every part, and where each part stands in the parameter vector; refuses an
+        order that does not fit (ValueError, see the class)."""
         self.pattern = pattern
         self.scale = scale_rad_s
         self.slowest = slowest_rad_s

@@ -105,6 +105,7 @@ class MultivariableResult(Shown):
     Attributes
     ----------
     outcome : Outcome
+        Met on the grid, not met, or not converged: then the controller means nothing, and gamma is inf.
     controller : Controller
         u = -K y.
     gamma : float
@@ -208,7 +209,8 @@ class Programme:
         specification: MultivariableSpecification,
         options: MultivariableOptions,
     ) -> None:
-        """Build grids, nominal loops, the rows of the dense check, and the form of the controller."""
+        """Build grids, nominal loops, the rows of the dense check, and the form of the controller, and refuse
+        what does not fit (see the class)."""
         first = plants[0]
         for plant in plants[1:]:
             if (plant.inputs, plant.outputs, plant.dt_s) != (first.inputs, first.outputs, first.dt_s):

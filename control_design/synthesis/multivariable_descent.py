@@ -95,8 +95,9 @@ class StackedRows:
         `entering` (R, N, Y, Y) of how each block sees the actuators and enters the outputs, and V_y (R, Y,
         Y), V_u (R, U, U) of the weights on outputs and actuators.
     s : ndarray, shape (R,)
-        Tustin's s at the row's frequency, where `ModalForm.response` evaluates K.
+        Tustin's s, rad/s, at the row's frequency, where `ModalForm.response` evaluates K.
     omega_rad_s : ndarray, shape (R,)
+        The row's frequency. Built by `stacked_rows`; no shape is checked.
     plant : ndarray, shape (R,)
         Number of the row's plant.
     requirement : ndarray, shape (R,)
@@ -193,7 +194,8 @@ class _NearWorst:
     """First-order model of the r rows near the worst at one point.
 
     Each row is the Hermitian matrix M of log H, in the eigenvectors of H at that point, largest first. Its
-    w^2 real numbers are ordered as `_entries` does: the diagonal, then real and imaginary parts above it.
+    w^2 real numbers are ordered as `_entries` does: the diagonal, then real and imaginary parts above it. At
+    least one row, as the worst one is near itself; nothing is checked.
 
     Attributes
     ----------
@@ -252,7 +254,7 @@ class MatrixDescent:
     """
 
     def __init__(self, form: ModalForm, stack: StackedRows, loops: Sequence[NominalLoop]) -> None:
-        """Keep the arguments, and the bounds (n,) of the parameters."""
+        """Keep the arguments, and the bounds (n,) of the parameters; nothing is checked."""
         self.form = form
         self.stack = stack
         self.loops = tuple(loops)
@@ -448,7 +450,7 @@ class MatrixDescent:
         factors = axes * roots[:, None, :]
 
         def gradient(points: Real) -> Real:
-            """Slopes (P, n) of the weighted sum at points (P, n), all in one call."""
+            """Slopes (P, n) of the weighted sum at points (P, n), all in one call, with the scalings held."""
             count = points.shape[0]
             copies = np.tile(np.arange(index.size), count)
             K = self.form.response(points, s)
@@ -567,7 +569,8 @@ def _fall(before: float, after: Bound | None) -> float:
 def _entries(matrix: Complex) -> Real:
     """Real numbers (..., w^2) of Hermitian matrices (..., w, w).
 
-    The diagonal, then real and imaginary part of each entry above it, row by row.
+    The diagonal, then real and imaginary part of each entry above it, row by row; what stands below the
+    diagonal is not looked at, so that a matrix is taken as Hermitian.
     """
     width = matrix.shape[-1]
     numbers = [matrix[..., i, i].real for i in range(width)]
@@ -577,7 +580,8 @@ def _entries(matrix: Complex) -> Real:
 
 
 def _weights(u: Complex) -> Real:
-    """Weights (r, w^2) with which u^H M u is a sum of M's `_entries` (r, w^2), for directions u (r, w)."""
+    """Weights (r, w^2) with which u^H M u is a sum of M's `_entries` (r, w^2), for directions u (r, w) of any
+    length."""
     width = u.shape[1]
     weights = [np.abs(u[:, i]) ** 2 for i in range(width)]
     for i, j in combinations(range(width), 2):
@@ -588,7 +592,8 @@ def _weights(u: Complex) -> Real:
 
 
 def _matrix(entries: Real, width: int) -> Complex:
-    """Hermitian matrices (..., w, w) with given `_entries` (..., w^2)."""
+    """Hermitian matrices (..., w, w) with given `_entries` (..., w^2); width is w. Fewer entries are an
+    IndexError, further ones are left out."""
     matrix = np.zeros((*entries.shape[:-1], width, width), dtype=np.complex128)
     for i in range(width):
         matrix[..., i, i] = entries[..., i]
@@ -610,7 +615,7 @@ def _lowered(value: Real, fall: Real, room: float, width: int) -> tuple[Real, Co
     shift = np.zeros((value.shape[0], fall.shape[2]))
 
     def largest(by: Real) -> Real:
-        """Largest eigenvalue (r,) with scalings moved by (r, N)."""
+        """Largest eigenvalue (r,) with scalings log t moved by (r, N)."""
         at = value + np.einsum("rin,rn->ri", fall, by)
         if width == 2:
             # In closed form: a fraction of the time of a general solver.

@@ -317,7 +317,11 @@ class OrderSearch:
         return shaped + [maker.low_gain() for _ in range(min(self.options.starts, _CARRIED))]
 
     def _starts(self) -> list[Real]:
-        """Parameters (n,) of all starts of `run`: the known ones first, then those that are drawn."""
+        """Parameters (n,) of all starts of `run`: the known ones first, then those that are drawn.
+
+        At least one is drawn. For unstable plants they are loops that were led to stability; not all of
+        these, nor of the random ones, are stable.
+        """
         maker = self._maker()
         if any(plant.unstable_poles for plant in self.problem.plants):
             stabilised = maker.stabilising(self._radius, max(self.options.starts, _CARRIED))
@@ -333,7 +337,8 @@ class OrderSearch:
         return [*self.known_starts, *mixed]
 
     def _maker(self) -> StartMaker:
-        """Source of random starts, scored on the lean grids as they are now."""
+        """Source of random starts, scored on the lean grids as they are now; it does not follow their
+        growth."""
         return StartMaker(
             self.cascade,
             self.problem.lean(),
@@ -396,7 +401,8 @@ class OrderSearch:
     def _checked(self, ends: Sequence[TriedController]) -> list[TriedController]:
         """Ends in different minima with their gamma on the dense grid, best on the lean grid first.
 
-        Stops once `_CARRIED` of them are robustly stable there, as the dense check is the dearer one.
+        Stops once `_CARRIED` of them are robustly stable there, as the dense check is the dearer one. Ends
+        that are unstable on the lean grid are left out; of none, none.
         """
         checked: list[TriedController] = []
         for end in different(ends, len(ends), on_grid=True):
@@ -445,7 +451,8 @@ class OrderSearch:
 
         An end that is better on the lean grid than the best, and reaches -1 between its points, has found a
         valley worth having: the frequencies that it violates join the lean grid, and it goes on from there,
-        with less gain at first.
+        with less gain at first. At most `_CARRIED` at a time, `_RETRIEVALS` times. Empty where no end is
+        stable on the dense grid and none could be saved; an end that was not checked there counts as lost.
         """
         stable = [end for end in ends if np.isfinite(end.gamma)]
         lost = _lost_between_points(ends)
@@ -569,7 +576,8 @@ class OrderSearch:
 
 
 def _lost_between_points(ends: Sequence[TriedController]) -> list[TriedController]:
-    """Ends that are stable on the lean grid and not robustly stable on the dense one."""
+    """Ends that are stable on the lean grid and not robustly stable on the dense one, or not checked
+    there."""
     return [end for end in ends if np.isfinite(end.gamma_grid) and not np.isfinite(end.gamma)]
 
 

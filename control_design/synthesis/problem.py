@@ -77,7 +77,8 @@ class Problem(Grids):
         options: SynthesisOptions,
         guards: tuple[Guard, ...] = (),
     ) -> None:
-        """Build grids and nominal loops, the computational delay at the input of each plant."""
+        """Build grids and nominal loops, the computational delay at the input of each plant; what `Grids` and
+        `NominalLoop` refuse goes up."""
         super().__init__(plants, specification, options)
         self.options = options
         self.guards = guards
@@ -339,7 +340,8 @@ class Problem(Grids):
         )
 
     def delay(self, omega_rad_s: Real) -> Complex:
-        """Computational delay e^{-j omega T n} (F,) at omega (F,), rad/s, of n samples of T."""
+        """Computational delay e^{-j omega T n} (F,) at omega (F,), rad/s, of n samples of T, as the
+        specification states them."""
         samples = self.spec.computational_delay_samples
         return np.asarray(np.exp(-1j * omega_rad_s * self.dt_s * samples), dtype=np.complex128)
 

@@ -204,7 +204,8 @@ class _Mapped:
 
 
 class _EllipseArrays(NamedTuple):
-    """Ellipses of all plants, (F,) each: centre, direction of the major axis, and semi-axes."""
+    """Ellipses of all plants, (F,) each: centre and semi-axes, output per input, and direction of the major
+    axis, complex of modulus one. `Ellipses` has checked the axes."""
 
     centre: Complex
     direction: Complex
@@ -238,7 +239,8 @@ class LoopRows:
     """
 
     def __init__(self, cascade: Cascade, plants: Sequence[Rows]) -> None:
-        """Put all frequencies into one array (F,), all rows into one (R,), and build their functions."""
+        """Put all frequencies into one array (F,), all rows into one (R,), and build their functions; refuses
+        nothing by itself (see the class)."""
         ellipses = [rows.ellipses for rows in plants]
         self._ellipses = _EllipseArrays(
             centre=np.concatenate([each.centre for each in ellipses]),
@@ -296,7 +298,10 @@ class LoopRows:
         self._latest: _Point | None = None
 
     def covers_minus_one(self, x: Real) -> bool:
-        """Whether some ellipse contains -1/K under x (n,); the rows, of its boundary, would not show it."""
+        """Whether some ellipse contains -1/K under x (n,); the rows, of its boundary, would not show it.
+
+        One without extent (a semi-axis of zero) contains nothing.
+        """
         centre, direction, semi_major, semi_minor = self._ellipses
         k = self._at(x).k
         # 1/K + centre in the ellipse's own axes, times |K|^2: no division by a K that vanishes.
@@ -315,7 +320,10 @@ class LoopRows:
         return self._at(x).logs
 
     def slopes(self, x: Real) -> Real:
-        """Slopes (R, n) of the rows in the parameters x (n,)."""
+        """Slopes (R, n) of the rows in the parameters x (n,), the worst members held; a copy.
+
+        x of another length is numpy's ValueError here and in the other methods.
+        """
         angles = self._at(x).angles
         (slope,) = self._slope(x, angles[:, None])
         return slope.reshape(-1, x.size).copy()

@@ -209,7 +209,7 @@ class StartMaker:
         controller_damping: float | None,
         keeps_sign: bool,
     ) -> None:
-        """Keep the arguments; see whether any weight on S asks for tracking."""
+        """Keep the arguments, None of a damping as 0; see whether any weight on S asks for tracking."""
         self.cascade = cascade
         self.data = data
         self.integrators = integrators
