@@ -280,6 +280,7 @@ class BracketProblem:
             if point.gamma < gamma_before:
                 best = point
                 start = point.x
+            # Ten times the accuracy of a programme: less may be its error.
             if not point.gamma < gamma_before * (1 - 10 * self.accuracy):
                 break
         return best

@@ -53,6 +53,13 @@ _MOST_OWN_DAMPING = 0.3
 # Damping ratio of the last pair: without a resonance peak.
 _LARGEST_DAMPING = 0.7
 
+# Modes and zeros that get all pairs of the options each; more of them share the pairs of so many, as the time
+# of a programme grows with the cube of the basis. Chosen.
+_MODES_WITH_ALL_PAIRS = 3
+
+# Pairs of a mode, at least: one a little above its own damping, one well damped.
+_LEAST_PAIRS = 2
+
 # Weight of the states beside the output in the linear-quadratic gains, relative to the output's: lets the
 # Riccati equations have a solution where the output does not see a mode. The factors are not unique, so no
 # bound moves.
@@ -101,8 +108,8 @@ def chosen_poles(plant: UncertainPlant, scale_rad_s: float, options: YoulaOption
     for mode in [*plant.modes, *modes_of(plant.zeros, dt)]:
         if mode.omega_rad_s < plant.nyquist_rad_s:
             resonances.append(mode)
-    shared_pairs = 3 * options.pairs_per_mode // max(len(resonances), 1)
-    n_pairs = max(2, min(options.pairs_per_mode, shared_pairs))
+    shared_pairs = _MODES_WITH_ALL_PAIRS * options.pairs_per_mode // max(len(resonances), 1)
+    n_pairs = max(_LEAST_PAIRS, min(options.pairs_per_mode, shared_pairs))
     pairs = [np.zeros(0, complex)]
     for mode in resonances:
         lowest_zeta = np.clip(_OWN_DAMPING_FACTOR * abs(mode.zeta), _LEAST_DAMPING, _MOST_OWN_DAMPING)

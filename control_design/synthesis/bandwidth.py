@@ -86,6 +86,7 @@ def synthesise_widest(
     trials = [stated(specification, bandwidth) for bandwidth in bandwidths]
     # A trial ends before it can mend a pole that is slower than the plant's grids; a whole design does.
     low_rad_s = options.omega_min_rad_s or min(lowest_rad_s(plant.dt_s, plant.poles) for plant in plants)
+    # One draw, of all whole numbers that rng has: every trial and design begins with the same generator.
     seed = int(rng.integers(2**63))
     quick = options.model_copy(update={"sufficient_gamma": _CLEAR, "omega_min_rad_s": low_rad_s})
     many_starts_may_help = True

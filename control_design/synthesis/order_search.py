@@ -252,6 +252,7 @@ class OrderSearch:
             may_end_near = least <= 1.0 or all_fits_tried
             if self._good_enough(ends) or agreed(least, _FAIR) or (may_end_near and near_free(least)):
                 break
+            # Five rounds are half of the search, the exchange is the other half.
             self.tell(0.1 * number, f"start {number + 1} of {rounds}, from controllers of any order")
             starts = self._other_starts() if all_fits_tried else self._fits(free, weighted=number > 0)
             ends = ends + self._raced(starts)
@@ -293,7 +294,7 @@ class OrderSearch:
         weighted: errors are weighted over frequency at random, else all relative errors alike. No fit for a
         cascade with notches.
         """
-        # Clear of the bound on the controller's damping by 1 %.
+        # Clear of the bound on the controller's damping by 1 %: a start on it has no room to move.
         asked_damping = self.spec.controller_damping or 0.0
         damping = max(1.01 * asked_damping, _NO_RESONANCE)
         rng = self.rng if weighted else None

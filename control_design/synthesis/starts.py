@@ -158,7 +158,8 @@ _WORST_CASE_EVALUATIONS = 60
 # score of inf. No pole modulus that is seen comes near.
 _LARGEST_COST = 1e6
 
-# Damping of drawn pairs over what is asked of the controller's own poles: clear of the bound by 1 %.
+# Damping of drawn pairs over what is asked of the controller's own poles: clear of the bound by 1 %, as a
+# start on it has no room to move.
 _CLEAR_OF_BOUND = 1.01
 # No division by zero; far below any response.
 _TINY = 1e-300

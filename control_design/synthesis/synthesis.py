@@ -131,6 +131,7 @@ def synthesise(
     specification = _seen_by_the_data(specification, plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), specification, options, tuple(guards))
+    # One draw, of all whole numbers that rng has, whatever the searches draw from generators of their own.
     seed = int(rng.integers(2**63))
     if specification.controller_order == "auto":
         result = _of_lowest_order(problem, seed, tell, thorough=thorough)
@@ -374,7 +375,7 @@ def _embedded(
     `_EMBEDDINGS` vectors of the higher cascade, whose sections are those of `lower` and one of order two
     more; any other raises ValueError (`with_cancelling_section`).
     """
-    # Clear of the bound on the controller's damping by 1 %.
+    # Clear of the bound on the controller's damping by 1 %: a start on it has no room to move.
     asked_damping = problem.spec.controller_damping or 0.0
     damping = max(_EMBEDDED_DAMPING, 1.01 * asked_damping)
     return [
