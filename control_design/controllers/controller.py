@@ -115,7 +115,8 @@ class Controller(Law):
 
     def _checked_limit(self, name: str) -> Limit:
         """The limit of that name as a number or None, for a sequence as a tuple of these, one for each
-        command. Raises ValueError for a wrong number of values, or one that is not positive."""
+        command. Raises ValueError for a wrong number of values, or one that is not positive (nan among
+        them; infinite ones pass), float's own error for what is no number."""
         value = getattr(self, name)
         inputs = self.D.shape[0]
         is_sequence = isinstance(value, tuple | list) or np.ndim(value) > 0

@@ -37,7 +37,8 @@ _PATIENCE = 15
 _SLOW = 1e-3
 # Predicted gain of a step, in the logarithm, that is not worth taking: a hundredth of the digits that count.
 _LEAST_GAIN = 1e-7
-# Rows this far below the worst, in the logarithm, are left out of a step: they cannot become it within one.
+# Rows this far below the worst, in the logarithm (a twelfth of it), are left out of a step: they cannot
+# become it within one. Chosen.
 _FAR_BELOW = 2.5
 # A step that gains less than this share of what it promised is corrected to second order: the share below
 # which the box shrinks.

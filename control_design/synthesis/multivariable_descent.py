@@ -60,7 +60,8 @@ _REACH = 0.5
 # Box of a scaling log t, over that of the parameters: scalings follow the controller freely. Doubled: 2 and
 # 5 %.
 _SCALING_BOX = 3.0
-# Rounds of adding directions u to the programme of a step. Doubled: nothing.
+# Programmes that are solved for a step at most, each with the directions u that the one before lacked.
+# Doubled: nothing.
 _CUTS = 4
 # Share of the predicted fall by which the largest eigenvalue may exceed the programme's level; beyond it, a
 # direction is added. Doubled: 6 and 2 %.

@@ -37,7 +37,8 @@ _BOUNDARY = 40
 # Newton steps from the vertex of the parabola to the worst member. With two, the worst case agrees with the
 # exact geometry to 1e-3 or better (tests of the descent).
 _REFINEMENTS = 2
-# Bend along a boundary, or share of the largest multiplier, below which it bends no row: rounding.
+# Second derivative of a row along its boundary (by the angle) above minus which it is no maximum, and share
+# of the largest multiplier up to which a row does not enter the curvature: rounding, in both.
 _NOTHING = 1e-9
 # Rows whose curvature is taken in one call: more are not often active, and a row of multiplier 0 that fills
 # up a call costs as much as another. Decides time only.

@@ -431,7 +431,8 @@ class StartMaker:
         Parameters
         ----------
         radius : callable
-            Largest pole modulus of the nominal loops of a parameter vector (n,); inf for an algebraic loop.
+            Largest pole modulus in z of the nominal loops of a parameter vector (n,); inf for an algebraic
+            loop.
         most : int
             Parameter vectors that are returned at most, at least 1; no more are led on once so many are
             stable.
