@@ -149,10 +149,13 @@ def c_source(controller: Controller, prefix: str = "controller", number: Number 
         suffix = "f"
 
     def literal(value: float) -> str:
-        """Shortest decimal that reads back as the same number of the C type; one too large for it
-        becomes no number of C, which `law_in` has refused but for a law without states."""
+        """Shortest decimal that reads back as the same number of the C type; ValueError for one that is too
+        large for it."""
         with np.errstate(over="ignore", under="ignore"):
-            text = str(number_type(value))
+            rounded = number_type(value)
+        if not np.isfinite(rounded):
+            raise ValueError(f"coefficient {value:.6g} does not fit in a C {number}; use number = 'double'")
+        text = str(rounded)
         # A C literal without point and exponent would be an integer.
         if not any(mark in text for mark in ".e"):
             text += ".0"

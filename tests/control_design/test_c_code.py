@@ -263,6 +263,7 @@ _HUGE = Controller([[0.5]], [[1e-30]], [[1e45]], [[0.0]], 0.01)
         (_CLOSE, {"number": "float"}, "use number = 'double'"),
         (_HUGE, {"number": "float"}, "use number = 'double'"),
         (replace(_P, input_limit=1e-50), {"number": "float"}, "input_limit = 1e-50 does not fit"),
+        (Controller.proportional(1e40, 0.01), {"number": "float"}, r"1e\+40 .*double"),
     ],
 )
 def test_code_that_would_not_be_the_law_is_refused(law, options, message):
