@@ -106,7 +106,7 @@ def test_two_modes_at_one_place_keep_a_free_residue():
     assert len(result.model.state_space()[0]) == one.nstates + 2
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(14, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("runs", [2, pytest.param(14, marks=pytest.mark.long)])
 def test_balls_hold_the_response_as_often_as_they_say(runs):
     """60 frequencies of one record are not independent, so the bounds are wide: the lower one is two standard
     deviations of the mean of the shares, .12 or so each."""
