@@ -45,6 +45,7 @@ def plain(name, delay):
     return answer(name, (1.0, 1.0, 1.0), delay)
 
 
+# Input, output and time together every day; each by itself says which of them it is.
 ALL = (1e-6, 1e6, 1e-3)
 ONE = [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6)]
 
@@ -54,7 +55,7 @@ ONE = [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6)]
     [
         *((name, 0, ALL) for name in OPTIONS),
         ("white", 12, ALL),
-        *(pytest.param("white", 0, scales, marks=pytest.mark.slow) for scales in ONE),
+        *(pytest.param("white", 0, scales, marks=pytest.mark.long) for scales in ONE),
     ],
 )
 def test_units_change_nothing(name, delay, scales):
