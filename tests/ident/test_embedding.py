@@ -56,31 +56,40 @@ def test_tangent_covers_and_classical_does_not():
     assert per_band(classical_hits).min() < 0.6
 
 
+# Measured; with half of the prior on "nothing is left out" the shares are .77, .87 and .90.
+DAMPED = {
+    "near the pole": (0.5 * np.exp(1.2j), 0.91),
+    "near the Nyquist frequency": (0.45 * np.exp(2.8j), 0.96),
+    "between them": (0.56 * np.exp(2.1j), 0.93),
+}
+FURTHER = {"between them": pytest.mark.long}
+
+
 @pytest.mark.slow
-def test_a_damped_mode_that_nobody_asked_for_is_inside():
-    """Too weak to be seen: 20 noise variances of energy, of 32 that an order selection asks for. The last one
-    stands near the Nyquist frequency, where a slow kernel has least."""
+@pytest.mark.parametrize(
+    ("hidden", "measured"),
+    [pytest.param(*DAMPED[place], id=place, marks=FURTHER.get(place, ())) for place in DAMPED],
+)
+def test_a_damped_mode_that_nobody_asked_for_is_inside(hidden, measured):
+    """Too weak to be seen: 20 noise variances of energy, of 32 that an order selection asks for. A slow
+    kernel has least near the Nyquist frequency."""
     slow, numerator, n = 0.93 * np.exp(0.25j), [0, 0.02, 0.015], 3000
     known = np.poly([slow, np.conj(slow)]).real
     omega = np.linspace(0.05, 0.95, 24) * np.pi / DT
     z = np.exp(1j * omega * DT)
-    given, shares = EmbeddingOptions(order_given=True), []
-    for hidden in (0.5 * np.exp(1.2j), 0.56 * np.exp(2.1j), 0.45 * np.exp(2.8j)):
-        unknown, hits = np.poly([hidden, np.conj(hidden)]).real, []
-        for seed in range(12):
-            rng = np.random.default_rng(seed)
-            u = signal.lfilter([0.3], [1, -0.7], rng.standard_normal(n))
-            more = signal.lfilter([0, 1], unknown, u)
-            size = 0.05 * np.sqrt(20 / np.sum(more**2))
-            y = signal.lfilter(numerator, known, u) + size * more + 0.05 * rng.standard_normal(n)
-            truth = np.polyval(numerator, z) / np.polyval(known, z) + size * z / np.polyval(unknown, z)
-            model = GobfModel(Poles(np.zeros(0), np.array([slow])), np.zeros(2), DT)
-            found = tangent([Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], model, given)
-            hits.append(found.at(omega).contains(truth))
-        shares.append(np.mean(hits))
-    # 91, 93 and 96 % measured; 77, 87 and 90 where half of the prior says that nothing is left out.
-    assert min(shares) > 0.86
-    assert np.mean(shares) > 0.9
+    order_given, hits = EmbeddingOptions(order_given=True), []
+    unknown = np.poly([hidden, np.conj(hidden)]).real
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        u = signal.lfilter([0.3], [1, -0.7], rng.standard_normal(n))
+        unseen = signal.lfilter([0, 1], unknown, u)
+        size = 0.05 * np.sqrt(20 / np.sum(unseen**2))
+        y = signal.lfilter(numerator, known, u) + size * unseen + 0.05 * rng.standard_normal(n)
+        truth = np.polyval(numerator, z) / np.polyval(known, z) + size * z / np.polyval(unknown, z)
+        model = GobfModel(Poles(np.zeros(0), np.array([slow])), np.zeros(2), DT)
+        ellipses = tangent([Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], model, order_given)
+        hits.append(ellipses.at(omega).contains(truth))
+    assert np.mean(hits) > measured - 0.03
 
 
 @pytest.mark.parametrize("share", [0.0, 0.04])
@@ -276,7 +285,7 @@ def test_autoregression_is_stable_even_for_a_growing_signal():
 
 
 @pytest.mark.parametrize(
-    "runs", [pytest.param(8, marks=pytest.mark.slow), pytest.param(64, marks=pytest.mark.long)]
+    "runs", [pytest.param(4, marks=pytest.mark.slow), pytest.param(64, marks=pytest.mark.long)]
 )
 def test_coverage_with_poles_from_the_same_data(runs):
     hits, classical_hits = [], []
