@@ -183,10 +183,11 @@ def test_a_stated_pole_gives_the_true_response_in_a_loop():
     assert stable.noise_std > 10 * found.noise_std
 
 
-def test_ellipses_hold_truth_though_the_stated_pole_is_a_little_off():
-    """Its error is a column of the fit: 40 runs, the pole off by more than its own standard deviation."""
+@pytest.mark.parametrize("runs", [12, pytest.param(40, marks=pytest.mark.long)])
+def test_ellipses_hold_truth_though_the_stated_pole_is_a_little_off(runs):
+    """Its error is a column of the fit; the pole is off by more than its own standard deviation."""
     held, intervals = [], []
-    for seed in range(40):
+    for seed in range(runs):
         off = OUTSIDE * (1 + 2e-5 * np.cos(seed))
         stated = options(unstable_poles=((off, 0.0),))
         record = pendulum(100 + seed, n=1500)
@@ -197,8 +198,10 @@ def test_ellipses_hold_truth_though_the_stated_pole_is_a_little_off():
         intervals.append(abs(1 / off + change - 1 / OUTSIDE) < 1.96 * spread)
         nominal = nominal_near(posterior, Poles([posterior.poles.real[0], 1 / off]), OMEGA)
         assert nominal.unstable_poles == pytest.approx([off])
+    # A run's response moves together, as a few independent frequencies. Intervals: two standard deviations of
+    # a binomial of 95 %, and one.
     assert 0.9 <= np.mean(held) <= 0.99
-    assert np.sum(intervals) >= 36
+    assert np.sum(intervals) >= 0.95 * runs - 2 * np.sqrt(0.95 * 0.05 * runs) - 1
 
 
 LOOPS = {
@@ -209,7 +212,7 @@ LOOPS = {
 }
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(10, marks=pytest.mark.long)])
+@pytest.mark.parametrize("runs", [1, pytest.param(10, marks=pytest.mark.long)])
 @pytest.mark.parametrize("case", LOOPS)
 def test_the_pendulum_s_pole_is_found(case, runs):
     found = [find_unstable([pendulum(seed, **LOOPS[case])]) for seed in range(runs)]
