@@ -55,7 +55,7 @@ def test_json_keeps_every_bit(model):
     assert same(model, ModelFile.from_json(ModelFile(model).to_json()).model)
 
 
-@settings(max_examples=4)  # each is read by a process of its own
+@settings(max_examples=2)  # each is read by a process of its own
 @given(model=models())
 def test_mat_keeps_every_bit(model):
     assert same(model, ModelFile.from_mat(ModelFile(model).to_mat()).model)

@@ -67,7 +67,7 @@ def test_intervals_of_p2_hold_the_truth_and_say_which_mode_is_known_best():
 
 
 @pytest.mark.parametrize(
-    "runs", [pytest.param(6, marks=pytest.mark.slow), pytest.param(34, marks=pytest.mark.long)]
+    "runs", [pytest.param(4, marks=pytest.mark.slow), pytest.param(34, marks=pytest.mark.long)]
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(runs):
     hits = []

@@ -319,7 +319,7 @@ def test_independent_inputs_are_not_called_alike(seed):
 def test_two_link_example(tmp_path):
     from examples import two_link_arm  # here: it draws
 
-    result, truth, bands = two_link_arm.run(n_samples=5000)
+    result, truth, bands = two_link_arm.run(n_samples=3000)
     # One integrator (its pole at z = 0 is counted), two real poles and the modes.
     assert result.model.poles.real.size == 3
     found = result.model.poles.omega_rad_s(two_link_arm.DT_S)
