@@ -14,7 +14,9 @@ def _rig() -> Rig:
 
 # Long held samples keep the number of solver restarts small; the stepper subdivides them all the same.
 DT_S = 0.04
-VOLTAGE = np.array([0, 3, 3, -4, 2, -1, 5, 5, -2, 0, 0, 1], dtype=float)
+VOLTAGE = np.array([0, 3, 3, -4, 2, -1], dtype=float)
+# Drag bends where the arm turns round: a motion several times as large leaves its error a smaller share.
+LONGER = np.array([0, 3, 3, -4, 2, -1, 5, 5, -2, 0, 0, 1], dtype=float)
 
 SMOOTH = {
     "nominal": ({}, []),
@@ -41,14 +43,14 @@ SMOOTH = {
 }
 
 
-def _compare(options, effects, delay=0.0, **inputs):
+def _compare(options, effects, delay=0.0, voltage=VOLTAGE, **inputs):
     """Largest error over the outputs, relative to the RMS of each."""
     rig = _rig()
-    expected = RitzArm(rig, **options).records(VOLTAGE, DT_S, delay, **inputs)
+    expected = RitzArm(rig, **options).records(voltage, DT_S, delay, **inputs)
     if inputs:
         inputs = {"hub_torque_Nm": inputs["hub_torque"], "tip_force_N": inputs["tip_force"]}
     # 16 modes: here the truncation of the modal model, not the integration, must not decide.
-    got = simulate(rig, VOLTAGE, effects, dt_s=DT_S, n_modes=16, **inputs)
+    got = simulate(rig, voltage, effects, dt_s=DT_S, n_modes=16, **inputs)
     measured = np.column_stack([got.hub_angle_rad, got.tip_true_m, got.tip_m])
     return np.max(np.abs(measured - expected) / np.sqrt(np.mean(expected**2, axis=0)))
 
@@ -61,7 +63,7 @@ def test_smooth_effects_agree_with_an_independent_arm_to_a_millionth(name):
 
 def test_a_drag_that_no_configuration_has_agrees_with_an_independent_arm():
     drag = LOOK_ALIKES["quadratic_drag"](coefficient_Nms2=0.2)
-    assert _compare({"drag": 0.2}, (drag,)) < 1e-6
+    assert _compare({"drag": 0.2}, (drag,), voltage=LONGER) < 1e-6
 
 
 def test_effects_together_agree_with_an_independent_arm():

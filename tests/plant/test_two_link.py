@@ -35,7 +35,7 @@ def test_without_losses_the_shoulder_keeps_its_angular_momentum():
     x = np.concatenate([[0.3, 0.9], np.zeros(n - 2), [0.5, -2.0], 0.2 * rng.standard_normal(n - 2)])
     sample = arm.sampled(1e-4)
     momenta = []
-    for _ in range(400):
+    for _ in range(150):
         momenta.append(_momentum(arm, x))
         x = np.asarray(sample(x, np.zeros(2)).full())[:, 0]
     assert abs(x[1] - 0.9) > 0.02  # it has moved
