@@ -90,7 +90,7 @@ def test_the_modal_form_of_a_controller_is_that_controller():
     assert np.min(np.abs(np.linalg.eigvals(form.continuous(mirrored)[0]) - (-0.5 + 9j))) < 1e-6
 
 
-@pytest.mark.parametrize("scaling", [0.03, 0.3])
+@pytest.mark.parametrize("scaling", [0.03, pytest.param(0.3, marks=pytest.mark.long)])
 def test_central_controllers_reach_their_norm_and_no_smaller_one_is_found(scaling):
     """Against the closed loop's largest singular value; reduced to all its states, K is itself."""
     P = weighted_plant(plant_t(), specification_t(6), scaling, 6.0, 1e-5)
@@ -109,11 +109,11 @@ def test_central_controllers_reach_their_norm_and_no_smaller_one_is_found(scalin
 
 @pytest.mark.slow
 def test_the_same_design_every_time():
-    second = synthesise_multivariable(plant_t(), specification_t(4), QUICK)
-    np.testing.assert_array_equal(designed().controller.A, second.controller.A)
+    first, second = (synthesise_multivariable(plant_t(), specification_t(4), LEAST) for _ in range(2))
+    np.testing.assert_array_equal(first.controller.A, second.controller.A)
 
 
-_TRIANGLE = pytest.param(((True, True), (False, True)), marks=pytest.mark.slow)
+_TRIANGLE = pytest.param(((True, True), (False, True)), marks=pytest.mark.long)
 
 
 @pytest.mark.parametrize("structure", ["full", "decentralised", _TRIANGLE])

@@ -25,7 +25,9 @@ from workflow.engine import codec
 
 from .plants import RelativeDisc, hub_arm, tip_acceleration, uncertain_hub
 
-_QUICK = SynthesisOptions(starts=2, exchange_rounds=1, dense_points=2000, sufficient_gamma=0.97)
+_QUICK = SynthesisOptions(
+    starts=2, grid_points=60, mode_points=30, exchange_rounds=1, dense_points=1500, sufficient_gamma=0.97
+)
 
 
 def _certified(plants, specification, options, seed):
@@ -79,7 +81,7 @@ def integrating_arm(integrators):
     return plant, *_certified([plant], specification, options, 2)
 
 
-@pytest.mark.parametrize("integrators", [1, 2])
+@pytest.mark.parametrize("integrators", [2, pytest.param(1, marks=pytest.mark.long)])
 def test_integrating_arms_with_integral_action_are_certified(integrators):
     _, result, certificate = integrating_arm(integrators)
     assert certificate.certified, certificate.items
@@ -87,7 +89,7 @@ def test_integrating_arms_with_integral_action_are_certified(integrators):
     assert result.controller.input_limit == 10.0
 
 
-@pytest.mark.parametrize("integrators", [1, 2])
+@pytest.mark.parametrize("integrators", [2, pytest.param(1, marks=pytest.mark.long)])
 def test_integral_action_beside_an_integrator_is_not_slow(integrators):
     """Asked for by a fifth of the corner; a tenth of it is slow. The light modes of the arm, at 12 and
     16 rad/s, are of another requirement: integral action leaves its poles below the corner."""
@@ -128,7 +130,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     specification = Specification(
         bandwidth_rad_s=3.9, modulus_margin=0.5, controller_order=2, computational_delay_samples=0
     )
-    options = SynthesisOptions(starts=1, exchange_rounds=0, dense_points=2000)
+    options = SynthesisOptions(starts=1, grid_points=60, mode_points=30, exchange_rounds=0, dense_points=2000)
     result, certificate = _certified([plant], specification, options, 1)
     assert result.outcome is Outcome.NOT_MET
     assert result.gamma > 1.2
@@ -140,7 +142,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
     assert not certificate.certified
 
 
-_FRUITLESS = SynthesisOptions(starts=1, exchange_rounds=0)
+_FRUITLESS = SynthesisOptions(starts=1, grid_points=60, mode_points=0, dense_points=1500, exchange_rounds=0)
 
 
 def test_without_a_stable_design_the_unstable_pole_is_named():
@@ -206,7 +208,9 @@ def test_a_controller_has_no_resonance_between_the_points_of_a_measured_response
     own = np.geomspace(0.5, 200.0, 60)
     measured = UncertainPlant("frf", system, RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
     wish = Specification(modulus_margin=0.4, bandwidth_rad_s=2.0, controller_order=4)
-    quick = SynthesisOptions(starts=1, sufficient_gamma=0.0, exchange_rounds=1, dense_points=800)
+    quick = SynthesisOptions(
+        starts=1, sufficient_gamma=0.0, grid_points=60, mode_points=30, exchange_rounds=1, dense_points=800
+    )
     found = synthesise([measured], wish, quick, rng=np.random.default_rng(1))
     h = found.controller.dt_s / 2
     tustin = (found.controller.poles - 1) / (found.controller.poles + 1) / h
@@ -234,7 +238,10 @@ def _plant(numerator: Any, denominator: Any, dt_s: float, delay: int = 0) -> Unc
             id="pendulum",
         ),
         pytest.param(
-            _plant([20], [1, -1.6, 1.0], 0.01), {"modulus_margin": 0.3, "controller_order": 2}, id="two poles"
+            _plant([20], [1, -1.6, 1.0], 0.01),
+            {"modulus_margin": 0.3, "controller_order": 2},
+            id="two poles",
+            marks=pytest.mark.long,
         ),
         pytest.param(
             _plant([2], [1, -2], 0.01, delay=6), {"modulus_margin": 0.3, "controller_order": 1}, id="delay"
@@ -248,6 +255,7 @@ def _plant(numerator: Any, denominator: Any, dt_s: float, delay: int = 0) -> Unc
             _plant([8100], np.polymul([1, 0, -9], [1, 1.2, 900]), 0.01),
             {"modulus_margin": 0.2, "controller_order": 4},
             id="resonance",
+            marks=pytest.mark.long,
         ),
     ],
 )
