@@ -192,7 +192,7 @@ class _Stepper:
 
 
 @needs_compiler
-@pytest.mark.parametrize("count", [30, pytest.param(500, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [12, pytest.param(500, marks=pytest.mark.long)])
 def test_the_code_of_any_controller_is_its_stepper(tmp_path, count):
     """In either precision to the last bit what the law is in that arithmetic; in `double` the stepper, to a
     few times what the stepper's own rounding is, measured by more digits."""

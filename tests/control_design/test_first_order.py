@@ -180,7 +180,7 @@ def test_posterior_expansion_holds_and_has_its_covariance(integrators):
     assert _excess(expansion.groups[0], 2.0 * rows @ posterior.covariance_factor, offsets) <= 1
 
 
-@pytest.mark.parametrize("scenario", ["A", "B", "C"])
+@pytest.mark.parametrize("scenario", ["A", "C", pytest.param("B", marks=pytest.mark.long)])
 def test_link_generators_have_the_links_covariance_and_hold(scenario):
     rng = np.random.default_rng(5)
     intervals = _intervals(rng)

@@ -1,5 +1,7 @@
 """Guards are kept stable; a joint design is stable for the share of draws asked, by poles computed here."""
 
+from functools import cache
+
 import control
 import numpy as np
 import pytest
@@ -64,11 +66,17 @@ def test_a_guard_is_kept_stable_and_costs_no_weight():
     assert certificate.gamma == pytest.approx(guarded.gamma, rel=0.01)
 
 
+@cache
+def _free() -> tuple[control_design.UncertainPlant, control_design.SynthesisResult]:
+    """A lag in ellipses that hold a fifth of its members, and a design for the ellipses alone."""
+    plant = uncertain_lag(0.5, 0.2)
+    return plant, control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
+
+
 @pytest.mark.slow
 def test_joint_design_is_stable_for_the_share_asked():
-    plant = uncertain_lag(0.5, 0.2)
+    plant, free = _free()
     rng = np.random.default_rng(3)
-    free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
     count, guards = unstable_draws(free.controller, [plant], _FAST, rng=rng, draws=1000, most=3)
     assert count > 30  # ellipses at 20 % say little about the whole
     assert 1 <= len(guards) <= 3
@@ -85,8 +93,7 @@ def test_joint_design_is_stable_for_the_share_asked():
 
 
 def test_certificate_asks_for_the_stable_share():
-    plant = uncertain_lag(0.5, 0.2)
-    free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(3))
+    plant, free = _free()
     found = control_design.certify(
         free.controller, [plant], _FAST, joint_coverage=0.5, rng=np.random.default_rng(1)
     )

@@ -43,7 +43,10 @@ def test_fits_are_damped_as_asked_and_not_made_of_notches():
     assert fitted(Cascade(("notch",), 0.005, 15.0), FreeController(_OMEGA, k), least_damping=0.3) is None
 
 
-@pytest.mark.parametrize(("scenario", "youla", "limit"), [("A", 0.926, 0.9374), ("C", 1.2547, 1.3356)])
+@pytest.mark.parametrize(
+    ("scenario", "youla", "limit"),
+    [("A", 0.926, 0.9374), pytest.param("C", 1.2547, 1.3356, marks=pytest.mark.long)],
+)
 def test_the_search_ends_with_few_starts_where_they_come_near_the_bound(scenario, youla, limit):
     """Limits: within .1 % of what 40 starts of two orders reach; youla: bound with the default basis."""
     plant, specification = flexible_link(scenario), flexible_link_specification(5)
