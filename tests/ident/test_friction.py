@@ -75,7 +75,7 @@ def rubbing(torque_Nm: float = 0.1) -> tuple[list[Record], dry.FrictionFit]:
     return records, dry.fit_friction(records, OPTIONS)
 
 
-@pytest.mark.parametrize("torque_Nm", [0.02, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("torque_Nm", [0.02, pytest.param(0.1, marks=pytest.mark.long)])
 def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
     found = dry.fit_friction(recorded(torque_Nm, 5, independent=True), OPTIONS)
     off = found.level - torque_Nm * VOLTS_PER_NM
@@ -85,7 +85,7 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
     assert found.level_std < 0.02 * found.level
 
 
-def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is(monkeypatch) -> None:
+def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is() -> None:
     """Noise of which its past predicts .002: long records tell it from white, as one in some hundred are."""
     records, found = rubbing()
     rng, longer, coloured = np.random.default_rng(4), [], []
@@ -96,8 +96,9 @@ def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is(monkeypatc
         noise[1:, 0] = coloured[-1]
         longer.append(replace(driven, output=found.motion(driven)[0][:, None] + noise))
     assert not whiteness_test(coloured).passed
-    monkeypatch.setattr("ident.friction.fit.fit_friction_in_loop", lambda *_, **__: pytest.fail("observed"))
-    assert dry.fit_friction(longer, OPTIONS).level == pytest.approx(found.level, rel=0.02)
+    fit = dry.fit_friction(longer, OPTIONS)
+    assert not fit.observed
+    assert fit.level == pytest.approx(found.level, rel=0.02)
 
 
 @pytest.mark.slow
@@ -125,18 +126,18 @@ def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
 def test_friction_that_falls_with_speed_is_told_from_coulomb_friction() -> None:
     """All four numbers of the law, each inside four of its standard deviations."""
     rng = np.random.default_rng(1)
-    wanted = {"static_torque_Nm": 0.1, "coulomb_torque_Nm": 0.05, "stribeck_velocity_rad_s": 0.05}
+    wanted = {"static_torque_Nm": 0.15, "coulomb_torque_Nm": 0.05, "stribeck_velocity_rad_s": 0.05}
     effect = parse_effect({"name": "stribeck_friction", **wanted})
     lines = multisine_lines(1000, RIG.sampling.dt_s, (0.2, 60.0), "odd")
-    voltages = (multisine(lines, 1000, rms, rng, periods=2) for rms in (2.0, 4.0, 7.0))
+    voltages = (multisine(lines, 1000, rms, rng) for rms in (1.5, 3.0, 6.0))
     records = [rubbed(f"{k}", voltage, effect, rng) for k, voltage in enumerate(voltages)]
     found = dry.fit_friction(records, OPTIONS)
-    truth = np.array([0.05 * VOLTS_PER_NM, np.log(1e-5), 0.05 * VOLTS_PER_NM, np.log(0.05)])
+    truth = np.array([0.05 * VOLTS_PER_NM, np.log(1e-5), 0.1 * VOLTS_PER_NM, np.log(0.05)])
     law = found.law
     off = np.array([law.level, np.log(law.presliding), law.excess, np.log(law.fall)]) - truth
     std = np.linalg.norm(found.covariance_factor[found.coefficients.size :][:4], axis=1)
     assert np.all(np.abs(off) < 4 * std)
-    assert np.all(std < [0.02 * truth[0], 1.0, 0.3 * truth[2], 0.3])
+    assert np.all(std < [0.02 * truth[0], 1.0, 0.15 * truth[2], 0.2])
 
 
 @pytest.mark.parametrize("torque_Nm", [0.02, 0.1])
@@ -209,8 +210,7 @@ def test_stepped_between_the_samples_without_friction_is_the_discrete_model(
 
 def test_held_friction_moves_the_arm_as_far_as_the_one_that_turns_within_a_sample() -> None:
     """To four millionths of a motion of 1 rad."""
-    records = recorded(0.1, 1)
-    found = dry.fit_friction(records, OPTIONS)
+    records, found = rubbing()
     arm = GobfModel(found.arm.poles.doubled(), found.coefficients, records[0].dt_s, integrators=1)
     for record in records:
         position, friction = found.motion(record)
@@ -410,14 +410,14 @@ def test_a_shaft_that_the_records_do_not_show_is_refused() -> None:
     dry.refuse_unseen_shaft(found, records)
     steps = np.ptp(records[0].output) / 8
     coarse = [replace(record, output=steps * np.round(record.output / steps)) for record in records]
-    with pytest.raises(ValueError, match=r"takes 9 different values only.*response = 'as recorded'"):
+    with pytest.raises(ValueError, match=r"'y'\D+9 .*response = 'as recorded'"):
         dry.refuse_unseen_shaft(found, coarse)
     one = records[0]
     stuck = [replace(one, input=one.input / 1000, output=one.output - found.motion(one)[0][:, None])]
-    with pytest.raises(ValueError, match="is lost in its noise"):
+    with pytest.raises(ValueError, match=r"'y' \(rms .*noise"):
         dry.refuse_unseen_shaft(dry.fit_friction(stuck, OPTIONS), stuck)
-    tip = recorded(0.1, 5, output=1)[:1]
-    with pytest.raises(ValueError, match=r"'y' is no position of the driven shaft, or .* degrees"):
+    tip = [recorded(0.1, 5, output=1)[0].slice(0, 400)]
+    with pytest.raises(ValueError, match=r"'y'.* degrees"):
         dry.refuse_unseen_shaft(dry.fit_friction(tip, OPTIONS), tip)
 
 
@@ -429,14 +429,16 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     inertia, viscous, none = np.array([7.8e-5, 7.1e-5]), np.array([2.5e-4, 0]), np.zeros(3)
     plant = Plant(inertia, viscous, none[:2], spring, friction, none, 0.02, 0, 1.0, 1e-3, 0, 1e-5, np.inf)
     through = Law(np.zeros((1, 1)), np.zeros((1, 2)), none[:1], np.array([1.0, 0.0]), none[:1])
-    phases, turn = np.random.default_rng(1).uniform(0, 2 * np.pi, 299), 2 * np.pi * np.arange(3000) / 3000
-    volts = 0.245 * np.cos(np.outer(turn, np.arange(1, 300)) + phases).sum(axis=1)
+    phases, turn = np.random.default_rng(1).uniform(0, 2 * np.pi, 99), 2 * np.pi * np.arange(1000) / 1000
+    volts = 0.424 * np.cos(np.outer(turn, np.arange(1, 100)) + phases).sum(axis=1)
     angle = plant.run(through, volts, 0.0, np.zeros(volts.size))["y"]
     record = Record("log", volts[:, None], angle[:, None], 1e-3, ("motor_V",), ("angle_rad",))
     found = dry.fit_friction([record], IdentOptions(integrators=1))
     assert found.observed
     assert found.law.level == pytest.approx(2.9e-3 / 0.02, rel=0.05)
     assert found.beyond == pytest.approx(1.3e-3 / 0.02, rel=0.05)
+    assert found.spring is not None
+    assert found.spring.compliance == pytest.approx(0.02 / 6.5, rel=0.05)
     omega, behind = np.geomspace(2 * np.pi, 200 * np.pi, 100), dry.without_friction([record], found)
     truth = response(*plant.sampled(), omega, 1e-3)
     assert np.mean(behind.response.at(omega, 0.95).contains(truth)) >= 0.93
