@@ -11,6 +11,8 @@ from control_design.synthesis.bandwidth import synthesise_widest
 
 _DT = 0.01
 _EFFORT = SynthesisOptions(starts=2, grid_points=80, dense_points=2000)
+# An inertia has neither modes nor ellipses: few frequencies hold its loop.
+_FEW = SynthesisOptions(starts=1, grid_points=40, mode_points=0, dense_points=800)
 
 
 def _inertia(delay_samples: int = 0) -> UncertainPlant:
@@ -27,19 +29,20 @@ def _asked(**change) -> Specification:
 @pytest.mark.slow
 def test_the_highest_bandwidth_that_is_met_is_taken():
     rng = np.random.default_rng(1)
-    found = {}
+    highest_rad_s = {}
     for delay in (2, 10):
         plant = _inertia(delay)
-        used, result = synthesise_widest([plant], _asked(), _EFFORT, rng=rng)
+        asked = _asked(bandwidth_rad_s=8.0, lowest_bandwidth_rad_s=1.2, controller_order=2)
+        used, result = synthesise_widest([plant], asked, _FEW, rng=rng)
         assert result.gamma <= 1.0
         assert used.lowest_bandwidth_rad_s is None
-        assert 0.5 <= used.bandwidth_rad_s < 40.0
+        assert 1.2 <= used.bandwidth_rad_s < 8.0
         wider = used.model_copy(update={"bandwidth_rad_s": 1.8 * used.bandwidth_rad_s})
         with suppress(SpecificationError):  # where the delay alone forbids it
-            assert synthesise([plant], wider, _EFFORT, rng=np.random.default_rng(2)).gamma > 1.0
-        found[delay] = used.bandwidth_rad_s
+            assert synthesise([plant], wider, _FEW, rng=np.random.default_rng(2)).gamma > 1.0
+        highest_rad_s[delay] = used.bandwidth_rad_s
     # What a dead time leaves is in proportion to it.
-    assert 2 < found[2] / found[10] < 6
+    assert 2 < highest_rad_s[2] / highest_rad_s[10] < 6
 
 
 def test_a_bandwidth_that_is_met_stays():
@@ -51,10 +54,9 @@ def test_a_bandwidth_that_is_met_stays():
 def test_nothing_is_lowered_unless_it_is_asked_for():
     asked = _asked(lowest_bandwidth_rad_s=None, bandwidth_rad_s=6.0, controller_order=1)
     plant = _inertia(20)
-    few = SynthesisOptions(starts=1, grid_points=40, mode_points=0, dense_points=800)
-    used, result = synthesise_widest([plant], asked, few, rng=np.random.default_rng(1))
+    used, result = synthesise_widest([plant], asked, _FEW, rng=np.random.default_rng(1))
     assert used == asked
-    assert result.gamma == synthesise([plant], asked, few, rng=np.random.default_rng(1)).gamma
+    assert result.gamma == synthesise([plant], asked, _FEW, rng=np.random.default_rng(1)).gamma
 
 
 def test_where_none_is_met_the_lowest_is_designed_for():

@@ -1,5 +1,7 @@
 """The certificate: honest about instability, exact against sampled plants, clear about its limits."""
 
+from functools import cache
+
 import control
 import numpy as np
 import pytest
@@ -89,16 +91,21 @@ def test_damping_number_is_the_sampled_worst_case_of_the_measured_output():
     assert worst >= item.achieved * 0.999
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1.5, 4.0])
+@pytest.mark.parametrize("ratio", [1.0, 4.0, pytest.param(1.5, marks=pytest.mark.long)])
 def test_a_mode_may_be_raised_by_as_much_as_is_allowed(ratio):
     """The weighted peak falls as the allowance grows: |Gp S| itself does not depend on it."""
-    plant = uncertain_hub(0.05)
-    found = {}
-    for asked in (0.5, ratio):
-        certificate = certify(gain(0.3), [plant], Specification(mode_peak_ratio=asked))
-        (found[asked],) = [i for i in certificate.items if i.requirement.startswith("damping")]
-    assert found[ratio].achieved * ratio == pytest.approx(0.5 * found[0.5].achieved, rel=1e-6)
-    assert found[ratio].met == (found[ratio].achieved <= 1)
+    raised = damping_of_a_mode(ratio)
+    assert raised.achieved * ratio == pytest.approx(0.5 * damping_of_a_mode(0.5).achieved, rel=1e-6)
+    assert raised.met == (raised.achieved <= 1)
+
+
+@cache
+def damping_of_a_mode(asked_ratio):
+    """What a certificate says of the mode of a hub whose peak may be raised by a ratio."""
+    specification = Specification(mode_peak_ratio=asked_ratio)
+    certificate = certify(gain(0.3), [uncertain_hub(0.05)], specification)
+    (item,) = [item for item in certificate.items if item.requirement.startswith("damping")]
+    return item
 
 
 def test_uncertainty_on_its_own_grid_is_named():
