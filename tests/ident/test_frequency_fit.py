@@ -244,7 +244,7 @@ BENCH_LAW = control.tf([4.0, -3.9], [1.0, -1.0], BENCH_DT_S)
         pytest.param((3.0, 200.0), (2.0, 400.0), 90, 0.008, marks=pytest.mark.long),
         pytest.param((6.0, 150.0), (2.0, 600.0), 90, 0.008, marks=pytest.mark.long),
         ((6.0, 150.0), (20.0, 400.0), 40, 0.008),
-        ((6.0, 150.0), (2.0, 400.0), 12, 0.008),
+        pytest.param((6.0, 150.0), (2.0, 400.0), 12, 0.008, marks=pytest.mark.long),
         ((6.0, 1e6), (2.0, 400.0), 40, 0.008),
     ],
     ids=["one sweep", "precise", "other lags", "further", "no slow points", "few points", "one lag"],
