@@ -50,7 +50,7 @@ def test_hub_torque_reaches_the_second_input():
     still = Controller.proportional(0.0, _DT)
     got = simulate(still, LinearMachine(two), np.zeros(200), hub_torque_Nm=torque).measured
     np.testing.assert_allclose(got, control.forced_response(g, inputs=2 * torque).outputs, rtol=0, atol=1e-12)
-    with pytest.raises(ValueError, match="needs a second one"):
+    with pytest.raises(ValueError, match="torque"):
         simulate(still, LinearMachine(g), np.zeros(200), hub_torque_Nm=torque)
 
 
@@ -97,15 +97,15 @@ def test_whole_loop_compiled_is_the_stepped_one():
 
 def test_bad_signals_are_refused():
     controller, machine = _controller(), LinearMachine(hub_arm())
-    with pytest.raises(ValueError, match="not finite at sample 1"):
+    with pytest.raises(ValueError, match="sample 1"):
         simulate(controller, machine, [0.0, np.nan])
-    with pytest.raises(ValueError, match="input_disturbance must be"):
+    with pytest.raises(ValueError, match="input_disturbance"):
         simulate(controller, machine, np.ones(3), input_disturbance=np.ones(2))
-    with pytest.raises(ValueError, match="differ in dt_s"):
+    with pytest.raises(ValueError, match=r"dt_s: 0\.005 and 0\.01"):
         simulate(controller, LinearMachine(hub_arm(0.01)), np.ones(3))
-    with pytest.raises(ValueError, match="1 outputs and 1 inputs only"):
+    with pytest.raises(ValueError, match="1 outputs and 1 inputs"):
         simulate(controller, machine, np.ones(3), measured_index=1)
-    with pytest.raises(ValueError, match="needs D = 0"):
+    with pytest.raises(ValueError, match="D = 0"):
         LinearMachine(control.ss(0.5, 1, 1, 1, 0.1))
 
 
@@ -137,7 +137,7 @@ def test_step_metrics_of_a_known_second_order_response():
 
 def test_step_metrics_refuse_what_is_no_step():
     trajectory = simulate(_controller(), LinearMachine(hub_arm()), np.sin(np.arange(50)))
-    with pytest.raises(ValueError, match="steps once"):
+    with pytest.raises(ValueError, match="reference"):
         step_metrics(trajectory)
 
 
@@ -187,9 +187,9 @@ def test_scatter_of_measured_sensitivity_is_stated_rightly(periods, draws):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"periods": 1}, "two periods or two draws"),
-        ({"rms": 0.0}, "rms must be positive"),
-        ({"band_rad_s": (1e-5, 1e-4)}, "no line of 200 samples"),
+        ({"periods": 1}, "1 and 1"),
+        ({"rms": 0.0}, r"rms\D+0\.0"),
+        ({"band_rad_s": (1e-5, 1e-4)}, "200 samples"),
     ],
 )
 def test_sensitivity_that_cannot_be_measured_is_refused(changes, words):

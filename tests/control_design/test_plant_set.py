@@ -28,7 +28,7 @@ def test_integrators_are_counted_from_the_nominal(integrators):
     assert plant.unstable_poles == 0
     assert [round(m.omega_rad_s, 6) for m in plant.modes] == [16.0]
     assert plant.modes[0].zeta == pytest.approx(0.015, rel=1e-6)
-    with pytest.raises(ValueError, match=f"0 integrators declared, the nominal has {integrators} poles"):
+    with pytest.raises(ValueError, match=rf"0\D+{integrators} poles"):
         UncertainPlant("arm", hub_arm(integrators=integrators), integrators=0)
 
 
@@ -66,14 +66,14 @@ def test_uncertainty_on_its_own_grid_is_refused_elsewhere_and_nominal_outside():
     np.testing.assert_array_equal(plant.own_grid, own)
     assert np.all(plant.at(own).semi_major > 0)
     assert np.all(plant.at(np.array([0.5, 10.0])).semi_major == 0)
-    with pytest.raises(ValueError, match=r"own grid only; 3 rad/s is not on it"):
+    with pytest.raises(ValueError, match="3 rad/s"):
         plant.at(np.array([1.0, 3.0]))
 
 
 @pytest.mark.parametrize(
     ("system", "message"),
     [
-        (control.ss(-1, 1, 1, 0), "sampling time in seconds"),
+        (control.ss(-1, 1, 1, 0), "dt = 0"),
         (control.tf([1], [1, 0.5], 0.1), "control.StateSpace"),
         (control.ss(0.5 * np.eye(2), np.eye(2), np.eye(2), 0, 0.1), "one input and one output"),
         (control.ss([[0, 1], [-1, 0]], [[0], [1]], [[1, 0]], 0, 0.1), "unit circle away from z = 1"),
@@ -85,13 +85,13 @@ def test_plants_that_cannot_be_used_are_refused(system, message):
 
 
 def test_uncertainty_records_are_checked():
-    with pytest.raises(ValueError, match="uncertainty needs a method at"):
+    with pytest.raises(ValueError, match="uncertainty"):
         PlantChannel(hub_arm(), object())  # type: ignore[arg-type]
     record = ResponseRecord(np.array([2.0, 1.0]), np.zeros(2), np.zeros((2, 2, 2)), 0.95)
     with pytest.raises(ValueError, match="ascending"):
         PlantChannel(hub_arm(), record)
     record = ResponseRecord(np.array([1.0, 1000.0]), np.zeros(2), np.zeros((2, 2, 2)), 0.95)
-    with pytest.raises(ValueError, match="Nyquist frequency is 628"):
+    with pytest.raises(ValueError, match="628"):
         PlantChannel(hub_arm(), record)
 
 

@@ -120,7 +120,7 @@ def test_validation_and_residual_tests_leave_the_same_rows_out():
 def test_a_record_no_longer_than_the_delay_is_refused_by_name():
     found, _ = ellipses("motor", 14, measured("motor", 14, 0.0, 4))
     short = measured("motor", 14, 0.0, 5, n=14)
-    with pytest.raises(ValueError, match=r"log.*14 samples, not more than the input delay 14"):
+    with pytest.raises(ValueError, match=r"log\D+14\D+14"):
         fit_on_fresh_data(found.model, short)
 
 

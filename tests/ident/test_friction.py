@@ -398,9 +398,9 @@ def test_modes_narrower_than_the_grid_stay_what_they_are() -> None:
 
 def test_a_stuck_shaft_and_an_output_that_is_no_position_are_refused() -> None:
     record = recorded(0.0, 1)[0]
-    with pytest.raises(ValueError, match="the shaft does not move"):
+    with pytest.raises(ValueError, match="binary"):
         dry.fit_friction([replace(record, output=np.zeros_like(record.output))], OPTIONS)
-    with pytest.raises(ValueError, match="at most one integrator and no direct term"):
+    with pytest.raises(ValueError, match="integrator"):
         dry.fit_friction([record], OPTIONS.model_copy(update={"integrators": 2}))
 
 

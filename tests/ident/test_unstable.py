@@ -110,7 +110,7 @@ def test_an_unstable_pole_without_its_image_and_free_runs_are_refused():
         replace(model(REAL), unstable=PAIR)
     with pytest.raises(ValueError, match="free run"):
         model(REAL).simulate(np.ones(5))
-    with pytest.raises(ValueError, match="inside the unit circle"):
+    with pytest.raises(ValueError, match=r"1\.11111"):
         IdentOptions(unstable_poles=((0.9, 0.0),))
     with pytest.raises(ValueError, match="relative_degree"):
         identify([pendulum(0, 500)], IdentOptions(unstable_poles=((1.1, 0),), relative_degree=2))
@@ -129,7 +129,7 @@ def test_files_keep_every_bit_and_old_ones_are_read(unstable):
     del document["unstable"]
     assert same(given.stable_part, codec.unpack(GobfModel, document, arrays))
     del document["poles"]
-    with pytest.raises(codec.CodecError, match="missing field 'poles'"):
+    with pytest.raises(codec.CodecError, match="'poles'"):
         codec.unpack(GobfModel, document, arrays)
 
 
@@ -277,7 +277,7 @@ def test_repeats_are_combined_with_their_unstable_pole():
     combined = combine_posteriors(each, small_sample_level=0.95)
     assert combined.unstable is found.unstable
     assert combined.at(OMEGA).contains(TRUTH).mean() > 0.9
-    with pytest.raises(ValueError, match="differ in poles"):
+    with pytest.raises(ValueError, match="poles"):
         combine_posteriors([each[0], each[1].stable_part])
 
 
