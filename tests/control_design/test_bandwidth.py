@@ -27,13 +27,14 @@ def _asked(**change) -> Specification:
 
 
 @pytest.mark.slow
-def test_the_highest_bandwidth_that_is_met_is_taken():
-    rng = np.random.default_rng(1)
+@pytest.mark.parametrize("delays", [(10,), pytest.param((2, 10), marks=pytest.mark.long)])
+def test_the_highest_bandwidth_that_is_met_is_taken(delays):
+    """What a dead time leaves is in proportion to it, as two of them show."""
     highest_rad_s = {}
-    for delay in (2, 10):
+    for delay in delays:
         plant = _inertia(delay)
         asked = _asked(bandwidth_rad_s=8.0, lowest_bandwidth_rad_s=1.2, controller_order=2)
-        used, result = synthesise_widest([plant], asked, _FEW, rng=rng)
+        used, result = synthesise_widest([plant], asked, _FEW, rng=np.random.default_rng(1))
         assert result.gamma <= 1.0
         assert used.lowest_bandwidth_rad_s is None
         assert 1.2 <= used.bandwidth_rad_s < 8.0
@@ -41,8 +42,8 @@ def test_the_highest_bandwidth_that_is_met_is_taken():
         with suppress(SpecificationError):  # where the delay alone forbids it
             assert synthesise([plant], wider, _FEW, rng=np.random.default_rng(2)).gamma > 1.0
         highest_rad_s[delay] = used.bandwidth_rad_s
-    # What a dead time leaves is in proportion to it.
-    assert 2 < highest_rad_s[2] / highest_rad_s[10] < 6
+    if len(delays) > 1:
+        assert 2 < highest_rad_s[2] / highest_rad_s[10] < 6
 
 
 def test_a_bandwidth_that_is_met_stays():
