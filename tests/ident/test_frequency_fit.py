@@ -240,7 +240,7 @@ BENCH_LAW = control.tf([4.0, -3.9], [1.0, -1.0], BENCH_DT_S)
     ("lags", "band", "n", "relative"),
     [
         ((6.0, 150.0), (2.0, 400.0), 90, 0.008),
-        ((6.0, 150.0), (2.0, 400.0), 90, 0.0004),
+        pytest.param((6.0, 150.0), (2.0, 400.0), 90, 0.0004, marks=pytest.mark.long),
         pytest.param((3.0, 200.0), (2.0, 400.0), 90, 0.008, marks=pytest.mark.long),
         pytest.param((6.0, 150.0), (2.0, 600.0), 90, 0.008, marks=pytest.mark.long),
         ((6.0, 150.0), (20.0, 400.0), 40, 0.008),
