@@ -27,11 +27,12 @@ from ident.uncertainty.embedding_algebra import nuisance_basis, triangle_of
 # motion is left then. Halved or doubled, the predicted scatter of 72 sweeps stays within the limits of
 # tests/ident/test_conditions.py.
 _TIME_CONSTANTS = 3.0
-# They count together over this share of a record at most: ten stretches are few to take a scatter from.
-# Halved, the predicted scatter of 72 sweeps stays within the limits of tests/ident/test_conditions.py.
+# They count together over this share of a record at most: it leaves ten stretches, and fewer would be too few
+# to take a scatter from. Halved, the predicted scatter of 72 sweeps stays within the limits of
+# tests/ident/test_conditions.py.
 _LONGEST_WINDOW = 0.1
-# Magnitude that the slowest pole is taken to have at least, so that it has a time constant: one of .1 is over
-# within a sample or two, and the window of one row then stays.
+# Magnitude that the slowest pole is taken to have at least, as a pole at zero has no time constant. At .1
+# three time constants are 1.3 samples, so that the window is one row; any smaller number gives the same.
 _FASTEST_POLE = 0.1
 # Repeats of a group from which on one is predicted by the others: a single other has nothing to differ from.
 _FEWEST_REPEATS = 3
@@ -50,9 +51,10 @@ def record_posteriors(
     Parameters
     ----------
     records : sequence of Record
-        One input, one output each, sampled as the model.
+        At least one (else ValueError of `min`); one input, one output each, sampled as the model.
     model : GobfModel
-        Of it the poles and the structure matter: all posteriors have its poles, twice.
+        Of it the poles and the structure (integrators, delay, direct term, unstable poles) matter, not its
+        coefficients: all posteriors have its poles, twice.
     options : EmbeddingOptions, optional
         Averaging over a missed mode is off here, for it would give each record further poles of its own.
 
@@ -64,7 +66,8 @@ def record_posteriors(
     Raises
     ------
     ValueError
-        As `tangent`.
+        By `ident.uncertainty.embedding.tangent`: a record is too short, has another sampling time, several
+        inputs or outputs, or does not excite the poles at all.
     """
     options = options or EmbeddingOptions()
     poles = model.poles.doubled()
@@ -83,17 +86,18 @@ def repeat_posteriors(
     groups : sequence of sequence of Record
         Each group repeats one experiment.
     model, options
-        As `record_posteriors`.
+        Those of `record_posteriors`.
 
     Returns
     -------
     list of list of ResponsePosterior
-        As the groups. Groups of one or two keep the covariance of each record's own residuals.
+        One list per group, one posterior per record, in their order. Groups of one or two keep the
+        covariance of each record's own residuals.
 
     Raises
     ------
     ValueError
-        As `tangent`.
+        By `record_posteriors`, and without any record.
 
     Notes
     -----
@@ -123,7 +127,9 @@ def _predicted_by_others(
 ) -> list[ResponsePosterior]:
     """The posteriors of three or more repeats, each with the covariance of its error as the others show it.
 
-    group and posteriors: one entry per repeat, in the same order. The means stay.
+    group and posteriors: one entry per repeat, in the same order, all posteriors with the same P coefficients
+    and a report. The means stay; the factors are (P, P (n - 1)) of n repeats. That the repeats had the same
+    input is not checked: repeats of unequal length are compared over their last rows.
     """
     # The last rows of all repeats, as many as the shortest has.
     columns: list[RealArray] = []
@@ -172,8 +178,10 @@ def _linear_rows(
 ) -> tuple[RealArray, RealArray]:
     """Columns (T, P) of the posterior's coefficients and the output (T,), whitened, without the nuisance.
 
-    posterior: made from this record by `record_posteriors`; of it the noise model and the order of the
-    coefficients matter: basis functions, kernel, unstable poles.
+    posterior: made from this record by `record_posteriors`; of it matter the noise model (in its report,
+    which has to be there), fir_length, and the order of the coefficients: basis functions and direct term,
+    kernel, unstable poles. T counts the rows behind the delay, less those that the noise model leaves out.
+    Raises ValueError as `tangent_rows`.
     """
     assert posterior.report is not None
     same_length = options.model_copy(update={"fir_length": posterior.fir_length})
@@ -204,13 +212,15 @@ def combine_posteriors(
     Returns
     -------
     ResponsePosterior
-        Its mean is the mean of the K means. Its report is the first one's, with the name of the method, the
-        noise and the rows of all.
+        Its mean is the mean of the K means. Its report is the first one's, with "K conditions" added to the
+        name of the method, the root mean square of the noises and the sum of the rows; None if the first
+        has none.
 
     Raises
     ------
     ValueError
-        If there are too few posteriors, or they do not share what they must.
+        If there are too few posteriors, or they do not share what they must (poles bit by bit, and
+        `_SHARED_FIELDS`). `small_sample_level` outside (0, 1): by `hotelling_widening`.
 
     Notes
     -----

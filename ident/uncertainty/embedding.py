@@ -64,18 +64,26 @@ from ident.uncertainty.undetected_mode import (
 # Taps of the kernel, as far as the records can carry it. Halved or doubled, the median ellipse of twenty
 # simulated arms moved by .1 %; the time grows with it.
 _DEFAULT_FIR_LENGTH = 150
-# Taps of the kernel for a measured frequency response, as far as the frequencies can carry it. Chosen;
-# a measured response has some hundred points, where records have thousands of rows.
+# Taps of the kernel for a measured frequency response, as far as the frequencies can carry it. Chosen below
+# `_DEFAULT_FIR_LENGTH`: a measured response has some hundred points, where records have thousands of rows.
 _FRF_FIR_LENGTH = 60
 # Rows, or frequencies, for each tap: a kernel that is as long as the data are would explain all of them.
 # Chosen; it acts on records of fewer than some 500 rows.
 _ROWS_PER_TAP = 3
-# Slow, alike, near Nyquist: the rest stands anywhere (Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
+# Columns that `common_fir_length` counts for each record, and for the regressors, beyond one per pole: up to
+# two (of the nuisance offset and a polynomial of an integrator; of the regressors the direct term). It is an
+# estimate; the exact count is checked when the regression is reduced.
+_COLUMNS_BEYOND_POLES = 2
+# Kernel shapes for what the poles leave out, by where on the frequency axis it has most power: at low ones,
+# alike at all, near the Nyquist frequency. Together they cover a remainder anywhere (Chen, Ohlsson and Ljung,
+# Automatica 48(8), 2012).
 _SHAPES = (tc_factor, exponential_factor, alternating_factor)
 # Modes that the embedding adds at most: coloured noise hides them from a search that takes it for white. Of
 # twenty simulated arms none asked for a second one; coloured noise that is taken for white asks for four.
 _MOST_ADDED = 5
-# Share of the output that is nothing beside its noise: a deviation of coefficients that is as good as none.
+# Weight of what is known of coefficients, as a share of the output's size, at which it is none beside the
+# records, but still keeps a column that does nothing from having no coefficient. Chosen far below the noise
+# of any log and far above rounding, 1e-16.
 _FREE = 1e-9
 # Rounds of residuals, noise model, whitening: the first is unwhitened, the others remove its bias. Of ten
 # simulated arms in coloured noise ellipses are 16 % too small after one round and 2 % after two, and six
@@ -100,6 +108,7 @@ def tangent(
     model : GobfModel
         Gives poles, integrators and delay; its coefficients do not matter.
     options : EmbeddingOptions, optional
+        Length of the kernel, nuisances, prior probability of a missed mode, whether the noise is coloured.
     noise : NoiseModel, optional
         Known beforehand, so that none is fitted, whatever the options.
 
@@ -121,7 +130,7 @@ class TangentBeside(NamedTuple):
     """Posterior of a response, and of the coefficients of q columns beside its basis functions.
 
     response: on P' unit normals; mean (q,) and factor (q, P') of the coefficients, on the same normals as the
-    response's covariance_factor.
+    response's covariance_factor. q does not count the columns of unstable poles, which are in the response.
     """
 
     response: ResponsePosterior
@@ -145,17 +154,18 @@ def tangent_beside(
     Parameters
     ----------
     records, model, options, noise
-        As `tangent`.
+        Those of `tangent`.
     beside : sequence of Beside
-        One per record, or none.
+        One per record (not checked), or none: columns (T, q) with shared coefficients, and columns (T, p1)
+        that take the place of the first p1 basis functions.
     n_known : int
         The last so many coefficients are independent unknowns of zero mean and unit variance, the others
         free.
     missed_above : float
         Least frequency of a mode that may be missing, radians a sample.
-    classes : sequence of ndarray, shape (T,)
-        Class of each row of each record, by what errors of the model may depend on; where the classes differ
-        the covariance is wider (`sandwiched`). Empty: one class.
+    classes : sequence of ndarray of int, shape (T,)
+        Class 0 .. M - 1, M at least 2, of each row of each record, by what errors of the model may depend on;
+        where the classes differ the covariance is wider (`sandwiched`). Empty: one class.
 
     Returns
     -------
@@ -164,7 +174,8 @@ def tangent_beside(
     Raises
     ------
     ValueError
-        As `tangent`.
+        As `tangent`; also where a record is no longer than twice the first rows of a given noise model, and
+        where `classes` has not one entry per record.
     """
     options = options or EmbeddingOptions()
     n_unstable = model.unstable.order
@@ -241,8 +252,12 @@ def tangent_beside(
 
 
 def _refuse_short(records: Sequence[Record], noise: NoiseModel) -> None:
-    """Raise ValueError, with its name, where a record is over before the noise model knows its past."""
+    """Raise ValueError, with its name, where a record has 2 n_start samples or fewer.
+
+    n_start: rows of a record on which the noise model lacks a past.
+    """
     for record in records:
+        # Twice: at least as many rows with a past as without one.
         if record.n_samples <= 2 * noise.n_start:
             raise ValueError(
                 f"{record.label}: {record.n_samples} samples are too few for the noise model, whose first "
@@ -251,15 +266,17 @@ def _refuse_short(records: Sequence[Record], noise: NoiseModel) -> None:
 
 
 def common_fir_length(records: Sequence[Record], poles: Poles, options: EmbeddingOptions) -> int:
-    """Taps of the kernel: as in the options, else 150, or a third of the rows left over; at least 1.
+    """Taps of the kernel: as in the options, else the smaller of 150 and a third of the rows left over.
 
-    poles: of the regressors (doubled for the tangent method). Rows are left over by the regressors and by the
-    nuisance of every record, one column per pole and up to two more.
+    records: their numbers of rows count. poles: of the regressors (doubled for the tangent method). Rows are
+    left over by the regressors and by the nuisance of every record, one column per pole and up to two more;
+    columns beside them are not counted. At least 1, also without records; a length from the options is not
+    checked here (`reduce_stacked` refuses one that the rows do not determine).
     """
     if options.fir_length is not None:
         return options.fir_length
     n_rows = sum(record.n_samples for record in records)
-    n_columns = (len(records) + 1) * (poles.order + 2)
+    n_columns = (len(records) + 1) * (poles.order + _COLUMNS_BEYOND_POLES)
     return max(1, min(_DEFAULT_FIR_LENGTH, (n_rows - n_columns) // _ROWS_PER_TAP))
 
 
@@ -276,12 +293,14 @@ def embed_response(
     Parameters
     ----------
     data : FrfRegression
-        The response; its rows are whitened frequencies, real parts above imaginary ones.
+        The response; its rows are whitened frequencies, first axes of all ellipses above second axes.
     model : GobfModel
         Of it poles and structure matter.
     fixed : Poles
-        First among the model's poles of each type; they are known and not doubled.
+        First among the model's poles of each type (not checked; only their numbers count); they are known and
+        not doubled.
     options : EmbeddingOptions, optional
+        Length of the kernel, and whether the order was given; the rest concerns records.
     shared_gain_std : float
         Relative standard deviation of a real factor common to all frequencies, such as that of a sensor's
         gain; it adds the direction of the mean.
@@ -293,7 +312,7 @@ def embed_response(
     Raises
     ------
     ValueError
-        If the frequencies do not outnumber the unknowns, or shared_gain_std is negative.
+        If the frequencies do not outnumber the unknowns, or shared_gain_std is negative, infinite or NaN.
 
     Notes
     -----
@@ -338,7 +357,8 @@ def _posterior(
 ) -> ResponsePosterior:
     """Posterior of the coefficients of `poles`, direct term and fir_length taps: mean (P,), factor (P, P').
 
-    Sampling time, integrators, delay, names and unstable poles are those of the model.
+    Sampling time, integrators, delay, names and unstable poles are those of the model; P counts the unstable
+    poles, too, last. Raises ValueError, by `ResponsePosterior`, for other shapes or numbers not finite.
     """
     return ResponsePosterior(
         poles=poles,
@@ -359,12 +379,14 @@ def _posterior(
 def _noise_std(rows: EmbeddingRows, stacked: StackedBlocks) -> float:
     """Standard deviation, output units, of what regressors and kernel leave of the stacked records.
 
-    The coefficients of which something is known are as good as free here, not quite, for a column may do
-    nothing in these records.
+    stacked: triangle of the records' rows, without what is known of coefficients. Those of which something is
+    known are nearly free here (`_FREE`): entirely free, a column that does nothing in these records would be
+    refused. Raises ValueError as `reduce_stacked`; 0 for records that are fitted exactly, or all zero.
     """
     size = max(float(np.std(record.output)) for record in rows.records)
     nearly_free = replace(rows, known_std=_FREE * size)
     reduced = reduce_stacked(stack_blocks(nearly_free.known_blocks(), stacked))
+    # At least one, against a division by zero.
     freedom = max(reduced.degrees_of_freedom - reduced.fir_length, 1)
     return float(np.sqrt(reduced.unexplained / freedom))
 
@@ -381,8 +403,10 @@ def tangent_rows(
     model : GobfModel
         Gives poles, which are doubled, and structure.
     options : EmbeddingOptions
+        Length of the kernel, offset, initial state, direct term (None: the model's).
     beside : sequence of Beside
-        Further columns, one entry per record, or none. Those of unstable poles are put before them.
+        Further columns, one entry per record (not checked), or none. Those of unstable poles are put before
+        them.
 
     Returns
     -------
@@ -425,7 +449,9 @@ def tangent_rows(
 class _Solution(NamedTuple):
     """Fit of some rows: the rows with the modes that were added, their regression, kernel and missed mode.
 
-    kernel: without a missed mode. missed: the pairs that may be missing, None where they were not looked for.
+    reduced: the triangle of these rows with p regressors and L taps. kernel: Gaussian of the taps, and with
+    the triangle of the coefficients, under the hypothesis of no missed mode. missed: the pairs that may be
+    missing with their probabilities, None where they were not looked for.
     """
 
     rows: EmbeddingRows
@@ -437,11 +463,16 @@ class _Solution(NamedTuple):
 def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solution:
     """Posterior on these rows; modes that an order selection would have kept are added to their poles.
 
-    Modes are looked for where options.prior_missed_mode is positive, one after the other.
+    Modes are looked for where options.prior_missed_mode (in [0, 1) by its class) is positive, one after the
+    other, as long as `pair_mixture` names one in `visible` (it drops J by more than 4 ln nu in nu ln J, and
+    pairs are likelier than the rest). After `_MOST_ADDED` a further one is left to the mixture, without a
+    word. Raises ValueError by `reduce_stacked` and `candidate_pairs`: records too short, or an input that
+    does not excite the poles.
     """
     n_added = 0
     while True:
         stacked = stack_blocks(rows.record_blocks())
+        # Once: the deviation only weighs what is known, and a mode more changes it little.
         if rows.n_known and n_added == 0:
             rows = replace(rows, known_std=_noise_std(rows, stacked))
         reduced = reduce_stacked(stack_blocks(rows.known_blocks(), stacked))
@@ -470,8 +501,9 @@ def _solve(rows: EmbeddingRows, options: EmbeddingOptions) -> _Solution:
 def _pairs_after_poles(coefficients: RealArray, order: int, pairs: ComplexArray) -> RealArray:
     """Coefficients, (P,) or (P, n), from (theta, eta, amplitudes) to (basis of all poles, direct term, eta).
 
-    order: of the poles without the pairs, whose basis functions come first in theta. pairs (K,): their 2 K
-    amplitudes become the coefficients of their cascade behind those poles.
+    order: of the poles without the pairs, whose basis functions come first in theta. pairs (K,), in z, all
+    different: their 2 K amplitudes, the last rows, become the coefficients of their cascade behind those
+    poles. Nothing is checked.
     """
     n_amplitudes = 2 * pairs.size
     before_amplitudes = coefficients.shape[0] - n_amplitudes

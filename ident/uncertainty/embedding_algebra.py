@@ -77,13 +77,13 @@ class Delays:
     Attributes
     ----------
     input : ndarray, shape (T,)
-        Zero before the record.
+        Taken as zero before the record.
     length : int
-        L, number of columns.
+        L, number of columns, at least 1.
     first : ndarray, shape (n, L)
         In place of the matrix's first n rows, counted with those left out.
     begin : int
-        Rows before that one are left out.
+        Rows before that one are left out; at most T. Nothing is checked.
     """
 
     input: RealArray
@@ -97,7 +97,7 @@ class Delays:
         return self.input.size - self.begin, self.length
 
     def __getitem__(self, rows: slice) -> RealArray:
-        """Rows of the matrix, (n, L), as of an array; slices with a step are not."""
+        """Rows of the matrix, (n, L), as of an array; an empty slice gives (0, L), a step is ignored."""
         start, stop, _ = rows.indices(self.shape[0])
         begin = self.begin + start
         end = self.begin + stop
@@ -113,12 +113,16 @@ class Delays:
         return made
 
     def __matmul__(self, taps: RealArray) -> RealArray:
-        """Output (T - begin,) of taps (L,)."""
+        """Output (T - begin,) of taps (L,). Raises ValueError (numpy's) for another number of taps."""
+        # No rows are no pieces, which numpy would refuse to join: blocks have at least one row.
         return np.concatenate([self[rows] @ taps for rows in pieces(self.shape[0])])
 
 
 def pieces(n_rows: int) -> list[slice]:
-    """Slices of `_PIECE` rows that together are n_rows: what of a long record is worked on together."""
+    """Slices of `_PIECE` rows that together are n_rows: what of a long record is worked on together.
+
+    The last one may reach beyond n_rows, which slicing ignores; none for 0.
+    """
     return [slice(begin, begin + _PIECE) for begin in range(0, n_rows, _PIECE)]
 
 
@@ -126,7 +130,8 @@ def pieces(n_rows: int) -> list[slice]:
 class RegressionBlock:
     """Whitened rows of one record: nuisance (T,n), regressors F (T,p), kernel Psi (T,L), output y (T,).
 
-    The output and all columns are in output units per unit of their coefficient.
+    The output is in its units, all columns in output units per unit of their coefficient. Numbers of rows are
+    not checked here: numpy refuses to stack unequal ones.
     """
 
     nuisance: RealArray
@@ -219,7 +224,11 @@ class KernelPosterior:
 
 
 def nuisance_basis(nuisance: RealArray) -> RealArray:
-    """Orthonormal columns (T,r) spanning the nuisance (T,n), nearly dependent ones dropped (`RANK`)."""
+    """Orthonormal columns (T,r) spanning the nuisance (T,n), nearly dependent ones dropped (`RANK`).
+
+    r = 0 where there are no columns, or all are zero. A column with NaN or infinity is not seen as one: it is
+    dropped or spoils the others; nuisances come from record lengths and poles, which are finite.
+    """
     if nuisance.shape[1] == 0:
         return nuisance
     length = np.linalg.norm(nuisance, axis=0)
@@ -234,7 +243,11 @@ def nuisance_basis(nuisance: RealArray) -> RealArray:
 
 @dataclass(frozen=True, eq=False)
 class StackedBlocks:
-    """Square triangle of p regressors, `length` kernel columns and the output of n_rows rows."""
+    """Square triangle of p regressors, `length` kernel columns and the output of n_rows rows.
+
+    triangle (p + length + 1, p + length + 1): upper, columns in this order. n_rows: rows less the rank of the
+    nuisance, over all blocks.
+    """
 
     triangle: RealArray
     n_rows: int
@@ -275,10 +288,15 @@ def stack_blocks(blocks: Iterable[RegressionBlock], upon: StackedBlocks | None =
     upon : StackedBlocks, optional
         With the same columns.
 
+    Returns
+    -------
+    StackedBlocks
+        NaN of a block stays in the triangle.
+
     Raises
     ------
     ValueError
-        Where there are none.
+        Where there are neither blocks nor `upon`; numpy's, where blocks differ in numbers of columns.
     """
     triangle: RealArray | None = None
     n_rows = 0
@@ -316,10 +334,13 @@ def stack_blocks(blocks: Iterable[RegressionBlock], upon: StackedBlocks | None =
 def reduce_stacked(stacked: StackedBlocks) -> ReducedRegression:
     """Sufficient statistics of stacked blocks; regressors that say what earlier ones say are left out.
 
+    A column counts as such where less than `RANK` of its length is orthogonal to those before it.
+
     Raises
     ------
     ValueError
-        As `reduce_regression`.
+        When rows do not exceed p + L + 1, or a regressor is zero in all of them. NaN is not refused: columns
+        with it are left out.
     """
     triangle = stacked.triangle
     p = stacked.p
@@ -359,7 +380,8 @@ def triangle_of(columns: RealArray) -> RealArray:
     """R (n,n) of the QR decomposition of columns (T,n); rows of zeros where T < n.
 
     By LAPACK's recursive decomposition: several times faster than `qr` of NumPy and SciPy on matrices this
-    narrow. Raises ArithmeticError where LAPACK refuses.
+    narrow. The diagonal may have either sign. NaN stays in its column and those behind it. Raises LAPACK's
+    own error for no rows or no columns, and ArithmeticError where it refuses anything else.
     """
     n_rows, n = columns.shape
     width = min(_PANEL, n_rows, n)
@@ -374,7 +396,8 @@ def triangle_of(columns: RealArray) -> RealArray:
 def tc_factor(lam: float, length: int) -> RealArray:
     """B (L,L) with (B B^T)_ij = lam^max(i,j), i, j = 1..L: the tuned/correlated kernel of unit alpha.
 
-    lam: decay of the variance per tap, between 0 and 1 (Chen, Ohlsson and Ljung, Automatica 48(8), 2012).
+    lam: decay of the variance per tap, between 0 and 1 (Chen, Ohlsson and Ljung, Automatica 48(8), 2012);
+    above 1, not checked, B has NaN. length: L, at least 1.
     """
     k = np.arange(1, length + 1, dtype=np.float64)
     step = lam**k * (1 - lam)
@@ -386,14 +409,19 @@ def tc_factor(lam: float, length: int) -> RealArray:
 def alternating_factor(lam: float, length: int) -> RealArray:
     """B (L,L) of the tuned/correlated kernel (`tc_factor`) with taps of alternating sign.
 
-    Its remainder stands near the Nyquist frequency, where that of `tc_factor` has least.
+    Its remainder has most power near the Nyquist frequency, where that of `tc_factor` has least. lam, length:
+    those of `tc_factor`.
     """
     signs = (-1.0) ** np.arange(length)[:, None]
     return np.asarray(signs * tc_factor(lam, length))
 
 
 def exponential_factor(lam: float, length: int) -> RealArray:
-    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe, alike over frequency."""
+    """B (L,L) with B B^T = diag(lam^k), k = 1..L: the prior of the classical recipe, alike over frequency.
+
+    lam: decay of the variance per tap, between 0 and 1, not checked. length: L. The recipe is that of
+    Goodwin, Gevers and Ninness (module text).
+    """
     k = np.arange(1, length + 1, dtype=np.float64)
     return np.diag(np.sqrt(lam**k))
 
@@ -431,7 +459,9 @@ class KernelSpectrum:
 def kernel_spectrum(reduced: ReducedRegression, lam: float, factor: RealArray) -> KernelSpectrum:
     """Singular value decomposition for an upper triangular factor B (L,L) whose columns die out with the tap.
 
-    lam: decay of the kernel's variance per tap, for the report.
+    reduced: of it r22 (L, L) and z (L,), the kernel's share of the regression. lam: decay of the kernel's
+    variance per tap, for the report alone. Not checked: B of another size (numpy refuses it), or all zero
+    (IndexError); the shapes of this file are neither.
     """
     size = np.einsum("ij,ij->j", factor, factor)
     alive = np.flatnonzero(size > _DIED_OUT * size.max())
@@ -456,10 +486,11 @@ def restricted_log_likelihood(
     Parameters
     ----------
     reduced : ReducedRegression
+        Its degrees of freedom and the unexplained part of the output; the rest is in `spectrum`.
     spectrum : KernelSpectrum
         Of the kernel's shape B.
     alpha : ndarray, shape (A,)
-        Prior variance of the first tap in noise variances; 0: no kernel.
+        Prior variance of the first tap in noise variances; 0: no kernel. Negative ones are not checked.
 
     Returns
     -------
@@ -525,8 +556,10 @@ class RemainderEnergies(NamedTuple):
 def remainder_energies(degrees_of_freedom: int) -> RemainderEnergies:
     """Energies of a remainder where the order was given, log-uniform up to what an order selection keeps.
 
-    That is 4 ln nu noise variances, nu the degrees of freedom; a tenth of the prior lies beyond.
+    That is 4 ln nu noise variances, nu = degrees_of_freedom; a tenth of the prior lies beyond. nu has to be
+    at least 2, so that this is above 1, which is not checked: `reduce_stacked` leaves at least 3.
     """
+    # A pair of poles, four numbers, is kept where it lowers nu ln J by more than ln nu for each.
     edge = 4 * np.log(degrees_of_freedom)
     n = int(np.ceil(np.log(_LARGEST_ENERGY) / np.log(edge) * _SCALES))
     index = np.arange(n + 1)
@@ -545,16 +578,18 @@ def evaluate_grid(
     Parameters
     ----------
     reduced : ReducedRegression
+        That of the spectra.
     spectra : iterable of KernelSpectrum
-        K.
+        K, at least one (IndexError or ValueError of numpy else).
     energy : ndarray, shape (A,)
         Of the remainder in the output, in noise variances: alpha = energy / trace(R22 B B^T R22^T).
     prior : ndarray, shape (A,)
-        Of each energy; its sum is 1.
+        Of each energy; its sum is 1, which is not checked.
 
     Returns
     -------
     KernelGrid
+        A kernel that the input does not excite has a huge alpha and the likelihood of none.
     """
     spectra = tuple(spectra)
     traces = [float(spectrum.singular @ spectrum.singular) for spectrum in spectra]
@@ -580,16 +615,18 @@ def evaluate_grid(
 def kernel_grid(
     reduced: ReducedRegression, shapes: Iterable[Callable[[float, int], RealArray]], *, order_given: bool
 ) -> KernelGrid:
-    """Restricted likelihood (`evaluate_grid`) over twelve decays of every shape, and scales.
+    """Restricted likelihood (`evaluate_grid`) over `_N_DECAYS` decays of every shape, and scales.
 
     Parameters
     ----------
     reduced : ReducedRegression
+        Its kernel part gives the number of taps L, at least 1. Nothing is checked here.
     shapes : iterable of callable
         Decay and length to a factor B, as `tc_factor`.
     order_given : bool
-        Somebody gave the order of the model: energies are those of `remainder_energies`. Else they are
-        log-uniform from far below the noise on, for a choice from the data leaves little.
+        Somebody gave the order of the model: energies are those of `remainder_energies`. Else they are those
+        of `_ENERGIES`, alike in the logarithm from far below the noise on: where the order was chosen from
+        the data, little is left.
 
     Returns
     -------
@@ -612,7 +649,8 @@ def kernel_grid(
 def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
     """Logarithm of the likelihood averaged over the prior of `grid_weights`, up to the grid's constant.
 
-    prior_no_remainder: prior probability that the poles explain everything.
+    prior_no_remainder: prior probability that the poles explain everything, from 0 to 1, not checked. NaN of
+    the grid gives NaN.
     """
     top = max(float(grid.log_likelihood.max()), grid.log_likelihood_none)
     of_grid = float(np.sum(grid.prior * np.exp(grid.log_likelihood - top)))
@@ -624,7 +662,8 @@ def total_log_evidence(grid: KernelGrid, prior_no_remainder: float) -> float:
 def grid_weights(grid: KernelGrid, prior_no_remainder: float) -> tuple[RealArray, float]:
     """Posterior weights (K,A) of the grid points, and the weight of no kernel; together they are 1.
 
-    prior_no_remainder: prior probability that the poles explain everything, 0 included.
+    prior_no_remainder: prior probability that the poles explain everything, from 0 to below 1 (at 1, numpy
+    warns of a logarithm of zero and all weight is on no kernel); not checked. NaN of the grid gives NaN.
     """
     log_grid = grid.log_likelihood + np.log((1 - prior_no_remainder) * grid.prior)
     log_prior_none = -np.inf
@@ -646,9 +685,10 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
     ----------
     grid : KernelGrid
     weights : ndarray, shape (K, A)
-        Of the grid points.
+        Of the grid points (`grid_weights`).
     weight_none : float
-        Of alpha = 0, where eta is zero. All weights together are 1.
+        Of alpha = 0, where eta is zero. All weights together are 1, which is not checked; of weights that are
+        NaN the covariance comes out empty.
 
     Returns
     -------
@@ -709,9 +749,11 @@ def conditional_posterior(grid: KernelGrid, weights: RealArray, weight_none: flo
 def embedding_report(
     method: str, reduced: ReducedRegression, kernel: KernelPosterior, **further: Any
 ) -> EmbeddingReport:
-    """What a reader can judge the posterior by.
+    """Report of a posterior: how it came about, by which a reader can judge it.
 
-    method: its name; further: fields of the report that neither reduction nor kernel knows.
+    method: its name. reduced: gives numbers of rows and regressors; kernel: noise (output units), scale,
+    decay and evidence. further: fields of `EmbeddingReport` that neither knows (TypeError for a name it
+    lacks).
     """
     return EmbeddingReport(
         method=method,
@@ -729,7 +771,10 @@ def embedding_report(
 def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tuple[RealArray, RealArray]:
     """Mean (P+L,) and covariance factor (P+L, P') of (theta, eta), P counting the columns left out too.
 
-    The first p columns of the factor are normals of the noise, the others those of the kernel.
+    reduced: the triangle, with its p columns in use; posterior: mean and factor of the L taps (with pairs:
+    more) and the noise variance, as many taps as `reduced.r12` has columns, which numpy refuses otherwise.
+    Coefficients of columns that are not in use are zero with no uncertainty. The first p columns of the
+    factor are normals of the noise, the others those of the kernel.
     """
     p = reduced.n_regressors
     length = posterior.kernel_mean.size
@@ -756,7 +801,8 @@ def joint_factor(reduced: ReducedRegression, posterior: KernelPosterior) -> tupl
 def by_class(rest: RealArray, classes: IntArray) -> RealArray:
     """Residual (T,) split into a column (T,M) for each of the M classes of its rows, zero in the others.
 
-    classes: numbers 0 .. M - 1 of the rows of a record, of which the residual has the last T.
+    classes: numbers 0 .. M - 1 of the rows of a record, of which the residual has the last T; M is one more
+    than the largest. Not checked: fewer classes than T (numpy refuses them), negative ones (in no column).
     """
     class_of_row = classes[-rest.size :, None]
     in_class = class_of_row == np.arange(1 + classes.max())
@@ -771,7 +817,8 @@ def sandwiched(factor: RealArray, scores: RealArray) -> RealArray:
     factor : ndarray, shape (P, P')
         Of the covariance that the noise makes.
     scores : ndarray, shape (M, P')
-        Sums over the rows of each class, in the unit normals of the factor.
+        Sums over the rows of each class, in the unit normals of the factor. M is at least 2, which is not
+        checked: of one class the factor is NaN.
 
     Notes
     -----
@@ -785,7 +832,11 @@ def sandwiched(factor: RealArray, scores: RealArray) -> RealArray:
 
 
 def symmetric_factor(covariance: RealArray) -> RealArray:
-    """Factor S (L,L') with S S^T = covariance (L,L), directions below rounding left out."""
+    """Factor S (L,L') with S S^T = covariance (L,L), directions below rounding (`_ROUNDING`) left out.
+
+    L at least 1; the symmetric part counts. L' = 0 for a covariance of zeros, and, silently, for one with
+    NaN.
+    """
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     certain = np.zeros(values.size, dtype=np.bool_)
     if values[-1] > 0:

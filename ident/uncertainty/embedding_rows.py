@@ -38,6 +38,9 @@ from ident.uncertainty.embedding_algebra import (
 class RecordRows:
     """The rows of one record that answer to its input, whitened.
 
+    T counts the rows of the record behind its input delay, n_start those on which the noise model lacks a
+    past. Units are those of the output, as whitening has none; nothing is checked here.
+
     Attributes
     ----------
     nuisance : ndarray, shape (T, n)
@@ -66,12 +69,15 @@ class RecordRows:
 class Beside:
     """What the output of one record depends on besides the basis functions, not whitened.
 
+    T counts all rows of the record, those before the input delay too. p1 and q are those of all records,
+    which nothing checks.
+
     Attributes
     ----------
     first : ndarray, shape (T, p1)
         In place of the first p1 regressors.
     columns : ndarray, shape (T, q)
-        With coefficients that all records share.
+        With coefficients that all records share; output units per unit of these.
     """
 
     first: RealArray
@@ -81,6 +87,8 @@ class Beside:
 @dataclass(frozen=True, eq=False)
 class EmbeddingRows:
     """How to make the matrices; they are made anew for each pass, so that only one record's are in memory.
+
+    `tangent_rows` of `ident.uncertainty.embedding` checks records and makes these; nothing is checked here.
 
     Attributes
     ----------
@@ -103,8 +111,9 @@ class EmbeddingRows:
         weighed against the records. None: nothing is taken as known.
     missed_above : float
         Least frequency of a mode that may be missing, radians a sample.
-    classes : tuple of ndarray, shape (T,)
-        Class of each row of each record, by what errors of the model may depend on; or none.
+    classes : tuple of ndarray of int, shape (T,)
+        Class 0 .. M - 1 of each row of each record (all T rows; `by_class` drops the first ones that a block
+        lacks), by what errors of the model may depend on; or none. Every record has rows of class M - 1.
     """
 
     records: tuple[Record, ...]
@@ -126,20 +135,30 @@ class EmbeddingRows:
         return int(self.beside[0].columns.shape[1])
 
     def __iter__(self) -> Iterator[RecordRows]:
-        """Rows of one record after the other."""
+        """Rows (`RecordRows`) of one record after the other, in the order of `records`.
+
+        Raises ValueError, by `answered`, for a record that is not longer than the delay, and IndexError where
+        `beside` has fewer entries than there are records, but some.
+        """
         for k, record in enumerate(self.records):
             beside_record = self.beside[k] if self.beside else None
             yield self._rows(record, beside_record)
 
     def blocks(self) -> Iterator[RegressionBlock]:
-        """Blocks of the regression: those of the records, and what is known of shared coefficients."""
+        """Blocks of the regression: those of the records, and what is known of shared coefficients.
+
+        One per record, and one of `n_known` rows where `known_std` is set. Raises as iterating does.
+        """
         yield from self.record_blocks()
         yield from self.known_blocks()
 
     def record_blocks(self) -> Iterator[RegressionBlock]:
-        """Rows of each record with kernel columns; those that `first` zeroes are left out, as rows count."""
+        """Rows of each record with `fir_length` kernel columns, one block per record.
+
+        The n_start rows that a zero `RecordRows.first` would make zero are left out: they would count among
+        the degrees of freedom. A record of no more rows gives an empty block.
+        """
         for rows in self:
-            # A row of zeros agrees with everything, but would count among the degrees of freedom.
             n_dropped = 0
             if not np.any(rows.first):
                 n_dropped = len(rows.first)
@@ -151,10 +170,13 @@ class EmbeddingRows:
             yield RegressionBlock(rows.nuisance[used], rows.regressors[used], kernel, rows.output[used])
 
     def scores(self, mean: RealArray) -> RealArray:
-        """Scores (M, P): for each of M classes of rows the product of its regressors and its residuals.
+        """Scores (M, P): for each of M classes the sum over records of regressors^T times its residuals.
 
-        mean (P+L,): of regressors' coefficients and kernel. The nuisance is projected out of the residuals,
-        and out of those of each class.
+        mean (P+L,): of regressors' coefficients and kernel. Unit: square of the whitened output over that of
+        a coefficient. The nuisance is projected out of the residuals, and out of those of each class, which
+        spreads them over all rows of the record again. Raises ValueError where `classes` has not one entry
+        per record, or (numpy's, of shapes) where the highest class differs between records; a zero of no
+        dimension without records.
         """
         total = np.zeros(())
         for block, classes in zip(self.record_blocks(), self.classes, strict=True):
@@ -170,9 +192,10 @@ class EmbeddingRows:
         return total
 
     def known_blocks(self) -> Iterator[RegressionBlock]:
-        """What is known of the last n_known coefficients: a measured zero of each, off by one in deviation.
+        """Block of n_known rows: a measured zero of each of the last coefficients, with deviation one.
 
-        Nothing where known_std is None.
+        At most one block: none where known_std is None; where it is set n_known has to be from 1 to q, which
+        is not checked.
         """
         if self.known_std is None:
             return
@@ -185,17 +208,21 @@ class EmbeddingRows:
         yield RegressionBlock(np.zeros((q, 0)), regressors, np.zeros((q, self.fir_length)), np.zeros(q))
 
     def pair_blocks(self) -> Iterator[RecordRows]:
-        """Rows whose input is what drives one more pair after all the poles: behind their all-pass."""
+        """Rows of each record whose input (and head) is what drives one more pair behind all `poles`.
+
+        That is the output of their all-pass; nuisance, regressors and output stay. Raises as iterating does.
+        """
         for rows in self:
             signal = all_pass_signal(self.poles, rows.input)
             head = all_pass_signal(self.poles, rows.head)
             yield replace(rows, input=signal, head=head)
 
     def _rows(self, record: Record, beside: Beside | None) -> RecordRows:
-        """Matrices of one record, every column whitened.
+        """Matrices of one record of one input and one output, every column whitened.
 
         Columns driven by the input from rest commute with the whitening filter: for them the input is
-        filtered once, but for the first rows.
+        filtered once, but for the first rows. Raises ValueError where the record is not longer than the
+        delay, or (numpy's) where `beside` has another number of rows; NaN of a signal stays in its columns.
         """
         structure = self.structure
         noise = self.noise
@@ -238,7 +265,11 @@ class EmbeddingRows:
         )
 
     def _driven(self, u: RealArray) -> RealArray:
-        """Basis functions driven by u (T,) from rest, (T, P), and u itself where there is a direct term."""
+        """Basis functions driven by u (T,) from rest, and u itself where there is a direct term, (T, P or P +
+        1).
+
+        u: input behind integrators and delay, whitened or not; NaN in it stays from there on.
+        """
         columns = regressor(self.poles, u)
         if self.structure.feedthrough:
             columns = np.column_stack([columns, u])
@@ -253,19 +284,20 @@ def gls_residuals(
     Parameters
     ----------
     rows : EmbeddingRows
-        Of the fit, with the noise model that it used.
+        Those of the fit, with the noise model that it used.
     reduced : ReducedRegression
-        Of these rows.
+        Of these rows (not checked): its triangle r11 (p, p) and the columns in use.
     kernel : KernelPosterior
-        Of that regression.
+        Of that regression: mean (L,) of the taps, noise variance.
 
     Returns
     -------
     residuals : list of ndarray, shape (T,)
         One per record: y minus posterior mean and nuisance, output units.
     absorbed : list of ndarray, shape (T, r)
-        One per record: columns Z, Z Z^T the share of the noise's covariance that the fit took off
-        (`autoregression.absorbed_gradient`). Neglected: the kernel's share of it.
+        One per record: columns Z, Z Z^T the share of the noise's covariance that the fit took off, for
+        innovations of unit variance (`autoregression.absorbed_gradient`). Neglected: the kernel's share of
+        it.
     """
     noise = rows.noise
     mean, _ = joint_factor(reduced, kernel)

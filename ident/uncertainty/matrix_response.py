@@ -31,21 +31,30 @@ from ident.identification import MimoIdentification
 from ident.mode_shapes import ModalFit, modes_of
 from ident.uncertainty.autoregression import fit_autoregression
 
-# Frequencies around a mode, beside those of the grid, whose largest radius stands for all.
+# Frequencies around each mode at which `largest_radius` looks, in addition to its grid over all frequencies.
+# 41 over `_HALF_WIDTHS` to either side are a quarter of a half width apart: chosen, so that a peak that is
+# one wide has several. With 3 to 81 of them the largest radius of four records of a simulated structure did
+# not move.
 _AROUND_MODE = 41
-# Half widths of a mode's peak that they reach to either side; they are a quarter of one apart.
+# Half widths (zeta omega) of a mode's peak that they reach to either side: there a peak has fallen to a
+# fifth. Chosen; with 2.5 or 10 the largest radius of the same records did not move.
 _HALF_WIDTHS = 5
 # Share of the Nyquist frequency up to which radii are looked at: at it the response is real, and its ball is
-# that of half as many numbers.
+# that of half as many numbers. At .99 or .9999 the largest radius of a simulated structure is the same.
 _NEAR_NYQUIST = 0.999
 # Largest order of the noise model of an output; BIC chooses up to it. With half
 # of it balls hold the response as often as the tests ask for (tests/ident/test_several_outputs.py).
 _AR_ORDER = 16
-# Rows of the longest record for each order that is tried. Chosen.
+# Rows of the longest record for each order that is tried: with `_AR_ORDER` 16 it acts on records of fewer
+# than 320 rows, so that their noise model has twenty rows a coefficient. Chosen; halved or doubled, nothing
+# moved where the noise is white.
 _ROWS_PER_ORDER = 20
-# Draws of the sum of squares: its 95 % quantile then is right to about 1 %.
+# Draws of the sum of squares: its 95 % quantile then is right to about 1 %. Halved or doubled, the largest
+# radius of a simulated structure moved by half a per cent.
 _DRAWS = 20_000
-# Share of the lowest frequency asked for down to which an integrator is one; see `input_factor`.
+# Share of the lowest frequency asked for down to which an integrator is one; see `input_factor`. At the
+# lowest frequency the factor is then off by 1e-3, which is far within what any ball is known to; smaller
+# shares bring the pole nearer to the circle, where a design loses digits. Chosen.
 _INTEGRATES_TO = 1e-3
 
 
@@ -56,6 +65,7 @@ class MatrixUncertainty:
     Attributes
     ----------
     omega_rad_s : ndarray, shape (F,)
+        Frequencies, rad/s, in any order.
     centre : ndarray, shape (F, Y, U), complex
         G0, in units of the outputs per unit of the inputs.
     output_factor : ndarray, shape (Y, Y)
@@ -63,6 +73,7 @@ class MatrixUncertainty:
     input_factor : ndarray, shape (F, U, U), complex
         Li, per unit of the inputs.
     radius : ndarray, shape (F,)
+        No unit; positive.
     dt_s : float
         Sampling time.
     level : float
@@ -78,17 +89,21 @@ class MatrixUncertainty:
     level: float
 
     def __post_init__(self) -> None:
+        """Lock the arrays; shapes are not checked, `MatrixPosterior.at` makes them."""
         lock(self, "omega_rad_s", "output_factor", "radius")
         lock(self, "centre", "input_factor", dtype=np.complex128)
 
     def distance(self, response: ComplexArray) -> RealArray:
-        """Distance |Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); 1 is the ball."""
+        """Distance |Lo^-1 (G - G0) Li^-1|_F over the radius, (F,), of responses (F, Y, U); 1 is the ball.
+
+        NaN where a response has NaN. Raises ValueError (numpy's) for another shape, unless it broadcasts.
+        """
         by_output = np.linalg.solve(self.output_factor, response - self.centre)
         normalised = by_output @ np.linalg.inv(self.input_factor)
         return np.asarray(np.linalg.norm(normalised, axis=(1, 2)) / self.radius)
 
     def holds(self, response: ComplexArray) -> npt.NDArray[np.bool_]:
-        """Whether each response (F, Y, U) lies in its ball, (F,)."""
+        """Whether each response (F, Y, U) lies in its ball, (F,); False where it has NaN."""
         return np.asarray(self.distance(response) <= 1)
 
 
@@ -112,6 +127,7 @@ class MatrixPosterior(Shown):
     Attributes
     ----------
     model : MimoModel
+        Centre of all balls: Y outputs, U inputs, poles, integrators, delay, dt_s.
     output_factor : ndarray, shape (Y, Y)
         Lo, in units of the outputs.
     modes : ModalFit
@@ -139,8 +155,15 @@ class MatrixPosterior(Shown):
         Parameters
         ----------
         lowest_rad_s : float
-            Lowest frequency that matters, rad/s. An integrator is one down to a thousandth of it; below, its
+            Lowest frequency that matters, rad/s, above 0 and far below 1 / dt_s with integrators, without
+            them not used; not checked. An integrator is one down to a thousandth of it; below, its
             uncertainty stays as there, so that the state space is stable.
+
+        Returns
+        -------
+        InputFactor
+            n: states of the modes for every input, and one per input and integrator. The delay, which has
+            modulus one, is left out.
         """
         a, b, changes = self.modes.response_states()
         n_outputs = len(self.model.outputs)
@@ -162,9 +185,11 @@ class MatrixPosterior(Shown):
         return InputFactor(a, b, c, d)
 
     def largest_radius(self, lowest_rad_s: float) -> float:
-        """Largest radius of the balls from lowest_rad_s to the Nyquist frequency, on a grid.
+        """Largest radius (no unit) of the balls from lowest_rad_s to the Nyquist frequency, on a grid.
 
-        The grid has points around the modes, where the radius changes fast.
+        The grid has `FREQUENCIES` (400) points alike in the logarithm, and more around the modes, where the
+        radius changes fast. lowest_rad_s: rad/s, above 0 and below pi / dt_s. Raises ValueError: numpy's for
+        another one, that of `at` where an input has no uncertainty.
         """
         poles = self.model.poles
         nyquist = _NEAR_NYQUIST * np.pi / self.dt_s
@@ -182,7 +207,8 @@ class MatrixPosterior(Shown):
         Raises
         ------
         ValueError
-            Where the model leaves some input without uncertainty.
+            Where the model leaves some input without uncertainty; by `MimoModel.frequency_response` for a
+            frequency beyond pi/dt, or 0 with integrators (where numpy may warn or refuse before).
         """
         model = self.model
         n_outputs = len(model.outputs)
@@ -226,9 +252,10 @@ def matrix_posterior(
     Parameters
     ----------
     records : sequence of Record
-        Those that the identification was made from.
+        Those that the identification was made from; that they are is checked by their number of rows alone.
     identification : MimoIdentification
-        Its model, its residuals, and which modes have one shape; order and shapes are taken as right.
+        Its model, structure, noise_covariance (Y, Y), residuals (T - delay, Y) of each record, and which
+        modes have one shape (`rank_one`, `n_fixed`); order and shapes are taken as right.
     level : float
         Probability of holding the response, frequency by frequency.
 
@@ -239,7 +266,8 @@ def matrix_posterior(
     Raises
     ------
     ValueError
-        If the records are not its own, or poles repeat.
+        If the records have another number of rows, poles repeat, or no record is long enough for a noise
+        model (more than twice its order). A noise covariance that is not positive definite: LinAlgError.
 
     Notes
     -----

@@ -36,11 +36,12 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     Parameters
     ----------
     posterior : ResponsePosterior
-        Gives structure, names and unstable poles of the model, too.
+        Its response and covariance; gives structure, names and unstable poles of the model, too.
     poles : Poles
         In z, as many as the model gets.
     omega_rad_s : array_like, shape (F,)
-        Frequencies at which the responses are compared, rad/s.
+        Frequencies at which the responses are compared, rad/s, ascending, up to pi / dt_s, not 0 with
+        integrators.
 
     Returns
     -------
@@ -49,7 +50,8 @@ def nominal_near(posterior: ResponsePosterior, poles: Poles, omega_rad_s: npt.Ar
     Raises
     ------
     ValueError
-        When there are too few frequencies for the coefficients.
+        When there are too few frequencies for the coefficients, or by `ResponsePosterior.at` for frequencies
+        that do not ascend or are out of its range.
 
     Notes
     -----
@@ -67,18 +69,22 @@ def nominals_near(
     Parameters
     ----------
     posterior, poles, omega_rad_s
-        As `nominal_near`.
+        Those of `nominal_near`; with unstable poles `poles` holds their mirror images.
 
     Yields
     ------
     GobfModel
-        On the given poles, on each taken twice, on those moved to where the posterior has them, and with ever
-        one pair more (`PoleSearch`), up to twice the given order and a pair; unstable poles stay.
+        On the given poles; on each taken twice; on those refined from the given ones on the posterior's
+        response (`PoleSearch.descend`); then with one pair more each time (`PoleSearch.add_pair`), until the
+        order exceeds twice the given one; unstable poles stay. Not every one need be nearer than the one
+        before: the caller judges.
 
     Raises
     ------
     ValueError
-        When there are too few frequencies for the coefficients.
+        When there are too few frequencies for the coefficients of the first model, or as `nominal_near`; if
+        the posterior's unstable poles are not among `poles`, by `Poles.without`. Later models are not checked
+        for too few frequencies: what the data do not show gets coefficient zero.
     """
     data = _regression(posterior, omega_rad_s)
     n_coefficients = poles.order + data.feedthrough
@@ -106,7 +112,8 @@ def nominals_near(
 def _regression(posterior: ResponsePosterior, omega_rad_s: npt.ArrayLike) -> FrfRegression:
     """The posterior's mean at omega (F,) as a measured response, with its ellipses as covariances.
 
-    Ellipses are at least `THINNEST` of the response wide, so that none is without weight.
+    Ellipses are widened by `THINNEST` (1e-4) of the response's modulus in each direction: one of no width
+    would have infinite weight. Raises ValueError as `ResponsePosterior.at`.
     """
     response = posterior.at(omega_rad_s)
     thinnest = (THINNEST * np.abs(response.centre[:, None, None])) ** 2 * np.eye(2)
@@ -121,7 +128,10 @@ def _regression(posterior: ResponsePosterior, omega_rad_s: npt.ArrayLike) -> Frf
 
 
 def _nearest(data: FrfRegression, poles: Poles, posterior: ResponsePosterior) -> GobfModel:
-    """Model on these poles that is nearest to the data, with structure and names of the posterior."""
+    """Model on these poles that is nearest to the data, with structure and names of the posterior.
+
+    data: the posterior's mean and ellipses (`_regression`). Coefficients that the data do not show are zero.
+    """
     fit = fit_response(data, poles)
     return GobfModel(
         poles=poles,
@@ -158,7 +168,11 @@ class NominalAgreement:
     def of(
         cls, frequency: FrequencyUncertainty, nominal: Callable[[RealArray], ComplexArray]
     ) -> NominalAgreement:
-        """Agreement of a nominal response, rad/s (F,) to G (F,), over the frequencies of the ellipses."""
+        """Agreement of a nominal response, rad/s (F,) to G (F,), over the frequencies of the ellipses.
+
+        frequency: omega_rad_s (F,) and its ellipses at their own level. Raises ValueError, by
+        `FrequencyUncertainty.normalised_distance`, for a response of another shape or not finite.
+        """
         distance = frequency.normalised_distance(nominal(frequency.omega_rad_s))
         worst = int(np.argmax(distance))
         return cls(
@@ -169,7 +183,10 @@ class NominalAgreement:
 
     @property
     def doubt(self) -> list[Finding]:
-        """What to say of a nominal that lies outside most of its ellipses; empty for others."""
+        """What to say of a nominal that lies outside most of its ellipses: one finding, or an empty list.
+
+        The limit is `MOST_INSIDE_PERCENT`, met exactly: no finding.
+        """
         if self.share_inside_percent >= MOST_INSIDE_PERCENT:
             return []
         return [

@@ -28,9 +28,11 @@ _SHARE_OF_DISTANCE = 1 / 3
 # Poles nearer than this in z are one pole but for rounding: no circle of doubles lies between them.
 _SAME_POLE = 1e-12
 # Factor on frequency, damping or decay beyond which an interval says nothing: (0, inf) is given in its place.
-# First order holds for changes far below it.
+# Chosen: first order holds for changes far below it, so that any factor between 10 and 100 would say the
+# same.
 _NO_KNOWLEDGE = 20
-# Least semi-axis of an ellipse, in units of the response, by which the contribution of a pair is divided.
+# Least semi-axis of an ellipse, in units of the response, by which the contribution of a pair is divided: in
+# place of zero, near the smallest double, so that it decides nothing else.
 _SMALLEST_RADIUS = 1e-300
 
 
@@ -58,6 +60,7 @@ class PoleIntervals:
     decay_per_s: RealArray
 
     def __post_init__(self) -> None:
+        """Lock the arrays; shapes are not checked, `pole_intervals` makes them."""
         lock(self, "omega_rad_s", "zeta", "decay_per_s")
 
 
@@ -67,15 +70,18 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
     Parameters
     ----------
     posterior : ResponsePosterior
-        It may have further poles.
+        Its poles, mean, covariance factor and dt_s. It may have further poles.
     poles : Poles
-        Of the model, in z: P pairs and R real ones.
+        Of the model, in z, bit by bit those of the posterior: P pairs and R real ones.
     level : float
-        Probability, between 0 and 1.
+        Probability of each interval, between 0 and 1; also that of the ellipse beyond which a pair has to
+        stand out. 0.95 is what all reports use.
 
     Returns
     -------
     PoleIntervals
+        (0, inf), of zeta (0, 1), for a pair that stays inside the ellipse at its own frequency, and for a
+        pole that the posterior has more often than twice.
 
     Raises
     ------
@@ -128,7 +134,12 @@ def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealA
         Of an arm with U unstable real poles and pairs (`ResponsePosterior.unstable`, which holds their mirror
         images a; how far each image is off are its last coefficients).
     level : float
-        Probability of each interval by itself, between 0 and 1.
+        Probability of each interval by itself, between 0 and 1; not checked: outside, the ends are NaN.
+
+    Returns
+    -------
+    ndarray, shape (U, 2)
+        Symmetric around the estimate, to first order; (0, 2) for a stable plant.
     """
     unstable = posterior.unstable
     n_real = unstable.real.size
@@ -150,7 +161,9 @@ def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealA
 def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexArray) -> ComplexArray:
     """Deviation of the pole, in z, as a complex row (P',) on the unit normals of the covariance factor.
 
-    everything: all poles of the posterior. Infinite where the posterior does not tell the pole's place.
+    everything (P,): all poles of the posterior, `pole` at least twice among them (its caller has checked).
+    P' is the number of columns of its covariance factor. Infinite where the posterior does not tell the
+    pole's place: it has the pole three times, or its residue is zero.
     """
     n_normals = posterior.covariance_factor.shape[1]
     # A pole that the basis has more often than twice has no displacement of its own.
@@ -173,7 +186,8 @@ def _pole_rows(posterior: ResponsePosterior, pole: complex, everything: ComplexA
 def _carried(posterior: ResponsePosterior, pole: complex, level: float) -> float:
     """What a pair adds to the response at its own frequency, in radii of the ellipse there.
 
-    Up to one the pair need not exist. level: of the ellipse.
+    No unit; up to one the pair need not exist. pole: upper one of a pair of the posterior, in z. level: of
+    the ellipse, between 0 and 1; its radius is the larger semi-axis.
     """
     omega = np.array([np.angle(pole) / posterior.dt_s])
     z = pole / np.array([abs(pole)])
@@ -196,14 +210,15 @@ def laurent_rows(poles: Poles, pole: complex) -> tuple[ComplexArray, ComplexArra
     poles : Poles
         Of the basis, P in all, `pole` twice among them.
     pole : complex
-        In z.
+        In z. Not checked: of a point that is no pole of the basis both rows are zero but for rounding, and of
+        one that is there three times the terms of third order are left out.
 
     Notes
     -----
     By Cauchy's integral over a circle around the pole, that no other pole is in.
     """
     distance = np.abs(poles.values - pole)
-    # Of a basis of one pole alone any circle inside the unit one will do.
+    # Of a basis of one pole alone nothing limits the circle: 1 stands in for a distance.
     other_poles = distance > _SAME_POLE
     next_pole = float(distance[other_poles].min(initial=1.0))
     radius = _SHARE_OF_DISTANCE * next_pole
@@ -218,8 +233,9 @@ def laurent_rows(poles: Poles, pole: complex) -> tuple[ComplexArray, ComplexArra
 def _interval(value: float, deviation: float, width: float) -> tuple[float, float]:
     """Ends: value times exp(-width deviation) and exp(width deviation).
 
-    deviation: standard deviation of the logarithm; width: of the interval, in such deviations. (0, inf) for a
-    factor of `_NO_KNOWLEDGE` or more, and for a deviation that is infinite or NaN.
+    value: the estimate, positive, in the unit of the ends. deviation: standard deviation of its logarithm;
+    width: half of the interval, in such deviations. (0, inf) for a factor of `_NO_KNOWLEDGE` or more, and for
+    a deviation that is infinite or NaN.
     """
     if not width * deviation < np.log(_NO_KNOWLEDGE):
         return 0.0, float("inf")

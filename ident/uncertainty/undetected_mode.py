@@ -43,8 +43,8 @@ _ZETA = (0.01, 0.03)
 # Time constants by which a candidate decays over the record, at least; see `candidate_pairs`. Measured:
 # halved or doubled, the median ellipse stays to .1 % and coverage to .3 %.
 _DECAY = 2.0
-# Periods that the slowest candidate makes in the record. The damping that `_DECAY` asks for is then still
-# light: 2 / (2 pi 6) = 0.053.
+# Periods that the slowest candidate makes in the longest record. The damping that `_DECAY` asks for is then
+# still light: 2 / (2 pi 6) = 0.053.
 _FEWEST_PERIODS = 6.0
 # Highest frequency of a candidate, rad/sample: 0.9 of Nyquist's. Measured: at .8 or .99 of it, the median
 # ellipse stays to .1 % and coverage to .1 %.
@@ -73,10 +73,23 @@ _DISTINGUISHABLE = 1e-6
 # Rounds of `refined_pair`, each of half the step of the one before: the last step is 1/64 of a spacing.
 # Measured on eight of the arms: with three rounds no ellipse moves by more than 1 %.
 _REFINEMENTS = 6
+# Half bandwidths within which pairs are neighbours, whose probabilities are added up before they are judged.
+# It is more than `_SPACING`, so that a mode half way between two counts with both. Chosen.
+_NEIGHBOURHOOD = 2
+# Points at which each round of `refined_pair` looks along frequency, and along damping, in steps: the ends,
+# the middle and half way. Four further points each halve the interval. Chosen.
+_OFFSETS = (-1.0, -0.5, 0.0, 0.5, 1.0)
+# Fall of nu ln J, in ln nu, for which an order selection keeps a pair: ln nu for each of its four numbers
+# (Schwarz's criterion, as `ident.fit.least_squares.information_criterion` has it).
+_KEPT_BY_SELECTION = 4
+# Share of all probability that the pairs together must have for the best one to be visible: likelier than
+# not.
+_LIKELIER_THAN_REST = 0.5
 # Damping ratios between which a pair is refined: at .6 a mode has hardly a peak. Measured on eight
 # of the arms: with 1e-4 to .9 no ellipse moves by 1 %.
 _REFINED_ZETA = (1e-3, 0.6)
-# Largest share of a residual that counts as explained: a double tells the rest from none.
+# Largest share of a residual that counts as explained: what is left, 1e-15, is a few times the rounding of a
+# double, so that its logarithm is finite.
 _MOST_EXPLAINED = 1 - 1e-15
 
 
@@ -97,6 +110,7 @@ class PairStatistics:
     """What the data say on each of J pairs: inner products of its two columns X with the records.
 
     Nuisance and regressors F = Q1 R11 are projected out of X and of the output y. All columns are whitened.
+    `pair_statistics` makes them; nothing is checked here.
 
     Attributes
     ----------
@@ -119,7 +133,11 @@ class PairStatistics:
     size: RealArray
 
     def axes(self) -> PairAxes:
-        """Principal axes of the gram matrices of all pairs."""
+        """Principal axes of the gram matrices of all J pairs.
+
+        Eigenvalues below `_ROUNDING` of the columns' size are raised to it. A pair whose columns have NaN
+        gets eigenvalues of NaN and projections of zero.
+        """
         values, vectors = np.linalg.eigh(self.gram)
         along = np.einsum("jki,jk->ji", vectors, self.projection)
         rounding = _ROUNDING * self.size[:, None]
@@ -130,7 +148,10 @@ class PairStatistics:
         )
 
     def distinguishable(self) -> BoolArray:
-        """Whether these records can tell each pair from the poles and the nuisance at all, (J,)."""
+        """Whether these records can tell each pair from the poles and the nuisance at all, (J,).
+
+        False for a pair that the input does not drive, or whose columns are NaN.
+        """
         remaining = self.gram[:, 0, 0] + self.gram[:, 1, 1]
         return np.asarray(remaining > _DISTINGUISHABLE * self.size)
 
@@ -144,7 +165,7 @@ class PairEvidence:
     log_likelihood : ndarray, shape (J, A)
         Restricted, up to the constant of `embedding_algebra.restricted_log_likelihood`.
     energy : ndarray, shape (A,)
-        Expected energy of the pair in the output, in noise variances.
+        Expected energy of the pair in the output, in noise variances (`remainder_energies`).
     prior : ndarray, shape (A,)
         Prior probability of each energy; the sum is 1.
     mean : ndarray, shape (J, A, 2)
@@ -172,12 +193,13 @@ def candidate_pairs(n_samples: int, above: float = 0.0) -> tuple[ComplexArray, R
     n_samples : int
         Rows of the longest record.
     above : float
-        Least frequency of a pair, radians a sample.
+        Least frequency of a pair, radians a sample; one beyond the highest leaves a pair of each damping.
 
     Returns
     -------
     poles : ndarray, shape (J,)
-        In z. From six periods in the record, or `above`, to nine tenths of the Nyquist frequency.
+        In z, read-only. From six periods in the record, or `above`, to nine tenths of the Nyquist frequency;
+        first all of the least damping, ascending.
     prior : ndarray, shape (J,)
         Sum 1: each damping alike, and within a damping each pair.
 
@@ -230,13 +252,15 @@ def pair_statistics(
     blocks : iterable of RecordRows
         `EmbeddingRows.pair_blocks`: whitened rows, and the input behind the all-pass of the model's poles.
     reduced : ReducedRegression
-        The regression of the same rows; of it the triangle R11 and the columns in use matter.
+        The regression of the same rows; of it the triangle R11 (p, p), the columns in use and the residual
+        matter.
     poles : ndarray, shape (J,)
-        One of each pair, in z.
+        One of each pair, in z, above the axis and inside the circle.
 
     Returns
     -------
     PairStatistics
+        Not checked: without blocks all products are zero; NaN of a record is in all of them.
 
     Notes
     -----
@@ -312,8 +336,9 @@ def _pair_rows(parameters: Any, signal: Any, states: Any) -> Any:
     """Two arrays (T,J): the two basis functions of every pair alone, driven by the signal (T,).
 
     parameters (J,4): `block_parameters` of the pairs. states (2,J): where the pairs start, and afterwards
-    where they stand. All pairs advance together, as neighbours in memory, so that the processor takes several
-    at once: this loop is most of the time of `pair_statistics`.
+    where they stand, changed in place. All pairs advance together, as neighbours in memory, so that the
+    processor takes several at once: this loop is most of the time of `pair_statistics`. Compiled: shapes and
+    types are not checked, and fastmath does not promise to carry NaN through.
     """
     n_pairs = parameters.shape[0]
     # One contiguous row for each coefficient of the recursion.
@@ -357,11 +382,12 @@ def pair_evidence(statistics: PairStatistics, degrees_of_freedom: int) -> PairEv
     statistics : PairStatistics
         Of J pairs.
     degrees_of_freedom : int
-        nu, rows less nuisance columns and regressors.
+        nu, rows less nuisance columns and regressors; at least 2 (`remainder_energies`), not checked.
 
     Returns
     -------
     PairEvidence
+        Of a residual that is explained entirely, likelihood and noise variance of the smallest double.
 
     Notes
     -----
@@ -430,7 +456,7 @@ class PairMixture:
     visible: complex | None
 
     def most_probable_rad_s(self, dt_s: float) -> float:
-        """Natural frequency of the likeliest pair, rad/s; 0 where no pair was kept."""
+        """Natural frequency of the likeliest pair, rad/s; 0 where no pair was kept. dt_s: s, positive."""
         if self.weight.size == 0:
             return 0.0
         likeliest = self.poles[np.argmax(self.weight)]
@@ -450,7 +476,7 @@ def pair_mixture(
     Parameters
     ----------
     poles, prior : ndarray, shape (J,)
-        Of `candidate_pairs`.
+        Those of `candidate_pairs`; J is at least 1.
     statistics : PairStatistics
         Of these pairs.
     degrees_of_freedom : int
@@ -459,11 +485,12 @@ def pair_mixture(
         Logarithm of the likelihood averaged over all hypotheses without a missed mode
         (`embedding_algebra.total_log_evidence`).
     prior_odds : float
-        Prior probability of a missed mode over that of none.
+        Prior probability of a missed mode over that of none, above 0; not checked.
 
     Returns
     -------
     PairMixture
+        With K = 0 where no neighbourhood is probable. Not checked: a residual of zero divides by zero.
 
     Notes
     -----
@@ -481,13 +508,12 @@ def pair_mixture(
     total = per_pair.sum() + np.exp(log_rest - top)
     probability = per_pair / total
 
-    # The likeliest pairs of probable neighbourhoods (two half bandwidths), in grid order: moments of a
-    # mixture feel an improbable hypothesis by the square of its distance, and it is outside every confidence
-    # region.
+    # The likeliest pairs of probable neighbourhoods, in grid order: moments of a mixture feel an improbable
+    # hypothesis by the square of its distance, and it is outside every confidence region.
     frequency = np.angle(poles)
     decay = -np.log(np.abs(poles))
     apart = np.abs(frequency[:, None] - frequency)
-    near = apart <= 2 * np.maximum(decay[:, None], decay)
+    near = apart <= _NEIGHBOURHOOD * np.maximum(decay[:, None], decay)
     in_neighbourhood = near @ probability
     worth_keeping = (in_neighbourhood > _LEAST_PROBABILITY) & (probability > _NEGLIGIBLE)
     probable = np.flatnonzero(worth_keeping)
@@ -514,8 +540,8 @@ def pair_mixture(
     explained_share = min(float(explained[best]) / statistics.residual, _MOST_EXPLAINED)
     gain = -degrees_of_freedom * np.log1p(-explained_share)
     visible: complex | None = None
-    likelier_than_rest = weight_of_all_pairs > 0.5 * total
-    if gain > 4 * np.log(degrees_of_freedom) and likelier_than_rest:
+    likelier_than_rest = weight_of_all_pairs > _LIKELIER_THAN_REST * total
+    if gain > _KEPT_BY_SELECTION * np.log(degrees_of_freedom) and likelier_than_rest:
         visible = complex(poles[best])
     return PairMixture(
         poles=poles[chosen],
@@ -541,7 +567,13 @@ def refined_pair(
     reduced : ReducedRegression
         The regression of these rows.
     pair : complex
-        Point of the grid of `candidate_pairs`.
+        Point of the grid of `candidate_pairs`: above the axis, inside the circle; not checked.
+
+    Returns
+    -------
+    complex
+        Between the damping ratios `_REFINED_ZETA`, not above nine tenths of the Nyquist frequency. Where the
+        records tell no point from the poles: the corner of lowest frequency and damping.
 
     Notes
     -----
@@ -551,10 +583,11 @@ def refined_pair(
     rate = np.log(pair)
     omega = float(np.abs(rate))
     zeta = float(-np.real(rate) / np.abs(rate))
-    # From the grid point half way to its neighbours, in the logarithms of frequency and damping.
+    # From the grid point half way to its neighbours, in the logarithms of frequency and damping; each round
+    # half of that.
     step_omega = 0.5 * _SPACING * zeta
     step_zeta = 0.5 * np.log(_ZETA[1] / _ZETA[0])
-    offsets = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    offsets = np.array(_OFFSETS)
     for _ in range(_REFINEMENTS):
         omegas = np.minimum(omega * np.exp(step_omega * offsets), _HIGHEST)
         zetas = np.clip(zeta * np.exp(step_zeta * offsets), *_REFINED_ZETA)
@@ -576,7 +609,7 @@ def refined_pair(
 def _explained(statistics: PairStatistics) -> RealArray:
     """Drop (J,) of the residual sum of squares by each pair with free amplitudes, output units squared.
 
-    Zero for pairs that the records cannot tell from the poles.
+    Zero for pairs that the records cannot tell from the poles, those with NaN among them.
     """
     axes = statistics.axes()
     drop = np.sum(axes.projections**2 / axes.eigenvalues, axis=1)
@@ -589,14 +622,15 @@ def with_pairs(rest: KernelPosterior, mixture: PairMixture) -> KernelPosterior:
     Parameters
     ----------
     rest : KernelPosterior
-        Under the hypothesis of no missed mode; L taps.
+        Under the hypothesis of no missed mode; mean (L,) and factor (L, L') of the taps, noise variance.
     mixture : PairMixture
-        K pairs.
+        K pairs: weights (K,), and means (K, 2) and covariances (K, 2, 2) of their amplitudes.
 
     Returns
     -------
     KernelPosterior
-        Its kernel_mean has L + 2 K entries. It has the mean and the covariance of the mixture.
+        Its kernel_mean has L + 2 K entries. It has the mean and the covariance of the mixture; alpha, lam and
+        log_evidence stay those of `rest`. With K = 0, that of `rest` but for rounding.
 
     Notes
     -----
@@ -635,7 +669,8 @@ def cascade_coordinates(poles: ComplexArray) -> RealArray:
     Parameters
     ----------
     poles : ndarray, shape (K,)
-        One of each pair, in z, upper half plane.
+        One of each pair, in z, upper half plane, all different: of equal ones (not checked) the matrix is
+        singular.
 
     Notes
     -----
