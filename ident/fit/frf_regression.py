@@ -29,18 +29,25 @@ from ident.fit.problem import CandidateCost, Linearisation, ResidualColour, resi
 # frequency overrule all the others. Chosen; doubled or halved, no test of these fits fails.
 THINNEST = 1e-4
 # How far below pi / dt, as a share, a frequency counts as pi / dt, where a response is real: rounding of
-# files.
+# files of ten digits.
 _NYQUIST_ROUNDING = 1e-9
-# Largest angle of a pair per sample that a search looks at, over pi: the box of the search ends there, too.
+# Largest angle of a pair per sample that a search looks at, over pi: the box of the search
+# (`ident.basis.coordinates`) ends there, too, for a mode beyond is hard to tell from one that is folded back.
 _LARGEST_ANGLE_SHARE = 0.9
-# Least number of independent numbers that a residual is worth: the criterion takes its logarithm and divides
-# by what it leaves, and a residual of one colour throughout would be worth nothing.
+# Periods of the lowest measured frequency that the record has which `longest` stands for: the box of a search
+# begins at two periods in the longest record (`ident.basis.coordinates`), so it begins at that frequency.
+_PERIODS_OF_LOWEST = 2
+# Least number of independent numbers that a residual is worth: the criterion takes its logarithm as the price
+# of a free number, and a residual of one colour throughout would be worth nothing. Chosen, so that the price
+# is above 1.
 _LEAST_WORTH = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class FrfRegression:
     """Everything a fit of a frequency response (F,) needs but the poles.
+
+    `prepare_response` makes and checks it; nothing is checked here.
 
     Attributes
     ----------
@@ -81,28 +88,39 @@ class FrfRegression:
 
     @cached_property
     def longest(self) -> int:
-        """Samples of a record that shows two periods of the lowest measured frequency above 0."""
+        """Samples of a record that shows two periods of the lowest measured frequency above 0.
+
+        Raises ValueError (numpy's, of an empty array) where 0 is the only frequency.
+        """
         angle_rad = np.angle(self.z)
         is_moving = angle_rad > 0
         lowest_rad = angle_rad[is_moving].min()
-        return int(np.ceil(4 * np.pi / lowest_rad))
+        return int(np.ceil(2 * _PERIODS_OF_LOWEST * np.pi / lowest_rad))
 
     @cached_property
     def omega_max_rad_s(self) -> float | None:
-        """Last measured frequency, rad/s, at most .9 pi / dt: beyond it nothing shows where a pair is."""
+        """Last measured frequency, rad/s, at most .9 pi / dt: beyond it nothing shows where a pair is.
+
+        0 where 0 is the only frequency; never None.
+        """
         last_rad = float(np.angle(self.z).max())
         return min(last_rad, _LARGEST_ANGLE_SHARE * np.pi) / self.dt_s
 
     def n_parameters(self, order: int, n_fixed: int = 0) -> int:
         """Number of free real numbers of a fit with `order` poles, `n_fixed` of them known.
 
-        Coefficients, the direct term if there is one, and the poles that are not known.
+        Coefficients, the direct term if there is one, and the poles that are not known. Nothing is checked:
+        n_fixed above the order gives too few.
         """
         n_direct = 1 if self.feedthrough else 0
         return int(2 * order - n_fixed + n_direct)
 
     def whiten(self, response: ComplexArray) -> RealArray:
-        """Real rows of unit variance (..., 2 F, K) of complex columns (..., F, K)."""
+        """Real rows (..., 2 F, K) of complex columns (..., F, K), in which the measurement has unit variance.
+
+        First axes of all F ellipses, then second axes, zero where a response is real. ValueError (numpy's)
+        for another F.
+        """
         aligned = response * self.turn[:, np.newaxis]
         first_axis = aligned.real * self.weight[0][:, np.newaxis]
         second_axis = aligned.imag * self.weight[1][:, np.newaxis]
@@ -111,7 +129,8 @@ class FrfRegression:
     def responses(self, poles: Poles) -> ComplexArray:
         """Responses (F, B or B + 1) of the basis functions and of the direct term, if there is one.
 
-        All times the known factor `common`; whitened they are the columns of the fit.
+        All times the known factor `common`; whitened they are the columns of the fit. B is the order of the
+        poles, which lie inside the circle, so that z is none of them.
         """
         parts = [basis_response(poles, self.z)]
         if self.feedthrough:
@@ -119,7 +138,7 @@ class FrfRegression:
         return np.asarray(self.common[:, np.newaxis] * np.hstack(parts))
 
     def columns(self, poles: Poles) -> RealArray:
-        """Whitened columns (2 F, B or B + 1) of a fit with these poles."""
+        """Whitened columns (2 F, B or B + 1) of a fit with these poles; (2 F, 0) without any."""
         return self.whiten(self.responses(poles))
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
@@ -132,12 +151,17 @@ class FrfRegression:
         pairs : ndarray of complex, shape (P,)
             Poles above the axis, one per pair.
         below : float
-            Where the cost is not below this, normal matrix and gradient are empty.
+            Where the cost is not below this, or NaN, normal matrix and gradient are empty.
 
         Returns
         -------
         Linearisation
-            rss, normal (B, B) and gradient (B,), B = R + 2 P.
+            rss (no unit), normal (B, B) and gradient (B,), B = R + 2 P.
+
+        Raises
+        ------
+        ValueError
+            By `Poles`, for one that is not inside the circle.
         """
         # By orthogonal factorisation: a response has hundreds of rows, which cost no more than products do.
         poles = Poles(real, pairs)
@@ -151,14 +175,15 @@ class FrfRegression:
         return Linearisation(fit.rss, directions.T @ directions, directions.T @ fit.residual)
 
     def residual(self, poles: Poles) -> RealArray:
-        """Whitened residual (2 F,) that the fit with these poles leaves."""
+        """Whitened residual (2 F,) that the fit with these poles leaves, no unit; see `fit_response`."""
         return fit_response(self, poles).residual
 
     def colour(self, residual: RealArray) -> ResidualColour:
         """Colour of a whitened residual (2 F,) over frequency; what it is worth counts measured numbers.
 
         The axes are two records of F numbers. At 0 and pi / dt one of the two was not measured and is zero:
-        that is no number, so the share of independent ones counts of `n_samples`.
+        that is no number, so the share of independent ones counts of `n_samples`. Worth at least
+        `_LEAST_WORTH`. A residual of zeros or with NaN: `n_samples`, not white.
         """
         count = self.z.size
         starts = np.array([0, count, 2 * count], dtype=np.int64)
@@ -172,13 +197,15 @@ class FrfRegression:
         Parameters
         ----------
         rss, order
-            J and number of poles of the fit that tells how well the covariances explain the residual.
+            J and number of poles of the fit that tells how well the covariances explain the residual. Of an
+            order with as many free numbers as measured ones the excess is J itself.
         worth : float
-            Ne, independent numbers that its residual is worth.
+            Ne, independent numbers that its residual is worth, positive; not checked.
 
         Returns
         -------
         callable
+            NaN for a J of NaN.
 
         Notes
         -----
@@ -214,7 +241,8 @@ class FrfRegression:
         Returns
         -------
         CandidateCost
-            J at points of the unit cube, one at a time or many.
+            J (no unit) at points of the unit cube, one at a time or many. Points outside the cube, and
+            shapes, are not checked.
         """
         frozen = self.columns(shared)
         q = np.linalg.qr(frozen)[0] if frozen.shape[1] else frozen
@@ -223,7 +251,7 @@ class FrfRegression:
         drive = self.common * all_pass_response(shared, self.z)
 
         def costs(units: RealArray) -> RealArray:
-            """J (E,) at points (E, D), all in one factorisation."""
+            """J (E,) at points (E, D), E at least 1, all in one factorisation."""
             blocks = np.stack([space.blocks(unit) for unit in units])
             rows = self.whiten(_cascade_responses(blocks, space.n_real, self.z, drive))
             new_rows = rows - q @ (q.T @ rows)
@@ -242,8 +270,9 @@ class FrfRegression:
 def _cascade_responses(blocks: RealArray, n_real: int, z: ComplexArray, drive: ComplexArray) -> ComplexArray:
     """Responses (E, F, B) of E cascades behind `drive` (F,), at the points z (F,).
 
-    blocks (E, R + P, 4): of each cascade, `n_real` real poles first, as in
-    `ident.basis.functions.block_parameters`.
+    blocks (E, R + P, 4): of each cascade, `n_real` = R real poles first, as in
+    `ident.basis.functions.block_parameters`; at least one block (numpy refuses to stack none). z on the unit
+    circle, so that no pole is met. B = R + 2 P; the unit is that of `drive`.
     """
     entering = np.broadcast_to(drive, (len(blocks), z.size))
     columns = []
@@ -274,7 +303,7 @@ def prepare_response(
         omega_rad_s (F,), ascending, not 0 with integrators, whose factor is infinite there; centre (F,), the
         measured response; covariance (F, 2, 2) of its real and imaginary part; dt_s.
     integrators, delay_samples : int
-        Known factor (z / (z - 1))^integrators z^-delay_samples of the model.
+        Known factor (z / (z - 1))^integrators z^-delay_samples of the model; at least 0, not checked.
     feedthrough : bool
         Whether the model has a direct term.
 
@@ -285,7 +314,8 @@ def prepare_response(
     Raises
     ------
     ValueError
-        A frequency without any uncertainty.
+        A frequency without any uncertainty (both axes zero). Not checked: omega = 0 with integrators gives a
+        factor that is not finite. Shapes, order and finite numbers are checked by `FrequencyUncertainty`.
     """
     omega = response.omega_rad_s
     s1, s2, direction = standard_axes(response.covariance)
@@ -356,14 +386,15 @@ def fit_response(data: FrfRegression, poles: Poles) -> FrfFit:
     Parameters
     ----------
     data : FrfRegression
-        Whitened measurement (2 F,).
+        Whitened measurement y (2 F,), weights and turns, known factor.
     poles : Poles
         B poles of the basis.
 
     Returns
     -------
     FrfFit
-        Directions that the data do not show (`RANK_TOLERANCE`) have coefficient zero.
+        Directions that the data do not show (`RANK_TOLERANCE`) have coefficient zero; so with more columns
+        than rows, which is not refused here. (27) is the paper's equation (Ziaei and Wang, 2006).
     """
     responses = data.responses(poles)
     q, triangle = np.linalg.qr(data.whiten(responses))

@@ -9,7 +9,9 @@ columns are too dependent for products, `linearise` says so and its caller facto
 Signals of several records lie one after the other in arrays (N,), record i in starts[i]:starts[i + 1], starts
 (K + 1,) beginning with 0; matrices are kept as rows, so that a column of the regression lies in one piece. A
 function whose products and sums may be fused or reordered is always compiled into its callers (forceinline):
-copies round differently.
+copies round differently. Nothing is checked in this file: compiled code reads and writes beyond an array
+without a word, so shapes, numbers of rows and lo <= hi <= N are the callers' care. A NaN in signals or points
+comes out in sums; what a factorisation makes of it is said there.
 """
 
 from __future__ import annotations
@@ -35,16 +37,23 @@ _LEAST_LENGTH_OF_FREE_ROW = 1e-11
 # The inverse of the products is wrong by 1e-16 over this, 1e-8, and one step of refinement squares that to
 # rounding. Doubled or halved, no test moves; at 1e-12 a test of nearly dependent columns fails.
 _LEAST_PIVOT = 1e-8
-# numpy's scalars: of Python's own numba compiles a version of the called function for each value.
+# First sample or row, and the two values of `lower` of `_products`. numpy's scalars: of Python's own numba
+# compiles a version of the called function for each value.
 _START: Any = np.int64(0)
+# Only the lower triangle.
 _LOWER: Any = np.bool_(True)
+# All products.
 _ALL: Any = np.bool_(False)
+# Compiled for calls from compiled code alone: `INSIDE` leaves out the wrapper for calls from Python.
 _called = numba.njit(**INSIDE)
 
 
 @numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
-    """Inner product of a (N,) and b (N,) over the samples lo..hi."""
+    """Inner product of a (N,) and b (N,) over the samples lo..hi; 0 where there are none.
+
+    Its sum may be taken in any order (reassoc), so that the last digits depend on where it is inlined.
+    """
     # Slices counted from 0: a[k], lo <= k < hi, allows for negative k and is not vectorised (ten times
     # slower).
     x = a[lo:hi]
@@ -57,10 +66,12 @@ def _dot(a: Any, b: Any, lo: int, hi: int) -> float:
 
 @numba.njit(**INSIDE, forceinline=True, fastmath={"reassoc", "contract"})
 def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) -> Any:
-    """Inner products over lo..hi of a (N,) with rows j .. j + 3, and those of b (N,) with them: two tuples.
+    """Inner products over lo..hi of a (N,) with rows j .. j + 3, and those of b (N,) with them: two 4-tuples.
 
-    Row `last` stands in for rows beyond it, so that the caller need not count. Eight at a time, because each
-    number that is read from memory is then used more than once: that is what the loop waits for.
+    rows (n, N), j <= last < n. Row `last` stands in for rows beyond it, so that the caller need not count.
+    Eight at a time, because each number that is read from memory is then used more than once: that is what
+    the loop waits for. Not more: eight sums, four rows and two vectors are 14 of the 16 registers that x86
+    has.
     """
     x = a[lo:hi]
     z = b[lo:hi]
@@ -86,13 +97,15 @@ def _eight_dots(a: Any, b: Any, rows: Any, j: int, last: int, lo: int, hi: int) 
 def _products(rows: Any, others: Any, lo: int, hi: int, lower: bool, first: int, target: Any) -> None:
     """Fill target[i, j] with the inner product over lo..hi of rows[i] and others[j], from row `first` on.
 
-    rows (R, N), others (S, N), target (R, S); with `lower` only j <= i. Targets are always slices of both
-    axes: one type, one compilation.
+    rows (R, N), others (S, N), target (R, S); with `lower` only j <= i (of two rows together: up to the
+    second one's diagonal), and then others has at least R rows. Targets are always slices of both axes: one
+    type, one compilation. Rows before `first`, and the rest of the target, stay as they are.
     """
     for i in range(first, rows.shape[0], 2):
         # Two rows at a time; an odd last one is paired with itself.
         second = min(i + 1, rows.shape[0] - 1)
         last = second if lower else others.shape[0] - 1
+        # Four others at a time, as `_eight_dots` takes them.
         for j in range(0, last + 1, 4):
             of_first, of_second = _eight_dots(rows[i], rows[second], others, j, last, lo, hi)
             for q in range(min(4, last + 1 - j)):
@@ -111,7 +124,7 @@ def _subtract(target: Any, factor: float, row: Any, lo: int, hi: int) -> None:
 
 @_called
 def _copy(target: Any, source: Any) -> None:
-    """Copy source (n,) into the first n numbers of target."""
+    """Copy source (n,) into the first n numbers of target, which has at least n."""
     # Array assignments would do, but each makes numba compile seconds of broadcasting code.
     for k in range(source.size):
         target[k] = source[k]
@@ -119,7 +132,10 @@ def _copy(target: Any, source: Any) -> None:
 
 @_called
 def _subtract_squares(target: Any, a: Any, first: int) -> None:
-    """Take a a^T out of the lower triangle of target (R, R), from row `first` on; a (R, Q)."""
+    """Take a a^T out of the lower triangle of target (R, R), from row `first` on, in place; a (R, Q).
+
+    What stands above the diagonal stays.
+    """
     for i in range(first, a.shape[0]):
         for j in range(i + 1):
             total = 0.0
@@ -142,8 +158,8 @@ def schur_drop(gram: Any, b: Any) -> float:
     Returns
     -------
     float
-        At least 0. A column that depends on those before it to within `_LEAST_SQUARE_OF_CANDIDATE` is left
-        out.
+        At least 0, in the unit of b squared over that of gram. A column that depends on those before it to
+        within `_LEAST_SQUARE_OF_CANDIDATE` is left out, and so is one whose products are NaN.
     """
     n = b.size
     drop = 0.0
@@ -177,7 +193,8 @@ def factorise(gram: Any, n: int, least_pivot: float) -> bool:
     """Whether gram[:n, :n] has a Cholesky factor L L^T, which then stands in its lower triangle.
 
     False, with the triangle half overwritten, if the square of a column's part outside the ones before is
-    not above `least_pivot` times its own square.
+    not above `least_pivot` (a share, no unit) times its own square; so for a column of zeros or NaN. gram has
+    n rows or more, and only its lower triangle is read.
     """
     for j in range(n):
         diagonal = gram[j, j]
@@ -197,7 +214,7 @@ def factorise(gram: Any, n: int, least_pivot: float) -> bool:
 
 @_called
 def forward(factor: Any, n: int, b: Any) -> None:
-    """Replace b[:n] by L^-1 b[:n], L the lower triangle of factor[:n, :n]."""
+    """Replace b[:n] by L^-1 b[:n], L the lower triangle of factor[:n, :n], its diagonal not zero."""
     for i in range(n):
         for j in range(i):
             b[i] -= factor[i, j] * b[j]
@@ -206,7 +223,7 @@ def forward(factor: Any, n: int, b: Any) -> None:
 
 @_called
 def backward(factor: Any, n: int, b: Any) -> None:
-    """Replace b[:n] by L^-T b[:n], L the lower triangle of factor[:n, :n]."""
+    """Replace b[:n] by L^-T b[:n], L the lower triangle of factor[:n, :n], its diagonal not zero."""
     for i in range(n - 1, -1, -1):
         for j in range(i + 1, n):
             b[i] -= factor[j, i] * b[j]
@@ -239,7 +256,11 @@ def driven_rows(blocks: Any, n_real: int, signals: Any, starts: Any, rows: Any) 
 
 @numba.njit(**COMPILED, inline="always")
 def _free_rows(blocks: Any, n_real: int, starts: Any) -> Any:
-    """Free responses (B, T) of a cascade over the longest record, T samples; shorter ones use their start."""
+    """Free responses (B, T) of a cascade over the longest record, T samples; shorter ones use their start.
+
+    blocks (R + P, 4) of R = n_real real poles and P pairs, B = R + 2 P; starts (K + 1,). No unit: they are
+    states after a unit impulse.
+    """
     # starts[0] is 0; Python's own 0 would make numba compile `run_cascade_free` once more.
     longest = starts[0]
     for r in range(starts.size - 1):
@@ -267,9 +288,10 @@ def cost_of_point(
     Parameters
     ----------
     unit : ndarray, shape (D,)
-        Point of the search: D = R + 2 P numbers from 0 to 1.
+        Point of the search: D = R + 2 P numbers from 0 to 1; beyond them poles leave the circle.
     n_real, low, high, raw
-        Search space: number R of real poles, ends (3,) of its box, whether its coordinates are the paper's.
+        Search space: number R of real poles, ends (3,) of its box, whether its coordinates are the paper's
+        (`ident.basis.coordinates.SearchSpace`).
     drive : ndarray, shape (U, N)
         Signals that drive the candidate blocks: each input behind the all-pass of the frozen poles.
     frozen : ndarray, shape (Q + 1, N)
@@ -284,7 +306,7 @@ def cost_of_point(
     Returns
     -------
     float
-        Square of the unit of the output.
+        Square of the unit of the output. For a point with NaN: what the frozen columns leave.
 
     Notes
     -----
@@ -347,8 +369,10 @@ def cost_of_point(
 def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> Any:
     """Polynomials and free responses (Q + B, N), orthonormal in each record.
 
-    polynomials_q (Q, N) are orthonormal already. Modified Gram-Schmidt, twice, which is as exact as a
-    factorisation. A free response that depends on the rows before it becomes zero.
+    blocks (R + P, 4) of R = n_real real poles and P pairs, B = R + 2 P. polynomials_q (Q, N) are orthonormal
+    already; starts (K + 1,). Modified Gram-Schmidt, twice, which is as exact as a factorisation. A free
+    response that depends on the rows before it becomes zero, as some do in a record of fewer than Q + B
+    samples.
     """
     n_known = polynomials_q.shape[0]
     response = _free_rows(blocks, n_real, starts)
@@ -362,6 +386,7 @@ def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> An
             part = rows[i, lo:hi]
             _copy(part, response[i - n_known, : hi - lo])
             square_before = _dot(part, part, _START, part.size)
+            # Twice is enough: the second pass takes off what rounding left of the first.
             for _ in range(2):
                 for j in range(i):
                     _subtract(rows[i], _dot(rows[j], rows[i], lo, hi), rows[j], lo, hi)
@@ -375,7 +400,10 @@ def _local_rows(blocks: Any, n_real: int, polynomials_q: Any, starts: Any) -> An
 
 @_called
 def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
-    """Take the local columns local_q (L, N), orthonormal in each record, out of target (N,), in place."""
+    """Take the local columns local_q (L, N), orthonormal in each record, out of target (N,), in place.
+
+    starts (K + 1,). Columns that are not orthonormal are taken out by another amount than projection would.
+    """
     for r in range(starts.size - 1):
         lo = starts[r]
         hi = starts[r + 1]
@@ -387,8 +415,9 @@ def _take_out_local(target: Any, local_q: Any, starts: Any) -> None:
 def _off_local_products(rows: Any, first: int, local_q: Any, starts: Any, on_local: Any, gram: Any) -> None:
     """Fill gram (R, R) with products of rows `first` .. with all rows before them, local columns taken out.
 
-    rows (R, N); local_q (L, N). on_local (R, L K) receives the products with local_q, record after record;
-    its first `first` rows are read, from an earlier call.
+    rows (R, N); local_q (L, N), orthonormal in each record; starts (K + 1,). on_local (R or more, L K)
+    receives the products with local_q, record after record; its first `first` rows are read, from an earlier
+    call. Only the lower triangle of gram is right.
     """
     n_local = local_q.shape[0]
     _products(rows, rows, _START, rows.shape[1], _LOWER, first, gram[:, :])
@@ -439,7 +468,8 @@ def linearise(
     Returns
     -------
     float
-        J, square of the unit of the output; -1 if the columns are too dependent for products.
+        J, square of the unit of the output; -1 if the columns are too dependent for products, one of them is
+        zero, or NaN is among them. NaN of y alone gives NaN.
 
     Notes
     -----

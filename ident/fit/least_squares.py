@@ -38,6 +38,9 @@ EXPLAINED = 1e-18
 class Regression:
     """Records made ready for a fit, one after the other: everything it needs but the poles.
 
+    `ident.fit.regression` makes it from checked records; nothing is checked here, and every record has at
+    least one sample.
+
     Attributes
     ----------
     u : ndarray, shape (U, N)
@@ -80,7 +83,7 @@ class Regression:
 
     @cached_property
     def y_clear(self) -> RealArray:
-        """Outputs without their part in the polynomial columns, (N,)."""
+        """Outputs without their part in the polynomial columns, (N,), units of the output."""
         y = self.y.copy()
         self.take_out_local(self.polynomials_q, y[np.newaxis])
         return y
@@ -117,7 +120,10 @@ class Regression:
         return tuple(slice(low, high) for low, high in ends)
 
     def n_parameters(self, order: int) -> int:
-        """Free real numbers of a fit with `order` poles: coefficients of each input, poles, nuisances."""
+        """Free real numbers of a fit with `order` poles: coefficients of each input, poles, nuisances.
+
+        Known poles count as free. order: at least 0, not checked.
+        """
         n_free_responses = order if self.structure.estimate_initial_state else 0
         per_record = self.polynomials.shape[0] + n_free_responses
         n_records = self.starts.size - 1
@@ -127,7 +133,10 @@ class Regression:
         return int(order + self.n_inputs * per_input + n_records * per_record)
 
     def take_out_local(self, local_q: RealArray, rows: RealArray) -> None:
-        """Project rows (R, N) off the columns local_q (Q, N), orthonormal in each record, in place."""
+        """Project rows (R, N) off the columns local_q (Q, N), orthonormal in each record, in place.
+
+        Q = 0 leaves them. That local_q is orthonormal is not checked; other shapes numpy refuses.
+        """
         if len(local_q):
             for segment in self.segments:
                 q = local_q[:, segment]
@@ -150,7 +159,14 @@ class Regression:
         Returns
         -------
         Linearisation
-            rss, normal (B, B) and gradient (B,), B = R + 2 P.
+            rss (output units squared), normal (B, B) and gradient (B,), B = R + 2 P. Of y with NaN all are
+            NaN.
+
+        Raises
+        ------
+        ValueError
+            By `Poles`, for one that is not inside the circle, but only where products do not tell: else it is
+            not checked.
         """
         blocks = blocks_of_poles(real, pairs)
         n = real.size + 2 * pairs.size
@@ -166,15 +182,21 @@ class Regression:
         return Linearisation(rss, normal, gradient)
 
     def residual(self, poles: Poles) -> RealArray:
-        """Residual (N,) that the fit with these poles leaves of the output."""
+        """Residual (N,) that the fit with these poles leaves of the output, in its units.
+
+        With more columns than samples it is rounding: `fit` refuses that, this does not.
+        """
         return project(self, poles).residual
 
     def colour(self, residual: RealArray) -> ResidualColour:
-        """Colour of a residual (N,)."""
+        """Colour of a residual (N,): see `residual_colour`, also for zeros and NaN."""
         return residual_colour(residual, self.starts)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """Criterion (J, order) -> number, lower is better: see `information_criterion`."""
+        """Criterion (J, order) -> number, lower is better: see `information_criterion`.
+
+        rss and order are not used: records need no scale from a fit. worth: independent numbers, positive.
+        """
         return information_criterion(float(self.y @ self.y), self, worth)
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
@@ -190,6 +212,8 @@ class Regression:
         Returns
         -------
         CandidateCost
+            J, output units squared, at points (D,) of the unit cube, writable arrays; compiled, so that
+            points outside and shapes are not checked.
         """
         projection = project(self, shared, local)
         frozen = np.vstack([projection.shared_q, projection.residual])
@@ -218,7 +242,12 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
     data : PoleProblem
         Its N = `n_samples`, and `n_parameters` of an order.
     worth : float
-        Ne, independent numbers that a residual is worth.
+        Ne, independent numbers that a residual is worth; positive, not checked.
+
+    Returns
+    -------
+    callable
+        Of a J that is zero or negative: the value at `EXPLAINED` |y|^2. Of NaN: NaN.
     """
     floor = max(EXPLAINED * power, np.finfo(np.float64).tiny)
 
@@ -256,7 +285,11 @@ class Projection:
     residual: RealArray
 
     def coefficients(self, y: RealArray) -> RealArray:
-        """Least-squares coefficients (Qs,) of the shared columns for the output y (N,)."""
+        """Least-squares coefficients (Qs,) of the shared columns for the output y (N,).
+
+        Output units per unit of a column. Directions weaker than `RANK_TOLERANCE` are left at zero; y with
+        NaN gives NaN.
+        """
         # Q is orthogonal to the local part of y, so that needs no subtraction here.
         projected = self.shared_q @ y
         theta = np.linalg.lstsq(self.triangle, projected, rcond=RANK_TOLERANCE)[0]
@@ -288,7 +321,8 @@ class LinearFit:
 def _driven(data: Regression, poles: Poles, signals: RealArray) -> tuple[RealArray, RealArray]:
     """Basis functions driven by signals (U, N) from rest in each record, and the signals behind the all-pass.
 
-    (U B, N), the states of the first signal first, and (U, N).
+    (U B, N), the states of the first signal first, and (U, N), in the units of the signals. B: order of the
+    poles; of data only `starts` counts. Compiled: that the signals have N samples is not checked.
     """
     rows = np.empty((signals.shape[0] * poles.order, signals.shape[1]))
     through = signals.copy()
@@ -306,11 +340,13 @@ def project(data: Regression, shared: Poles, local: Poles | None = None) -> Proj
     shared : Poles
         Poles of the basis that the inputs drive.
     local : Poles, optional
-        Poles of the free responses; default: `shared`.
+        Poles of the free responses; default: `shared`. Not used where records start from rest.
 
     Returns
     -------
     Projection
+        Qs is U B, and U more with a direct term. With more columns than samples, or NaN, nothing is refused:
+        the residual is rounding, or NaN.
 
     Notes
     -----
@@ -359,7 +395,8 @@ def fit(data: Regression, poles: Poles) -> LinearFit:
     Returns
     -------
     LinearFit
-        Directions that the data do not show (`RANK_TOLERANCE`) have coefficient zero.
+        Directions that the data do not show (`RANK_TOLERANCE`) have coefficient zero. Signals with NaN give
+        NaN. (27) is the paper's equation (Ziaei and Wang, 2006).
 
     Raises
     ------
@@ -382,7 +419,10 @@ def fit(data: Regression, poles: Poles) -> LinearFit:
 
 
 def block_states(data: Regression, poles: Poles, signal: RealArray) -> RealArray:
-    """States (B, N) of each block by itself driven by the signal (N,), record by record from rest."""
+    """States (B, N) of each block by itself driven by the signal (N,), record by record from rest.
+
+    In the unit of the signal, real poles first, two rows per pair; (0, N) without poles.
+    """
     parts = [_driven(data, block, signal[np.newaxis])[0] for block in poles.blocks()]
     return np.concatenate(parts) if parts else np.zeros((0, signal.size))
 
@@ -391,7 +431,7 @@ def linearisation(data: Regression, poles: Poles) -> Linearisation:
     """Cost and Kaufman linearisation at these poles, by orthogonal factorisation.
 
     `Regression.linearise` has the same answer several times as fast where the columns are not too dependent.
-    rss, normal (B, B), gradient (B,), all filled.
+    rss (output units squared), normal (B, B), gradient (B,), all filled; NaN where the records have NaN.
     """
     projection = project(data, poles)
     # What the poles make of the output. A polynomial part stays in the span of free responses; without them

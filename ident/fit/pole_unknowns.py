@@ -8,7 +8,9 @@ keeps its shape. The first functions keep unknowns inside their bounds and tell 
 `ident.fit.refinement.refine`.
 
 Fixed poles come first of each type, and have no unknowns: with n_free_real = R - n_fixed_real, an array x
-(P,) holds 1 - a of the free real poles and then s, f of each free pair.
+(P,) holds 1 - a of the free real poles and then s, f of each free pair. `bounds` is `Bounds.array` of
+`ident.fit.refinement` everywhere, in the order of the constants below. Nothing is checked in this file:
+compiled code reads beyond an array without a word, so numbers of poles and shapes are the callers' care.
 """
 
 from __future__ import annotations
@@ -53,11 +55,12 @@ _CLOSE = 1e-7
 # Least angle of a pair per sample, rad: a pair has to lie above the axis, and no record shows one so slow.
 _LEAST_ANGLE_RAD = 1e-12
 # Largest angle of a pair per sample, over pi: beyond pi a mode is folded back, and at pi its pair is a real
-# pole. As in `ident.fit.refinement`.
+# pole. Chosen; it has to be the number of `ident.fit.refinement`.
 _LARGEST_ANGLE_SHARE = 0.995
 # Least square of a direction's length, in place of zero: a pole that moves nothing has a scale to divide by.
 _TINY = 1e-300
-# Least pivot of the damped normal matrix of unit diagonal: a step is only taken if its factor has two digits.
+# Least pivot of the damped normal matrix of unit diagonal, whose products are rounded to 1e-16: a step is
+# only taken if its factor has two digits. Else `refine` adds damping.
 _LEAST_PIVOT_OF_STEP = 1e-14
 # Pieces of the two compiled functions at the end: as functions of their own they would be compiled twice.
 _inlined = numba.njit(**COMPILED, inline="always")
@@ -68,7 +71,7 @@ def narrowest(f: float, bounds: Any) -> float:
     """Least decay per sample of a pair at angle f [rad/sample]: its distance to the nearest measured band.
 
     A resonance is 2 s wide at half its power, so something measured then lies within that width. 0 where the
-    bounds list no measured bands.
+    bounds list no measured bands, inside one, and for an angle of NaN.
     """
     if bounds.size <= _FIRST_BAND:
         return 0.0
@@ -82,8 +85,9 @@ def narrowest(f: float, bounds: Any) -> float:
 def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
     """Unknowns (P,) that x (P,) becomes inside the bounds.
 
-    Of a pair frequency |log p| and damping ratio are clipped, then s and f formed again. A pair that is
-    narrower than its distance to the data is widened, but never beyond the largest damping.
+    n_free_real: how many of them are 1 - a. Of a pair frequency |log p| and damping ratio are clipped, then s
+    and f formed again. A pair that is narrower than its distance to the data is widened, but never beyond the
+    largest damping, which is below 1. Unknowns of NaN may stay NaN.
     """
     inside = np.empty_like(x)
     for i in range(n_free_real):
@@ -107,7 +111,8 @@ def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
 def blocked(x: Any, gradient: Any, n_free_real: int, bounds: Any) -> Any:
     """Which unknowns x (P,) stand on a bound and would be driven out of it, (P,): 1 for yes, 0 for no.
 
-    gradient (P,) = S^T r by unknowns: a step goes along it.
+    gradient (P,) = S^T r by unknowns: a step goes along it. x lies inside the bounds; an unknown counts as on
+    one to `_CLOSE`. Real poles with a gradient of zero or NaN count as driven upwards.
     """
     # Floats, not booleans: zeros of another type would be compiled for this alone.
     held = np.zeros(x.size)
@@ -140,7 +145,8 @@ def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> 
     real (R,) and pairs (P',) are all poles, the fixed ones first. The states are those of each block by
     itself, driven by the fitted output y_hat. Of a real block: b/(z - a) y_hat; of a pair: sg (z - beta)/D
     y_hat and sg sb/D y_hat, with D = z^2 - t z + g, t = 2 exp(-s) cos f, g = exp(-2 s). Moving a pole changes
-    y_hat by -(dD/dp)/D y_hat; here dD = -z dt + dg is written in the two states.
+    y_hat by -(dD/dp)/D y_hat; here dD = -z dt + dg is written in the two states. B = R + 2 P'; P unknowns of
+    the free poles. Poles lie inside the circle: on it the numbers divided by are zero.
     """
     blocks = blocks_of_poles(real, pairs)
     n_real = real.size
@@ -171,8 +177,9 @@ def chain_rule(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> 
 def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns.
 
-    chain (B, P) from `chain_rule`; normal (B, B) and gradient (B,) by block states. The chain has one or two
-    numbers a column, so zeros are skipped instead of multiplied.
+    chain (B, P) from `chain_rule`; normal (B, B) and gradient (B,) by block states; they are not changed. The
+    chain has one or two numbers a column, so zeros are skipped instead of multiplied; NaN of a block stays
+    with its unknowns.
     """
     n, m = chain.shape
     system = np.zeros((m, m))
@@ -195,7 +202,9 @@ def _by_unknowns(chain: Any, normal: Any, gradient: Any) -> tuple[Any, Any]:
 def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> Any:
     """Unknowns (P,) of poles: 1 - a of the free real poles, then s, f of each free pair.
 
-    real (R,) and pairs (P',) are all poles, the fixed ones first.
+    real (R,) and pairs (P',) are all poles, the fixed ones first; a pair at 0 has no logarithm (ValueError).
+    Not
+    compiled; ValueError or IndexError of numpy where more are fixed than there are.
     """
     n_free_real = real.size - n_fixed_real
     x = np.empty(n_free_real + 2 * (pairs.size - n_fixed_pairs))
@@ -211,7 +220,10 @@ def free_parameters(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int
 
 @_inlined
 def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int) -> None:
-    """Put the unknowns x (P,) into the free poles of real (R,) and pairs (P',), in place."""
+    """Put the unknowns x (P,) into the free poles of real (R,) and pairs (P',), in place.
+
+    Unknowns inside the bounds give poles inside the circle; others are not refused.
+    """
     n_free_real = real.size - n_fixed_real
     for i in range(n_free_real):
         real[n_fixed_real + i] = 1 - x[i]
@@ -225,7 +237,8 @@ def set_poles(x: Any, real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: i
 def start(real: Any, pairs: Any, n_fixed_real: int, n_fixed_pairs: int, bounds: Any) -> Any:
     """Unknowns (P,) of the poles, brought inside the bounds; the free poles are changed to match, in place.
 
-    bounds: `Bounds.array`. Called too seldom to be compiled.
+    real (R,) and pairs (P',) are writable, the fixed ones first of each type. bounds: `Bounds.array`. Called
+    too seldom to be compiled. More fixed poles than there are: IndexError.
     """
     x = free_parameters(real, pairs, n_fixed_real, n_fixed_pairs)
     x = clip_parameters.py_func(x, real.size - n_fixed_real, bounds)
@@ -270,7 +283,8 @@ def scaled_system(
     free : ndarray of int, shape (m,)
         Which of the unknowns they are.
     promised : float
-        Fall of J that the linearisation promises.
+        Fall of J that the linearisation promises, in the unit of J; 0 where every unknown is held.
+        Unknowns whose column of normal has NaN promise nothing.
     """
     # From block states to unknowns, and which of these are free to move.
     chain = chain_rule(real, pairs, n_fixed_real, n_fixed_pairs)
@@ -316,12 +330,14 @@ def damped_step(
     Parameters
     ----------
     x, n_fixed_real, n_fixed_pairs, bounds, system, slope, scale, free
-        Those of `scaled_system`, and what it returned.
+        Those of `scaled_system`: unknowns (P,), numbers of fixed poles, `Bounds.array`; and what it returned
+        for the m unknowns that no bound holds: (m, m), (m,), (m,), (m,).
     damping : float
         Added to the unit diagonal of the system: 0 is a Gauss-Newton step, large numbers are short steps
-        downhill.
+        downhill. Negative ones are not checked.
     real, pairs : ndarray, shapes (R,) and (P',)
-        Their free poles are filled with those of the step.
+        Their free poles are filled with those of the step; left alone where none is possible, because the
+        damped system is too nearly singular (`_LEAST_PIVOT_OF_STEP`) or has NaN.
 
     Notes
     -----

@@ -27,12 +27,13 @@ from ident.data.finding import TEST_LEVEL, WHITE_LAGS
 # Share of |y|^2 below which products of columns, rounded to 1e-15 of it and summed, know nothing of a
 # residual: the logarithm that DIRECT sees ends here. A refinement sees the true residual.
 _FLOOR = 1e-13
-# Most lags whose autocorrelation says how much a residual is worth, and how many samples of the shortest
-# record there must be per lag: an autocorrelation is known to one over the root of the number of its
-# products.
+# Most lags whose autocorrelation says how much a residual is worth. Chosen: what a model leaves is forgotten
+# within 200 samples unless it is a drift, and more lags add the scatter of what is none.
 _MOST_LAGS = 200
 
-# Samples of the shortest record per lag.
+# Samples of the shortest record per lag: an autocorrelation is known to one over the root of the number of
+# its products, of which so nine tenths are there at the last lag. Chosen. Its product with `WHITE_LAGS` is
+# the shortest record in which a residual can count as white, 250 samples.
 _SAMPLES_PER_LAG = 10
 
 
@@ -47,9 +48,10 @@ class Linearisation(NamedTuple):
     rss : float
         J = |r|^2.
     normal : ndarray, shape (B, B)
-        S^T S, the Gauss-Newton (Kaufman) Hessian.
+        S^T S, the Gauss-Newton (Kaufman) Hessian. Empty, or not filled, where rss was not below what the
+        caller had asked for (`below`).
     gradient : ndarray, shape (B,)
-        S^T r.
+        S^T r; where normal is.
     """
 
     rss: float
@@ -77,11 +79,11 @@ class CandidateCost:
         space : SearchSpace
             What a point of the cube stands for.
         power : float
-            |y|^2.
+            |y|^2, in the unit of J; of zero `log` fails for a J of zero.
         one : callable
             J at a point (D,).
         many : callable, optional
-            J (E,) at points (E, D), where that is faster than one by one.
+            J (E,) at points (E, D), where that is faster than one by one. Nothing is checked here.
         """
         self.space = space
         self.evaluations = 0
@@ -90,7 +92,10 @@ class CandidateCost:
         self._floor = _FLOOR * power
 
     def rss(self, units: RealArray) -> RealArray:
-        """Residual sums of squares (E,) at points (E, D) of the unit cube."""
+        """Residual sums of squares (E,) at points (E, D) of the unit cube, in the unit of `power`.
+
+        A point outside the cube, or of another D, is not refused: its value means nothing.
+        """
         self.evaluations += len(units)
         if self._many is not None:
             return self._many(units)
@@ -98,12 +103,18 @@ class CandidateCost:
         return np.array([self._one(unit) for unit in kernel_array(units)])
 
     def at(self, unit: RealArray) -> float:
-        """Residual sum of squares at a point (D,) of the unit cube."""
+        """Residual sum of squares at a point (D,) of the unit cube; as `rss`, nothing is checked.
+
+        The point has to be contiguous and writable, as compiled code takes it.
+        """
         self.evaluations += 1
         return self._one(unit)
 
     def log(self, unit: RealArray) -> float:
-        """Logarithm of J at a point (D,), as DIRECT sees it: never below that of rounding."""
+        """Logarithm of J at a point (D,), as DIRECT sees it: never below that of rounding, `_FLOOR` |y|^2.
+
+        A J of NaN stays NaN; where J and |y|^2 are both zero, ValueError of the logarithm.
+        """
         return math.log(max(self.at(unit), self._floor))
 
 
@@ -115,14 +126,18 @@ class Linearised(Protocol):
         """Square sum |y|^2 of the data without the part of constants and the like."""
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
-        """Cost and linearisation at real poles (R,) and pairs (P,), the poles above the axis.
+        """Cost and linearisation (B = R + 2 P) at real poles (R,) and pairs (P,), the poles above the axis.
 
-        Only the cost counts where it is not under `below`: the caller then drops the rest.
+        Only the cost counts where it is not under `below`: the caller then drops the rest. A refinement asks
+        for poles inside the circle alone; what others do is the implementation's.
         """
 
 
 class PoleProblem(Linearised, Protocol):
-    """A least-squares problem, linear in everything but the poles."""
+    """A least-squares problem, linear in everything but the poles.
+
+    A protocol: the classes of the module text answer, and say what they make of bad input.
+    """
 
     @property
     def dt_s(self) -> float:
@@ -141,22 +156,25 @@ class PoleProblem(Linearised, Protocol):
         """Number of real numbers that were measured."""
 
     def n_parameters(self, order: int) -> int:
-        """Free real numbers of a fit with `order` poles: coefficients, poles, nuisances."""
+        """Free real numbers of a fit with `order` poles (at least 0): coefficients, poles, nuisances."""
 
     def residual(self, poles: Poles) -> RealArray:
-        """Residual (N,) that the fit with these poles leaves of the data."""
+        """Residual (N,) that the fit with these poles leaves of the data, in their unit."""
 
     def colour(self, residual: RealArray) -> ResidualColour:
-        """Whiteness of a residual, and how many independent numbers it is worth."""
+        """Whiteness of a residual (N,) of `residual`, and how many independent numbers it is worth."""
 
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
-        """Cost of candidates on top of frozen poles: `shared` behind the input, `local` in free responses."""
+        """Cost of candidates on top of frozen poles: `shared` behind the input, `local` in free responses.
+
+        space: the box of the candidates, R real poles and P pairs, D = R + 2 P numbers a point.
+        """
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
         """Criterion (J, order) -> number, lower is better.
 
-        It is read from a model with this J = rss and order whose residual is worth so many independent
-        numbers.
+        A model with J = rss and this order, whose residual is worth `worth` independent numbers, tells the
+        noise; every model is then judged by the same criterion.
         """
 
 
@@ -170,8 +188,9 @@ class ResidualColour:
         Independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth of the shortest
         record (Bartlett): by that factor colour widens the scatter of J.
     white : bool
-        Autocorrelations at lags 1 .. 25 are no larger, all together, than those of white noise 99 times in
-        100 (Box and Pierce); never so in records of less than 250 samples.
+        Autocorrelations at lags 1 .. 25 (`WHITE_LAGS`) are no larger, all together, than those of white noise
+        99 times in 100 (`TEST_LEVEL`; Box and Pierce); never so where a record has less than 250 samples, ten
+        a lag.
     """
 
     effective_samples: float
@@ -186,12 +205,12 @@ def residual_colour(residual: RealArray, starts: IntArray) -> ResidualColour:
     residual : ndarray, shape (N,)
         Residuals of all records, one after the other.
     starts : ndarray of int, shape (K + 1,)
-        Where the records begin, and N.
+        Where the records begin, and N; a record has at least one sample (numpy's ValueError else).
 
     Returns
     -------
     ResidualColour
-        Of a residual of zeros: N samples, not white.
+        Of a residual of zeros, or with NaN: N samples, not white.
     """
     n = residual.size
     shortest = int(np.min(np.diff(starts)))

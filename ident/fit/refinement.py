@@ -33,21 +33,25 @@ _GROWTH = 4.0
 # Least fall of J, as a share of what the linearisation promised, with which a step is taken. The usual small
 # number of trust regions (More, 1978): any true fall counts.
 _LEAST_GAIN = 1e-4
-# Damping above which a refinement gives up: a step is then 1e-12 of a full one, and what it could gain
-# rounding.
+# Damping, in units of the scaled normal matrix, above which a refinement gives up: a step is then 1e-12 of a
+# full one, and what it could gain is rounding.
 _LARGEST_DAMPING = 1e12
-# Least factor of the damping after a step that gains as promised (Nielsen, 1999, has 1/3).
+# Least factor of the damping after a step that gains as promised (Nielsen, 1999, has 1/3). Chosen; a
+# refinement that starts `FAR` so takes practically full steps (`NEAR`) after four that gain.
 _LEAST_RELIEF = 1 / 5
 # Share of |y|^2 below which J is rounding: residuals of 1e-13 of the output.
 _EXPLAINED = 1e-26
-# Decay over the longest record below which a pole cannot be told from one on the circle.
+# Decay over the longest record below which a pole cannot be told from one on the circle: it loses a
+# thousandth there, less than noise hides. Chosen.
 _STILL = 1e-3
 # Largest 1 - a of a real pole: those down to -.95 are reached by refinement only; they have no continuous
 # counterpart, so no search starts there.
 _LARGEST_DISTANCE = 1.95
 # Lowest frequency of a pair, rad in the longest record: 1/63 of a period there looks like a straight line.
+# Chosen.
 _LEAST_ANGLE_PER_RECORD = 0.1
-# Largest angle of a pair per sample, over pi: beyond pi a mode is folded back.
+# Largest angle of a pair per sample, over pi: beyond pi a mode is folded back, and at pi its pair is a real
+# pole. Chosen; `ident.fit.pole_unknowns` has the same number.
 _LARGEST_ANGLE_SHARE = 0.995
 
 
@@ -55,7 +59,8 @@ _LARGEST_ANGLE_SHARE = 0.995
 class Bounds:
     """Sides that a refined pole keeps: user bounds, and the circle itself.
 
-    Compiled code takes all of them in this order (`ident.fit.pole_unknowns`).
+    Compiled code takes all of them in this order (`ident.fit.pole_unknowns`). Nothing is checked: where a
+    lower bound is above its upper one, the upper one holds (of s_min: the lower).
 
     Attributes
     ----------
@@ -85,18 +90,19 @@ class Bounds:
     def from_options(cls, options: IdentOptions, longest: int, dt_s: float) -> Bounds:
         """Bounds stated by the user; else only what keeps a pole usable over a record of `longest` samples.
 
-        options : IdentOptions: decay_min_per_s to zeta_max, None where nothing was stated. dt_s: sampling
-        time, s.
+        options : IdentOptions: decay_min_per_s to zeta_max, None where nothing was stated, checked there
+        against each other. longest: at least 1 (ZeroDivisionError for 0). dt_s: sampling time, s, positive. A
+        stated bound beyond what a record shows can leave a side empty, which is not refused here.
         """
         still = _STILL / longest
         largest_angle = _LARGEST_ANGLE_SHARE * np.pi
 
         def distance(decay_per_s: float | None, default: float) -> float:
-            """1 - a of a stated decay, 1/s."""
+            """1 - a of a stated decay, 1/s, or the default (of 1 - a) where it is None."""
             return default if decay_per_s is None else -float(np.expm1(-decay_per_s * dt_s))
 
         def angle(omega_rad_s: float | None, default: float) -> float:
-            """Angle per sample of a stated frequency, rad/s."""
+            """Angle per sample of a stated frequency, rad/s, or the default (rad/sample) where it is None."""
             return default if omega_rad_s is None else omega_rad_s * dt_s
 
         return cls(
@@ -115,7 +121,8 @@ class Bounds:
         Parameters
         ----------
         measured_rad : ndarray, shape (K, 2)
-            Low and high end of each band, ascending, from 0 to pi rad/sample.
+            Low and high end of each band, ascending, from 0 to pi rad/sample; at least one (IndexError else).
+            Order and range are not checked.
 
         Returns
         -------
@@ -141,7 +148,8 @@ class Bounds:
 
     @cached_property
     def array(self) -> RealArray:
-        """Bounds as compiled code takes them, (7 + 2 K,): in the order of the fields, bands low and high."""
+        """Bounds as compiled code takes them, (7 + 2 K,): in the order of the fields, K bands low and
+        high."""
         scalars = [
             self.distance_min,
             self.distance_max,
@@ -200,20 +208,26 @@ def refine(
     fixed : Poles
         Poles that do not move.
     max_iterations : int
-        Most steps that gain.
+        Most steps that gain. 60 is chosen; a refinement that ends there has not
+        converged.
     tolerance : float
-        Promised fall of J, as a share of it, below which a point counts as stationary.
+        Promised fall of J, as a share of it, below which a point counts as stationary. At 1e-9 poles are off
+        by a few 1e-5 of what noise moves them in a record of some thousand samples (J falls by about 1 / N a
+        deviation).
     damping : float
         Of the first step, `NEAR` an optimum or `FAR` from one.
 
     Returns
     -------
     Refined
+        Not converged: steps ran out, or no step gained (also where J is NaN: the start comes back, inside the
+        bounds). Without free poles: the start, converged.
 
     Notes
     -----
     Damping after Nielsen (IMM-REP-1999-05): a step that gains multiplies it by 1 - (2 ratio - 1)^3, ratio
-    the fall over the promised one, 1/5 at least; a step that does not gain is shortened ever faster.
+    the fall over the promised one, 1/5 at least; a step that does not gain is shortened ever faster. That
+    `fixed` come first of each type is not checked; more fixed poles than there are: IndexError.
     """
     real, pairs = poles.writable()
     n_fixed = fixed.counts
@@ -254,6 +268,7 @@ def refine(
         current = trial
         real, trial_real = trial_real, real
         pairs, trial_pairs = trial_pairs, pairs
+        # Nielsen's cubic: 2 for a ratio of 0, 1 at 1/2, `_LEAST_RELIEF` from about .96 on.
         damping *= max(_LEAST_RELIEF, 1 - (2 * ratio - 1) ** 3)
         growth = _GROWTH
     return Refined(Poles(real, pairs), current.rss, max_iterations, False)
@@ -262,7 +277,9 @@ def refine(
 def pole_system(here: Linearisation, poles: Poles, fixed: Poles = NO_POLES) -> tuple[RealArray, RealArray]:
     """Normal matrix (P, P) and S^T r (P,) of the free unknowns (1 - a; s, f); the gradient of J is -2 S^T r.
 
-    here : Linearisation: normal (B, B) and gradient (B,) at these poles; fixed: first of each type.
+    here : Linearisation: normal (B, B) and gradient (B,) at these poles, B their order (ValueError of numpy
+    for another); fixed: first of each type, not checked. P: numbers of the poles that are not fixed. Bounds
+    play no part. Unit: that of J over that of the unknowns, which have none.
     """
     # Too seldom to be compiled by itself.
     chain = chain_rule.py_func(*poles.writable(), *fixed.counts)
@@ -276,7 +293,9 @@ def free_optimality(here: Linearisation, poles: Poles, bounds: Bounds, fixed: Po
     P projects on the tangent directions of the poles that are neither fixed nor held by a bound. With records
     from rest and nothing held it is |Phi2^T r|/|r|, Phi2 the orthonormal doubled basis.
 
-    here : Linearisation: rss, normal (B, B) and gradient (B,) at these poles; 0 where rss is.
+    here : Linearisation: rss, normal (B, B) and gradient (B,) at these poles, of which bounds.array tells
+    those that stand on a bound. No unit; 0 where rss is 0 or NaN. Compiled: that B fits the poles is not
+    checked.
     """
     known = (*poles.writable(), *fixed.counts)
     x = free_parameters(*known)

@@ -18,10 +18,12 @@ from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
 
-# Stretches of a long record among which the most exciting one is sought begin a fraction of its length apart.
+# Starts per length of a stretch, of the stretches of a long record among which the most exciting one is
+# sought: a quarter of their length apart, so that each exciting one is at least to seven eighths in one of
+# them. Chosen.
 _STARTS_PER_STRETCH = 4
 # Share of the largest input variance with which a stretch counts as equally exciting: ties (a periodic or
-# binary input) go to the beginning, where the record may well start from rest.
+# binary input) go to the beginning, where the record may well start from rest. Chosen.
 _AS_EXCITING = 0.9
 
 
@@ -38,6 +40,7 @@ def prepare(records: Sequence[Record], structure: Structure) -> Regression:
     Returns
     -------
     Regression
+        With U = 1.
 
     Raises
     ------
@@ -69,7 +72,8 @@ def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regressio
     ------
     ValueError
         No record, a record with more than one output or not longer than the delay, inputs that differ between
-        records, or sampling times that differ by more than 0.1 %.
+        records (by name; a single one may have any), or sampling times that differ by more than 0.1 %.
+        Finite numbers are checked by `Record`.
     """
     if not records:
         raise ValueError("identification needs at least one record; got none")
@@ -116,7 +120,9 @@ def prepare_inputs(records: Sequence[Record], structure: Structure) -> Regressio
 def restructured(records: Sequence[Record], data: Regression, structure: Structure) -> Regression:
     """`prepare_inputs(records, structure)`, from `data`, the records prepared with another structure.
 
-    Where only nuisances differ, their signals are not filtered anew.
+    Where only nuisances and direct term differ, their signals are not filtered anew, and `records` are not
+    looked at. That `data` are of these records, and the unstable poles the same, is not checked; where they
+    are filtered anew: ValueError as `prepare_inputs`.
     """
     # Feed-through and free responses are columns that a fit makes itself; only polynomials are stored.
     before = data.structure
@@ -135,7 +141,10 @@ def restructured(records: Sequence[Record], data: Regression, structure: Structu
 
 
 def _legendre(n_samples: int, count: int) -> RealArray:
-    """Legendre polynomials of degrees 0 .. count - 1 over a record of T = n_samples samples, (count, T)."""
+    """Legendre polynomials of degrees 0 .. count - 1 over a record of T = n_samples samples, (count, T).
+
+    (0, T) for count = 0; T is at least 1, and below count the rows depend on each other.
+    """
     # Constants, by far the most common, need no ramp.
     if count < 2:
         return np.ones((count, n_samples))
@@ -150,15 +159,17 @@ def thinned(records: Sequence[Record], limit: int) -> tuple[list[Record], bool]:
     Parameters
     ----------
     records : sequence of Record
-        At least one.
+        Without any, so is the part.
     limit : int
-        Samples that the search shall look at.
+        Samples that the search shall look at, at least 1 (ValueError by `Record.slice` for 0 where the
+        records do not fit).
 
     Returns
     -------
     part : list of Record
-        Whole records, evenly chosen, as many as fit; if not even one fits, the most exciting stretch of the
-        first. All of them where they fit.
+        Whole records, evenly chosen, as many as fit if all were of mean length; where that is one which does
+        not fit, its first stretch of `limit` samples whose input varies most, to a tenth. All records where
+        they fit.
     in_mid_record : bool
         The part begins after the first row of its record, and so hardly at rest.
     """

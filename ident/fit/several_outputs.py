@@ -29,7 +29,8 @@ class OutputRegressions:
     Attributes
     ----------
     each : tuple of Regression
-        Y of them, with the same records, structure and sampling time.
+        Y of them, at least one, with the same records, structure and sampling time; `prepare_outputs` makes
+        them so, nothing is checked here.
     """
 
     each: tuple[Regression, ...]
@@ -55,7 +56,7 @@ class OutputRegressions:
 
     @property
     def power(self) -> float:
-        """Square sum of the outputs without the part of constants and the like."""
+        """Square sum of the outputs without the part of constants and the like; of whitened ones no unit."""
         return sum(output.power for output in self.each)
 
     @property
@@ -79,15 +80,19 @@ class OutputRegressions:
         return self.each[0].longest
 
     def n_parameters(self, order: int) -> int:
-        """Free real numbers of a fit with `order` poles: what every output has of its own, the poles once."""
+        """Free real numbers of a fit with `order` poles: what every output has of its own, the poles once.
+
+        order: at least 0, not checked.
+        """
         without_poles = [output.n_parameters(order) - order for output in self.each]
         return order + sum(without_poles)
 
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
         """Sums of the outputs' costs, normal matrices (B, B) and gradients (B,) at these poles.
 
-        real (R,), pairs (P,): poles above the axis. `below` is not used: which output alone stays below says
-        nothing of the sum.
+        real (R,), pairs (P,): poles above the axis, B = R + 2 P; inside the circle, as `Regression.linearise`
+        checks or not. `below` is not used: which output alone stays below says nothing of the sum. NaN of one
+        output is NaN of the sums.
         """
         # Each output has columns and coefficients of its own; only the poles are shared, so all three add up.
         parts = [output.linearise(real, pairs) for output in self.each]
@@ -98,15 +103,21 @@ class OutputRegressions:
         )
 
     def residual(self, poles: Poles) -> RealArray:
-        """What the fits with these poles leave, output after output, (Y N,)."""
+        """What the fits with these poles leave, output after output, (Y N,), in the units of the outputs.
+
+        As `Regression.residual` it does not refuse more columns than samples.
+        """
         return np.concatenate([output.residual(poles) for output in self.each])
 
     def colour(self, residual: RealArray) -> ResidualColour:
-        """Colour of a residual (Y N,), every record of every output by itself."""
+        """Colour of a residual (Y N,), every record of every output by itself: see `residual_colour`."""
         return residual_colour(residual, self.starts)
 
     def criterion(self, rss: float, order: int, worth: float) -> Callable[[float, int], float]:
-        """Criterion (J, order) -> number, lower is better: see `information_criterion`."""
+        """Criterion (J, order) -> number, lower is better: see `information_criterion`.
+
+        rss and order are not used. worth: independent numbers of a residual, positive.
+        """
         # With its constants: what counts as rounding depends on the numbers as they were logged.
         power = sum(float(output.y @ output.y) for output in self.each)
         return information_criterion(power, self, worth)
@@ -114,7 +125,8 @@ class OutputRegressions:
     def candidate_cost(self, space: SearchSpace, shared: Poles, local: Poles) -> CandidateCost:
         """Cost of candidates on top of frozen poles: the sum of the outputs' costs.
 
-        `shared` are driven by the inputs, `local` are those of the free responses.
+        space: the box of the candidates, D numbers a point. `shared` are driven by the inputs, `local` are
+        those of the free responses. Points are not checked, as with `Regression.candidate_cost`.
         """
         costs = [output.candidate_cost(space, shared, local) for output in self.each]
         power = sum(float(output.y @ output.y) for output in self.each)
@@ -139,11 +151,13 @@ def prepare_outputs(records: Sequence[Record], structure: Structure) -> OutputRe
     Returns
     -------
     OutputRegressions
+        Y regressions, one per output, in the records' order of outputs.
 
     Raises
     ------
     ValueError
-        Names of outputs differ between records; also as `prepare_inputs`.
+        Names of outputs differ between records; also as `prepare_inputs`: no record, a record not longer than
+        the delay, other inputs or sampling times.
     """
     # Without records there is one nameless output, so that `prepare_inputs` says what is missing.
     names = records[0].output_names if records else ("",)
@@ -160,5 +174,9 @@ def prepare_outputs(records: Sequence[Record], structure: Structure) -> OutputRe
 
 
 def whitened(records: Sequence[Record], white: RealArray) -> list[Record]:
-    """Records with outputs white y, white (Y, Y) from the noise covariance of the outputs: units are gone."""
+    """Records with outputs white y, white (Y, Y) from the noise covariance of the outputs: units are gone.
+
+    white: the inverse of the covariance's Cholesky factor, one over units. ValueError (numpy's) where a
+    record has other than Y outputs; a matrix with NaN is refused by `Record`.
+    """
     return [replace(record, output=record.output @ white.T, output_units=()) for record in records]

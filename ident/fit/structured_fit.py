@@ -75,8 +75,9 @@ def structured_fit(data: Regression, poles: Poles, relative_degree: int) -> Line
     Raises
     ------
     ValueError
-        A pole has no continuous-time counterpart, there are too few poles or samples, or the regression has a
-        direct term.
+        A pole has no continuous-time counterpart (real and not above 0), there are too few poles or samples,
+        relative_degree is below 1, or the regression has a direct term. Several inputs are not refused by
+        name: shapes do not fit then. Signals with NaN give NaN or numpy's LinAlgError.
     """
     solved = _solve(data, poles, relative_degree)
     residual = solved.residual
@@ -87,7 +88,8 @@ def structured_fit(data: Regression, poles: Poles, relative_degree: int) -> Line
 def _solve(data: Regression, poles: Poles, relative_degree: int) -> _Constrained:
     """Solution of the constrained problem at given poles, with what its linearisation needs.
 
-    Raises ValueError as `structured_fit`.
+    data (N samples, one input), poles (B, the zeros of the integrators first) and r as for `structured_fit`;
+    raises as it does.
     """
     if data.structure.feedthrough:
         raise ValueError("relative_degree of 1 or more excludes a direct term; expected feedthrough = false")
@@ -124,7 +126,10 @@ class UnderRelativeDegree:
     relative_degree : int
         r, at least 1.
     fixed : Poles
-        Poles that do not move, first of each type. Their directions are left at zero.
+        Poles that do not move, first of each type; their numbers count, and that they come first is not
+        checked. Their directions are left at zero.
+
+    Bad input is refused when the poles are fitted (`structured_fit`), not here.
     """
 
     data: Regression
@@ -133,7 +138,7 @@ class UnderRelativeDegree:
 
     @property
     def power(self) -> float:
-        """Square sum of the outputs without the part of constants and the like."""
+        """Square sum of the outputs without the part of constants and the like, output units squared."""
         return self.data.power
 
     def sensitivities(self, poles: Poles) -> tuple[RealArray, RealArray]:
@@ -147,8 +152,9 @@ class UnderRelativeDegree:
         Returns
         -------
         residual : ndarray, shape (N,)
+            In units of the output.
         directions : ndarray, shape (B, N)
-            By block states: one per real pole, two per pair; zero for fixed poles.
+            By block states: one per real pole, two per pair; zero for fixed poles. In units of the output.
 
         Raises
         ------
@@ -186,21 +192,27 @@ class UnderRelativeDegree:
     def linearise(self, real: RealArray, pairs: ComplexArray, below: float = np.inf) -> Linearisation:
         """Cost and linearisation at real poles (R,) and pairs (P,), the poles above the axis.
 
-        `below` is not used: nearly all of the work is done before the cost is known.
+        rss in output units squared, normal (B, B), gradient (B,), all filled. `below` is not used: nearly all
+        of the work is done before the cost is known. Raises ValueError as `structured_fit`, and by `Poles`
+        for one that is not inside the circle.
         """
         residual, directions = self.sensitivities(Poles(real, pairs))
         rss = float(residual @ residual)
         return Linearisation(rss, directions @ directions.T, directions @ residual)
 
     def bounded(self, bounds: Bounds) -> Bounds:
-        """Bounds without real poles that have no continuous-time counterpart."""
+        """Bounds (distance_max, 1 - a, at most .99) without real poles of no continuous-time counterpart.
+
+        A stated distance_min beyond that is not refused: `Bounds`.
+        """
         return replace(bounds, distance_max=min(bounds.distance_max, 1 - _FASTEST))
 
     def refine(self, poles: Poles, bounds: Bounds, tolerance: float = 1e-9) -> Refined:
         """Poles downhill from the given ones, under the relative degree.
 
-        As `ident.fit.refinement.refine`, with real poles kept at or above 0.01. tolerance: promised fall of
-        J, as a share of it, below which a point counts as stationary.
+        As `ident.fit.refinement.refine`, with real poles kept at or above `_FASTEST`. bounds: a start outside
+        is brought inside. tolerance: promised fall of J, as a share of it, below which a point counts as
+        stationary; the default is that of `refine`. Raises ValueError as `structured_fit`.
         """
         limits = self.bounded(bounds)
         return refine(self, poles, limits, self.fixed, max_iterations=_MOST_STEPS, tolerance=tolerance)
@@ -208,7 +220,8 @@ class UnderRelativeDegree:
     def optimality(self, poles: Poles, bounds: Bounds) -> float:
         """Share |P r|/|r| of the residual that moving poles could explain, to first order; 0: an optimum.
 
-        P projects on the tangent directions of the constrained models that no bound holds.
+        P projects on the tangent directions of the constrained models that no bound holds; r (N,) is the
+        residual of the fit. 0 also where r is zero. Raises ValueError as `structured_fit`.
         """
         linearisation = self.linearise(*poles.writable())
         return free_optimality(linearisation, poles, self.bounded(bounds), self.fixed)
