@@ -19,7 +19,8 @@ from ident.basis.noise_model import NoiseModel, monic_polynomial, reflected_insi
 from ident.data.arrays import RealArray, lock
 
 # Share of its beginning below which the memory of 1 / C counts as gone. Whitening and the expansion of A / C
-# are exact to this share. Halved in its exponent, a zero at .9 needs 100 first rows in place of 200.
+# are exact to this share. Halved in its exponent, a zero at .9 needs 100 first rows in place of 200. Chosen:
+# below the digits of any log, above the rounding of a sum of so many rows.
 _DIED_OUT = 1e-9
 # Rows that the memory of 1 / C may last, which allows zeros up to .9795: their covariance is factored, which
 # takes a tenth of a second for so many, and eight times as long for twice as many.
@@ -52,6 +53,7 @@ class ArmaNoise(NoiseModel):
     c_polynomial: RealArray
 
     def __post_init__(self) -> None:
+        """Check the polynomials and lock them. Raises ValueError as the class says."""
         for name in ("a_polynomial", "c_polynomial"):
             polynomial = monic_polynomial(getattr(self, name), name)
             largest = _largest_root(polynomial)
@@ -83,7 +85,8 @@ class ArmaNoise(NoiseModel):
         Raises
         ------
         ValueError
-            As the class.
+            As the class: no vector that begins with 1, or roots of C so near to the circle that whitening
+            never forgets, as those on the circle are after they were pulled in.
         """
         a_checked = monic_polynomial(a_polynomial, "a_polynomial")
         c_checked = monic_polynomial(c_polynomial, "c_polynomial")
@@ -128,11 +131,11 @@ class ArmaNoise(NoiseModel):
         )
 
     def filtered(self, signals: RealArray) -> RealArray:
-        """A / C signals from rest, (T,) or (T, n)."""
+        """A / C signals from rest, (T,) or (T, n), in their units; from a NaN on all is NaN."""
         return np.asarray(lfilter(self.a_polynomial, self.c_polynomial, signals, axis=0), dtype=np.float64)
 
     def coloured(self, innovations: RealArray) -> RealArray:
-        """C / A innovations from rest, (T,) or (T, n)."""
+        """C / A innovations from rest, (T,) or (T, n), in their units; from a NaN on all is NaN."""
         return np.asarray(
             lfilter(self.c_polynomial, self.a_polynomial, innovations, axis=0), dtype=np.float64
         )
@@ -140,8 +143,9 @@ class ArmaNoise(NoiseModel):
     def autocovariance(self, max_lag: int) -> RealArray:
         """gamma_k, k = 0 .. max_lag, from the autocovariance of w = e / A.
 
-        With v = C w it is sum_ij c_i c_j E w_(t-i) w_(t-k-j), the correlation of the c_i among themselves
-        against the autocovariance of w.
+        (max_lag + 1,), of innovations of unit variance; max_lag at least 0, not checked. With v = C w it is
+        sum_ij c_i c_j E w_(t-i) w_(t-k-j), the correlation of the c_i among themselves against the
+        autocovariance of w.
         """
         q = self.c_polynomial.size - 1
         of_denominator = AutoregressiveNoise(self.a_polynomial).autocovariance(max_lag + q)
@@ -153,12 +157,18 @@ class ArmaNoise(NoiseModel):
         return np.asarray(two_sided[max_lag:], dtype=np.float64)
 
     def relative_spectrum(self, n_samples: int) -> RealArray:
-        """|C / A|^2 over the variance at the lines of an FFT of n_samples, (n_samples // 2 + 1,)."""
+        """|C / A|^2 over the variance at the lines of an FFT of n_samples, (n_samples // 2 + 1,).
+
+        n_samples: more than the order of A and of C, or the transform cuts them off, which is not refused.
+        """
         numerator = np.abs(np.fft.rfft(self.c_polynomial, n_samples)) ** 2
         denominator = np.abs(np.fft.rfft(self.a_polynomial, n_samples)) ** 2
         return np.asarray(numerator / denominator / self.autocovariance(0)[0])
 
 
 def _largest_root(polynomial: RealArray) -> float:
-    """Largest magnitude of the roots of a monic polynomial in q^-1; 0 where it has none."""
+    """Largest magnitude of the roots of a monic polynomial (n + 1,) in q^-1; 0 where it has none.
+
+    Its numbers are finite (`monic_polynomial`); numpy's LinAlgError else.
+    """
     return float(np.max(np.abs(np.roots(polynomial)), initial=0.0))

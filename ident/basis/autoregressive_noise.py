@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from ident.basis.noise_model import NoiseModel, monic_polynomial
 from ident.data.arrays import RealArray, lock
 
-# A filter without a denominator, or without a numerator.
+# Polynomial 1: a filter without a denominator, or without a numerator.
 _ONE = np.ones(1)
 
 
@@ -40,6 +40,7 @@ class AutoregressiveNoise(NoiseModel):
     a_polynomial: RealArray
 
     def __post_init__(self) -> None:
+        """Check the polynomial and lock it. Raises ValueError as the class says."""
         monic_polynomial(self.a_polynomial, "a_polynomial")
         lock(self, "a_polynomial")
 
@@ -69,17 +70,22 @@ class AutoregressiveNoise(NoiseModel):
         )
 
     def filtered(self, signals: RealArray) -> RealArray:
-        """A(q) signals from rest, (T,) or (T, n)."""
+        """A(q) signals from rest, (T,) or (T, n), in their units; NaN spreads over the next n rows."""
         return np.asarray(lfilter(self.a_polynomial, _ONE, signals, axis=0), dtype=np.float64)
 
     def coloured(self, innovations: RealArray) -> RealArray:
-        """innovations / A(q) from rest, (T,) or (T, n)."""
+        """innovations / A(q) from rest, (T,) or (T, n), in their units.
+
+        From a NaN on all is NaN; with roots of A on or outside the circle it grows.
+        """
         return np.asarray(lfilter(_ONE, self.a_polynomial, innovations, axis=0), dtype=np.float64)
 
     def autocovariance(self, max_lag: int) -> RealArray:
         """gamma_k, k = 0 .. max_lag, by the Yule-Walker equations and then their recursion.
 
-        sum_i a_i gamma_|k - i| = 1 for k = 0, and 0 for k = 1 .. n, are solved for gamma_0 .. gamma_n.
+        (max_lag + 1,), of innovations of unit variance; empty for max_lag = -1. sum_i a_i gamma_|k - i| = 1
+        for k = 0, and 0 for k = 1 .. n, are solved for gamma_0 .. gamma_n. Roots of A outside the circle give
+        numbers that are no covariance, on it numpy's LinAlgError.
         """
         order = self.order
         # Unknown gamma_j stands at i = k - j (Toeplitz part) and, for j > 0, at i = k + j (Hankel part).
@@ -94,7 +100,10 @@ class AutoregressiveNoise(NoiseModel):
         return gamma[: max_lag + 1]
 
     def relative_spectrum(self, n_samples: int) -> RealArray:
-        """1 / |A|^2 over the variance at the lines of an FFT of n_samples, (n_samples // 2 + 1,)."""
+        """1 / |A|^2 over the variance at the lines of an FFT of n_samples, (n_samples // 2 + 1,).
+
+        n_samples: at least n + 1, or the transform cuts A off, which is not refused; numpy refuses 0.
+        """
         of_unit_power = self.a_polynomial * np.sqrt(self.autocovariance(0)[0])
         return np.asarray(1 / np.abs(np.fft.rfft(of_unit_power, n_samples)) ** 2)
 

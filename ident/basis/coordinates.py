@@ -22,34 +22,41 @@ from ident.basis.poles import Poles
 from ident.data.arrays import COMPILED, ComplexArray, RealArray, kernel_array, lock
 
 # Largest damping ratio of a pair: closer to critical damping it is two real poles in disguise, and its two
-# columns become dependent. Chosen.
+# columns become dependent. Chosen; `IdentOptions.zeta_max` has it as its limit.
 ZETA_LIMIT = 0.98
 # Least damping ratio of a pair: links have more, and an undamped pair with a free initial state fits any slow
 # disturbance (docs/decisions.md). A user who knows a lighter mode states `zeta_min`.
 ZETA_LEAST = 1e-3
-# Shortest record whose length shapes the box, samples: of fewer, the box would be empty or nearly so.
+# Shortest record whose length shapes the box, samples: of fewer, the box would be empty or nearly so (from 5
+# down no frequency is left between two periods and the highest share). Chosen.
 _SHORTEST = 30
 # Slowest real pole of the box: it decays by this share of its value over the longest record. Slower ones look
-# like an offset there; a refinement may go on to a thousandth (`ident.fit.refinement.Bounds`).
+# like an offset there; a refinement may go on to a thousandth (`ident.fit.refinement.Bounds`). Chosen.
 _LEAST_DECAY_PER_RECORD = 0.2
 # Fastest real pole of the box, as 1 - a: down to .3 of its value within a sample. A refinement may go on.
+# Chosen.
 _LARGEST_DISTANCE = 0.7
 # Lowest frequency of the box, periods within the longest record: with fewer a pair looks like a drift.
+# Chosen; a refinement may go on to a tenth of a radian.
 _LEAST_PERIODS = 2
 # Highest frequency of the box, as a share of the Nyquist frequency: a mode there is hard to tell from one
-# that is folded back. A stated bound may go up to the second number.
+# that is folded back. Chosen.
 _HIGHEST_SHARE = 0.9
 
-# Share of the Nyquist frequency up to which a stated bound may go.
+# Share of the Nyquist frequency up to which a stated bound may go: what was stated is more than the box
+# knows, but at the Nyquist frequency itself a pair is a real pole. Chosen.
 _HIGHEST_STATED_SHARE = 0.99
 # Largest damping ratio of the box; a refinement may go on to ZETA_LIMIT. Chosen: more rings no more.
 _LARGEST_ZETA = 0.63
-# Damping ratio to which a pair of the raw box is moved that is real, or complex with more than this.
+# Damping ratio to which a pair of the raw box is moved that is real, or complex with more than this. Chosen
+# below `ZETA_LIMIT`, so that a refinement begins inside its bounds.
 _MOVED_ZETA = 0.95
-# Least damping ratio and highest frequency (over pi) of a pair that is moved: it has to be a pole of `Poles`.
+# Least damping ratio of a pair that is moved: it has to lie inside the circle, to be a pole of `Poles`. Any
+# small number will do; the refinement has a bound of its own.
 _LEAST_MOVED_ZETA = 1e-6
 
-# Highest frequency of such a pair, over pi.
+# Highest frequency of a pair that is moved, over pi: it has to lie above the axis, and where the box of the
+# other coordinates ends (`_HIGHEST_SHARE`) is far enough.
 _HIGHEST_MOVED_SHARE = 0.9
 # Modulus in place of a pole at z = 0, which has no logarithm. Any small one: its frequency, 6.9 rad/sample,
 # is above the limit and is cut.
@@ -84,7 +91,7 @@ class SearchSpace:
     dt_s: float
 
     def __post_init__(self) -> None:
-        """Lock the ends and refuse an empty box."""
+        """Lock the ends and refuse an empty box, or one with NaN. Raises ValueError as the class says."""
         lock(self, "low", "high")
         is_open = self.low < self.high
         if not np.all(is_open):
@@ -113,11 +120,19 @@ class SearchSpace:
         return (*reals, *pairs)
 
     def _at(self, units: RealArray) -> RealArray:
-        """Coordinates of one point (D,) of the unit cube, or of as many as there are columns (D, E)."""
+        """Coordinates of one point (D,) of the unit cube, or of as many as there are columns (D, E).
+
+        Of the module text, frequencies in rad/sample. Points outside the cube lie outside the box; nothing is
+        checked.
+        """
         return np.asarray(_coordinates_of_point(units, self.n_real, self.low, self.high))
 
     def blocks(self, unit: RealArray) -> RealArray:
-        """Cascade blocks (R + P, 4) of a point (D,) of the unit cube, as compiled code takes them."""
+        """Cascade blocks (R + P, 4) of a point (D,) of the unit cube, as compiled code takes them.
+
+        `blocks_of_point` says what is in them. That the point is in the cube, or of D numbers, is not
+        checked.
+        """
         point = kernel_array(unit)
         blocks = blocks_of_point(point, self.n_real, self.low.copy(), self.high.copy(), self.raw)
         return np.asarray(blocks)
@@ -126,7 +141,8 @@ class SearchSpace:
         """Poles of a point (D,) of the unit cube.
 
         A pair of the raw box that is not complex, or nearly not, is put at a damping ratio of .95 with the
-        frequency |log p| it has: what follows needs a pair above the axis.
+        frequency |log p| it has: what follows needs a pair above the axis. Raises ValueError, by `Poles`,
+        where a point outside the cube, or NaN, gives a pole outside the circle; D is not checked.
         """
         if not self.raw:
             point = self._at(unit)
@@ -156,7 +172,8 @@ class SearchSpace:
     def levels(self, poles: Poles) -> RealArray:
         """Where poles lie between the ends of the box by their first coordinate, (R + P,), 0 to 1.
 
-        `poles` may be of any number. Those outside the box have the 0 or 1 of the side they are on.
+        `poles` may be of any number, R and P theirs. Those outside the box have the 0 or 1 of the side they
+        are on.
         """
         if self.raw:
             beta = 2 * poles.pairs.real / (1 + np.abs(poles.pairs) ** 2)
@@ -169,7 +186,10 @@ class SearchSpace:
         return np.asarray(np.clip((first - low) / (high - low), 0, 1))
 
     def coordinates(self, units: RealArray) -> RealArray:
-        """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s, as `names` says."""
+        """Coordinates (E, D) of points (E, D) of the unit cube; frequencies in rad/s, as `names` says.
+
+        For plots; points outside the cube are not refused.
+        """
         points = self._at(units.T).T
         if not self.raw:
             points[:, self.n_real :: 2] -= np.log10(self.dt_s)
@@ -177,7 +197,11 @@ class SearchSpace:
 
 
 def _pairs(omega: RealArray, zeta: RealArray) -> ComplexArray:
-    """Poles (P,) above the axis, of frequencies omega (P,) in rad/sample and damping ratios zeta (P,) < 1."""
+    """Poles (P,) above the axis, of frequencies omega (P,) in rad/sample and damping ratios zeta (P,) < 1.
+
+    A damping ratio above 1 gives NaN, a damped frequency of pi or more a pole below the axis: `Poles` refuses
+    both.
+    """
     return np.asarray(np.exp(omega * (-zeta + 1j * np.sqrt(1 - zeta**2))))
 
 
@@ -189,9 +213,9 @@ def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: 
     n_real, n_pairs : int
         Numbers of poles that are sought.
     longest : int
-        Samples N of the longest record.
+        Samples N of the longest record; fewer than `_SHORTEST` count as so many.
     dt_s : float
-        Sampling time, s.
+        Sampling time, s, positive: not checked.
     options : IdentOptions
         `coordinates`, and the bounds decay_min_per_s to zeta_max, None where nothing was stated.
 
@@ -233,7 +257,8 @@ def search_space(n_real: int, n_pairs: int, longest: int, dt_s: float, options: 
 def _coordinates_of_point(unit: Any, n_real: int, low: Any, high: Any) -> Any:
     """Coordinates (D,) of a point (D,) of the unit cube in the box low, high (3,).
 
-    The first coordinate of each pole lies between that of the pole before, of its type, and the end.
+    The first coordinate of each pole lies between that of the pole before, of its type, and the end. n_real:
+    R, how many of the coordinates are real poles'. Also of columns (D, E). Compiled: nothing is checked.
     """
     point = np.empty_like(unit)
     floor = low[0]
@@ -254,7 +279,8 @@ def blocks_of_point(unit: Any, n_real: int, low: Any, high: Any, raw: bool) -> A
 
     Rows as `ident.basis.functions.block_parameters` makes them of poles: [a, sqrt(1 - a^2), 0, 0] of a real
     pole, [gamma, beta, sqrt(1 - gamma^2), sqrt(1 - beta^2)] of a pair; from the coordinates, so that a pole
-    near the circle loses no digits.
+    near the circle loses no digits. n_real: R; raw: the coordinates are the paper's. Compiled: nothing is
+    checked; points outside the cube, and NaN, give blocks that are no basis.
     """
     point = _coordinates_of_point(unit, n_real, low, high)
     blocks = np.zeros((n_real + (unit.size - n_real) // 2, 4))

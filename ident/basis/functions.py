@@ -29,8 +29,9 @@ _LEAST_ONE_MINUS_GAMMA = 5e-17
 # its rounding, 1e-16, and far above the denormal numbers from 1e-308 on, which are slow. 1e-20 or 1e-100
 # would do.
 _DEAD = 1e-30
-# Samples between two looks at whether a free response is dead, so that the inner loop has no condition.
-# Chosen.
+# Samples between two looks at whether a free response is dead, so that the inner loop has no condition: so
+# many are the most that a dead one is followed for nothing. Chosen; it decides time, and digits below
+# `_DEAD`.
 _LOOK_EVERY = 32
 
 
@@ -38,7 +39,8 @@ class LosslessCascade(NamedTuple):
     """State space x(k+1) = A x + B u, w = C x + D u; the states x are the basis functions, w is the
     all-pass output.
 
-    A (B, B), B (B, 1), C (1, B), D (1, 1); the matrix [[A, B], [C, D]] is orthogonal, so A A^T + B B^T = I.
+    A (B, B), B (B, 1), C (1, B), D (1, 1), B the number of poles; the matrix [[A, B], [C, D]] is orthogonal,
+    so A A^T + B B^T = I. No units.
     """
 
     A: RealArray
@@ -51,7 +53,8 @@ def block_parameters(poles: Poles) -> RealArray:
     """Numbers of each block of the cascade, (R + P, 4), real poles first.
 
     A real pole a has [a, sqrt(1 - a^2), 0, 0], a pair [gamma, beta, sg, sb] as in the module text, without
-    cancellation: beta^2 + sb^2 = 1 and gamma^2 + sg^2 = 1 hold to rounding.
+    cancellation: beta^2 + sb^2 = 1 and gamma^2 + sg^2 = 1 hold to rounding. (0, 4) without poles; bad ones
+    are refused by `Poles`.
     """
     return np.asarray(blocks_of_poles(*poles.writable()))
 
@@ -61,7 +64,8 @@ def blocks_of_poles(real: Any, pairs: Any) -> Any:
     """Blocks (R + P, 4) of real poles (R,) and pairs (P,) as `block_parameters` gives them, for compiled
     code.
 
-    real and pairs are writable arrays, pairs complex with the poles above the axis; nothing is checked.
+    real and pairs are writable arrays, pairs complex with the poles above the axis, all inside the circle;
+    nothing is checked: of a pole outside the numbers are NaN or wrong.
     """
     blocks = np.zeros((real.size + pairs.size, 4))
     for i in range(real.size):
@@ -92,13 +96,13 @@ def basis_state_space(poles: Poles) -> LosslessCascade:
     Returns
     -------
     LosslessCascade
-        A (B, B), B (B, 1), C (1, B), D (1, 1).
+        A (B, B), B (B, 1), C (1, B), D (1, 1); D = 1 without poles.
 
     Notes
     -----
-    It replaces inverting E in (24). Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A = [[gamma
-    beta, -gamma sb], [sb, beta]], B = [sg, 0], C = [-beta sg, sb sg], D = gamma; each is driven by the
-    all-pass output of the one before.
+    It replaces inverting E in the paper's (24). Real block A = a, B = C = sqrt(1 - a^2), D = -a; pair block A
+    = [[gamma beta, -gamma sb], [sb, beta]], B = [sg, 0], C = [-beta sg, sb sg], D = gamma; each is driven by
+    the all-pass output of the one before.
     """
     n = poles.order
     A = np.zeros((n, n))
@@ -134,30 +138,43 @@ def basis_state_space(poles: Poles) -> LosslessCascade:
 def inverse_all_pass(poles: Poles) -> tuple[RealArray, RealArray, RealArray, RealArray]:
     """State space (A, B, C, D) of the inverse of the all-pass of these poles; none of them may be zero.
 
-    Shapes as of `basis_state_space`. Its poles are 1 / conj(p), outside the circle.
+    Shapes as of `basis_state_space`. Its poles are 1 / conj(p), outside the circle. A pole at zero is not
+    refused: numbers are infinite or NaN.
     """
     A, B, C, D = basis_state_space(poles)
     return A - B @ C / D, B / D, -C / D, 1 / D
 
 
 def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """Values (F, B) of the basis functions at the points z (F,); z must not be a pole."""
+    """Values (F, B) of the basis functions at the points z (F,); NaN or infinite at a pole.
+
+    Raises ValueError for z of another number of dimensions.
+    """
     return _response_and_all_pass(poles, z)[0]
 
 
 def block_responses(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """Responses (F, B) at the points z (F,) of the states of each block by itself, driven by the input."""
+    """Responses (F, B) at the points z (F,) of the states of each block by itself, driven by the input.
+
+    Real poles first, two columns per pair; (F, 0) without poles. Raises ValueError as `basis_response`.
+    """
     parts = [basis_response(block, z) for block in poles.blocks()]
     return np.hstack([np.zeros((z.size, 0), dtype=np.complex128), *parts])
 
 
 def all_pass_response(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """B(z) = prod (1 - conj(x) z)/(z - x) at the points z (F,); modulus 1 on the unit circle."""
+    """B(z) = prod (1 - conj(x) z)/(z - x) at the points z (F,), (F,); modulus 1 on the unit circle.
+
+    1 without poles; NaN or infinite at a pole x. Raises ValueError as `basis_response`.
+    """
     return _response_and_all_pass(poles, z)[1]
 
 
 def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-    """Basis functions (F, B) and all-pass (F,) at the points z (F,). Raises ValueError for other shapes."""
+    """Basis functions (F, B) and all-pass (F,) at the points z (F,); NaN or infinite at a pole.
+
+    Raises ValueError for z of another number of dimensions.
+    """
     z = np.asarray(z, dtype=np.complex128)
     if z.ndim != 1:
         raise ValueError(f"z must be a 1-d array; got shape {z.shape}")
@@ -182,7 +199,8 @@ def _response_and_all_pass(poles: Poles, z: ComplexArray) -> tuple[ComplexArray,
 def log_all_pass_slopes(poles: Poles, z: ComplexArray) -> ComplexArray:
     """Derivatives d log B / d pole of the all-pass at z (F,), (F, B).
 
-    Columns: by each real pole, then by real and imaginary part of each pair.
+    Columns: by each real pole, then by real and imaginary part of each pair; (F, 0) without poles. z is no
+    pole and no inverse of one, which is not checked: infinite or NaN there.
     """
 
     def slope(p: ComplexArray) -> ComplexArray:
@@ -203,7 +221,9 @@ def log_all_pass_slopes(poles: Poles, z: ComplexArray) -> ComplexArray:
 def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
     """Derivatives (dB / d pole)(q) y of the all-pass output for y (T,), from rest, (T, B).
 
-    Columns as in `log_all_pass_slopes`: by each real pole, then by real and imaginary part of each pair.
+    Columns as in `log_all_pass_slopes`: by each real pole, then by real and imaginary part of each pair, in
+    the unit of y; (T, 0) without poles. Raises ValueError, by `all_pass_signal`, for y of another shape,
+    where there are poles; from a NaN on all is NaN.
     """
     # One all-pass after the other is as good as all at once, and no polynomial of high degree is formed.
     blocks = poles.blocks()
@@ -242,13 +262,17 @@ def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
 def regressor(poles: Poles, u: RealArray) -> RealArray:
     """Basis functions driven by u (T,) or (T, 1) from rest, (T, B).
 
-    Phi[k, i] = [L_i(q) u](k); Phi[0] = 0. Raises ValueError for another shape of u.
+    Phi[k, i] = [L_i(q) u](k), in the unit of u; Phi[0] = 0. From a NaN on all is NaN; (0, B) for T = 0.
+    Raises ValueError for another shape of u.
     """
     return _through(poles, u)[0].T
 
 
 def all_pass_signal(poles: Poles, u: RealArray) -> RealArray:
-    """Output (T,) of the all-pass of the poles for u (T,), from rest."""
+    """Output (T,) of the all-pass of the poles for u (T,) or (T, 1), from rest, in the unit of u.
+
+    A copy of u without poles. Raises ValueError for another shape of u.
+    """
     return _through(poles, u)[1]
 
 
@@ -269,7 +293,8 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
     """Free responses of the cascade (T, B): columns of an unknown initial state.
 
     Column i is the impulse response of basis function i from its first sample on, h_i(k + 1), k = 0..T-1:
-    together they span what any initial state of the poles leaves.
+    together they span what any initial state of the poles leaves. No unit. n_samples: T, at least 0 (numpy's
+    ValueError else).
     """
     rows = np.empty((poles.order, n_samples))
     run_cascade_free(block_parameters(poles), poles.real.size, rows, 0, n_samples)
@@ -279,7 +304,9 @@ def free_response(poles: Poles, n_samples: int) -> RealArray:
 def nuisance_columns(poles: Poles, n_samples: int, n_polynomials: int, free: bool) -> RealArray:
     """Nuisance columns (T, n) of one record of T = n_samples samples.
 
-    Powers 0 .. n_polynomials - 1 of a ramp from -1 to 1 and, if `free`, the free responses of the poles.
+    Powers 0 .. n_polynomials - 1 of a ramp from -1 to 1 and, if `free`, the free responses of the poles (B
+    columns). n may be 0, or exceed T: columns then depend on each other, which nothing refuses here. Negative
+    numbers: ValueError of numpy.
     """
     ramp = np.linspace(-1.0, 1.0, n_samples)
     powers = np.vander(ramp, n_polynomials, increasing=True)
@@ -301,7 +328,8 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
     rows : ndarray, shape (row + R + 2 P or more, N)
         Filled from `row` on over lo..hi.
     row, lo, hi : int
-        First row, first sample, and the sample after the last.
+        First row, first sample, and the sample after the last; 0 <= lo <= hi <= N. Nothing is checked:
+        compiled code reads and writes beyond an array without a word.
 
     Notes
     -----
@@ -376,8 +404,9 @@ def run_cascade(blocks: Any, n_real: int, w: Any, rows: Any, row: int, lo: int, 
 def run_cascade_free(blocks: Any, n_real: int, rows: Any, row: int, length: int) -> None:
     """Fill rows[row:, :length] with the free responses A^k B of the whole cascade.
 
-    They are the states after an impulse at k = -1. blocks (R + P, 4), n_real = R of them real poles; rows
-    have R + 2 P rows from `row` on. Zero once a block and its input are below `_DEAD`.
+    They are the states after a unit impulse at k = -1. blocks (R + P, 4), n_real = R of them real poles; rows
+    have R + 2 P rows from `row` on, and at least `length` columns, which is not checked. Zero once a block
+    and its input are below `_DEAD`.
     """
     # The all-pass response to the impulse: its value at k = -1, the signal w from k = 0 on.
     impulse = 1.0

@@ -36,8 +36,8 @@ _TINY = 1e-300
 class Residues(NamedTuple):
     """Partial fractions of G without its delay: direct + at_one/(z - 1) + sum of pole/(z - p) and conjugates.
 
-    poles (M,): real ones, and of each pair the one above the axis; pole (M, Y, U); at_one (Y, U), zero
-    without an integrator; direct (Y, U).
+    poles (M,): real ones, and of each pair the one above the axis; pole (M, Y, U), complex; at_one (Y, U),
+    zero without an integrator; direct (Y, U). Units of the outputs per unit of the inputs.
     """
 
     poles: ComplexArray
@@ -123,12 +123,16 @@ class MimoModel:
     def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray:
         """Response matrix G (F, Y, U) at omega (F,) in rad/s.
 
-        Raises ValueError for |omega| > pi / dt_s, and for omega = 0 with integrators.
+        Units of the outputs per unit of the inputs. Raises ValueError for |omega| > pi / dt_s or NaN, another
+        shape, and for omega = 0 with integrators.
         """
         return np.stack([output.frequency_response(omega_rad_s) for output in self.outputs], axis=1)
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Outputs (T, Y) for the inputs u (T, U), from rest. Raises ValueError for another shape of u."""
+        """Outputs (T, Y) for the inputs u (T, U), from rest, in their units; from a NaN on NaN.
+
+        Raises ValueError for another shape of u.
+        """
         return np.stack([output.simulate(u) for output in self.outputs], axis=1)
 
     def residues(self) -> Residues:
@@ -168,7 +172,8 @@ class MimoModel:
         A, B, C, D : ndarray, shapes (n, n), (n, U), (Y, n), (Y, U)
             A pair whose residue has rank one has two states, whatever the numbers of inputs and outputs; an
             integrator has as many as its residue has rank. The delay has a state per sample and input, or
-            output where there are fewer. Without residues, every output has states of its own.
+            output where there are fewer. Without residues (poles that repeat, several integrators), every
+            output has states of its own. Nothing is refused: the model was checked when it was made.
         """
         try:
             residues = self.residues()
@@ -210,7 +215,10 @@ class MimoModel:
         return A, B, C, D
 
     def to_control(self) -> Any:
-        """This model as a `control.StateSpace` with dt = dt_s, U inputs and Y outputs."""
+        """This model as a `control.StateSpace` with dt = dt_s, U inputs and Y outputs.
+
+        Raises ImportError without python-control.
+        """
         # Here and not above: it brings its plotting along, which nobody else needs.
         import control
 
@@ -224,7 +232,7 @@ def residue_columns(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
     Parameters
     ----------
     poles : Poles
-        Poles of the basis, B of them.
+        Poles of the basis, B of them, inside the circle; without any both results are empty.
 
     Returns
     -------
@@ -236,7 +244,7 @@ def residue_columns(poles: Poles) -> tuple[ComplexArray, ComplexArray]:
     Raises
     ------
     ValueError
-        Poles repeat.
+        Poles repeat: two are nearer than `_SAME_POLE`.
 
     Notes
     -----
@@ -256,7 +264,8 @@ def _mode(pole: complex, c: ComplexArray, b: ComplexArray) -> tuple[RealArray, R
     """Real (A, B, C) of c b/(z - pole), with its conjugate where the pole is complex.
 
     c (Y,) and b (U,): column and row of a residue of rank one. A (n, n), B (n, U), C (Y, n), with n = 1 for a
-    real pole and 2 for a pair.
+    real pole and 2 for a pair. c is not zero; of a real pole c b is real, which is not checked: an imaginary
+    part is dropped.
     """
     if pole.imag == 0:
         # The singular vectors of a real residue are real up to a common turn.
@@ -277,7 +286,7 @@ def _delayed(
     """State space of the system (A, B, C, D) followed, or preceded, by a delay of one sample.
 
     A (n, n), B (n, U), C (Y, n), D (Y, U). The new states hold the inputs where there are no more of them
-    than outputs, else the outputs: min(U, Y) states more.
+    than outputs, else the outputs: min(U, Y) states more. Shapes that do not fit numpy refuses.
     """
     n_states = len(A)
     n_outputs, n_inputs = D.shape

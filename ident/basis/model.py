@@ -47,9 +47,10 @@ class GobfModel(Shown):
     """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
     (5).
 
-    coefficients (B,): one per basis function, real poles first, then two per pair. unstable: mirror images 1
-    / conj(p) of poles p outside the circle, each among the poles: G is the above divided by their all-pass
-    B(z). Raises ValueError if the shapes do not fit, a number is not finite or dt_s is not positive.
+    coefficients (B,): one per basis function, real poles first, then two per pair, output units per input
+    unit, as feedthrough. unstable: mirror images 1 / conj(p) of poles p outside the circle, each among the
+    poles: G is the above divided by their all-pass B(z). Raises ValueError if the shapes do not fit, a number
+    is not finite or dt_s is not positive.
 
     Examples
     --------
@@ -104,12 +105,15 @@ class GobfModel(Shown):
 
     @property
     def stable_part(self) -> GobfModel:
-        """Stable model B G: G times the all-pass of its unstable poles; G itself where it has none."""
+        """Stable model B G: G times the all-pass of its unstable poles; equal to G where it has none."""
         return replace(self, unstable=NO_POLES)
 
     @property
     def unstable_poles(self) -> ComplexArray:
-        """Poles of G outside the circle, (n,), both of each pair."""
+        """Poles of G outside the circle, (n,), both of each pair; (0,) for a stable model.
+
+        Infinite for a mirror image at zero, which `IdentOptions` cannot state and nothing here refuses.
+        """
         return np.asarray(1 / self.unstable.values.conj())
 
     def frequency_response(self, omega_rad_s: RealArray) -> ComplexArray:
@@ -128,7 +132,7 @@ class GobfModel(Shown):
         Raises
         ------
         ValueError
-            A frequency beyond pi / dt_s, another shape, or omega = 0 in a model with integrators.
+            A frequency beyond pi / dt_s or NaN, another shape, or omega = 0 in a model with integrators.
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         nyquist_rad_s = np.pi / self.dt_s
@@ -155,7 +159,9 @@ class GobfModel(Shown):
         -------
         A, B, C, D : ndarray, shapes (n, n), (n, 1), (1, n), (1, 1)
             n = input_delay_samples + integrators + order, in the order of the cascade. With unstable poles
-            the states are mixed by an orthogonal matrix, and n stays the same.
+            the states are mixed by an orthogonal matrix, and n stays the same. D alone without states (n =
+            0). Raises TypeError for numbers of integrators or samples that are not whole, which the class
+            lets pass.
 
         Notes
         -----
@@ -202,7 +208,8 @@ class GobfModel(Shown):
         Returns
         -------
         ndarray of complex, shape (Z,)
-            Z is at most the order. Zeros of delay and integrators, which are at z = 0, are left out, as are
+            Z is at most the order. A model that is zero everywhere has NaN among them, which nothing refuses.
+            Zeros of delay and integrators, which are at z = 0, are left out, as are
             those beyond a modulus of 1e4, which are at infinity but for rounding.
 
         Notes
@@ -223,20 +230,26 @@ class GobfModel(Shown):
         return values[np.argsort(np.abs(values), kind="stable")]
 
     def to_control(self) -> Any:
-        """This model as a `control.StateSpace` with dt = dt_s, one input and one output."""
+        """This model as a `control.StateSpace` with dt = dt_s, one input and one output.
+
+        Raises ImportError without python-control.
+        """
         return _as_control(self, [self.input_name])
 
     def save(self, path: str | Path) -> None:
-        """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does."""
+        """Write poles, coefficients and state space to a .json or .mat file, as `identify --export` does.
+
+        Another suffix, or a path that cannot be written, is refused by the function that writes it.
+        """
         self.front.shown.save(self, Path(path))
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Output (T,) for the input u (T,) or (T, 1), from rest.
+        """Output (T,) for the input u (T,) or (T, 1), from rest, in units of the output; from a NaN on NaN.
 
         Raises
         ------
         ValueError
-            The model is unstable: its output would grow without end.
+            The model is unstable: its output would grow without end; or u has another shape.
         """
         refuse_unstable(self.unstable)
         filtered = filter_input(u, self.integrators, self.input_delay_samples)
@@ -248,8 +261,9 @@ class GobfModel(Shown):
 class MisoModel:
     """y = sum_i G_i u_i, every G_i a `GobfModel` with the same poles, integrators and delay.
 
-    coefficients (U, B), feedthrough (U,): row i belongs to input i. Raises ValueError as `GobfModel`, or if
-    names repeat.
+    coefficients (U, B), feedthrough (U,): row i belongs to input i, output units per unit of that input. dt_s
+    in s. Raises ValueError as `GobfModel` (shapes, numbers not finite, dt_s), or if names repeat or there is
+    none.
     """
 
     poles: Poles
@@ -315,17 +329,18 @@ class MisoModel:
         Returns
         -------
         ndarray of complex, shape (F, U)
+            Units of the output per unit of each input.
 
         Raises
         ------
         ValueError
-            A frequency outside that range.
+            A frequency outside that range or NaN, or another shape.
         """
         channels = [self.channel(i).frequency_response(omega_rad_s) for i in range(self.n_inputs)]
         return np.stack(channels, axis=1)
 
     def simulate(self, u: RealArray) -> RealArray:
-        """Output (T,) for the inputs u (T, U), from rest.
+        """Output (T,) for the inputs u (T, U), from rest, in units of the output; from a NaN on NaN.
 
         Raises
         ------
@@ -344,6 +359,7 @@ class MisoModel:
         Returns
         -------
         A, B, C, D : ndarray, shapes (n, n), (n, U), (1, n), (1, U)
+            n = order + input_delay_samples, and the integrators where they have states of their own.
 
         Notes
         -----
@@ -385,7 +401,10 @@ class MisoModel:
         return _unmirrored(A, B, C, D, self.unstable)
 
     def to_control(self) -> Any:
-        """This model as a `control.StateSpace` with dt = dt_s, U inputs and one output."""
+        """This model as a `control.StateSpace` with dt = dt_s, U inputs and one output.
+
+        Raises ImportError without python-control.
+        """
         return _as_control(self, list(self.input_names))
 
 
@@ -402,7 +421,9 @@ def _unmirrored(
 
     A (n, n), B (n, U), C (1, n), D (1, U) have the mirror images of the unstable poles among their poles.
     1/B(z) adds the unstable poles behind the output and has zeros at the mirror images, which so become
-    unobservable: their eigenvectors are left out, which takes away as many states as were added.
+    unobservable: their eigenvectors are left out, which takes away as many states as were added. Without
+    unstable poles the matrices come back as they are. That the mirror images are among the poles is checked
+    by the models, not here; one at zero gives numbers that are not finite (`inverse_all_pass`).
     """
     for block in unstable.blocks():
         # The stage 1/B of one real pole or one pair, driven by the output.
@@ -426,7 +447,10 @@ def _unmirrored(
 
 
 def _as_control(model: GobfModel | MisoModel, inputs: list[str]) -> Any:
-    """A `control.StateSpace` of the model with these names of its inputs and the name of its output."""
+    """A `control.StateSpace` of the model with these names of its inputs (U) and the name of its output.
+
+    States that do nothing stay, so that the matrices are those of `state_space`.
+    """
     # Here and not above: it brings its plotting along, which nobody else needs.
     import control
 

@@ -40,14 +40,17 @@ class ModelFile:
     ellipses: FrequencyUncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Check that the ellipses are of the model's sampling time."""
+        """Check that the ellipses are of the model's sampling time. Raises ValueError as the class says."""
         if self.ellipses is not None and self.ellipses.dt_s != self.model.dt_s:
             raise ValueError(
                 f"the ellipses' dt_s = {self.ellipses.dt_s} is not the model's, {self.model.dt_s}"
             )
 
     def _document(self) -> dict[str, Any]:
-        """Fields of the file, in its order: text, numbers, arrays, and fields of the ellipses."""
+        """Fields of the file, in its order: text, numbers, arrays, and fields of the ellipses.
+
+        Nothing can be bad here: the model and the ellipses were checked when they were made.
+        """
         model = self.model
         document: dict[str, Any] = {"format": FORMAT, "format_version": FORMAT_VERSION}
         names = ("input_name", "output_name", "dt_s", "integrators", "input_delay_samples", "feedthrough")
@@ -70,7 +73,7 @@ class ModelFile:
         """JSON text; floats with as many digits as they have, so that reading gives the same bits."""
 
         def as_lists(array: Any) -> Any:
-            """Lists of an array, of a complex one as rows [real part, imaginary part]."""
+            """Lists of an array, of a complex one (n,) as rows [real part, imaginary part]."""
             if np.iscomplexobj(array):
                 array = np.column_stack([array.real, array.imag])
             return array.tolist()
@@ -82,7 +85,8 @@ class ModelFile:
     def from_json(cls, text: str, source: str = "model file") -> ModelFile:
         """Model file of the text that `to_json` made.
 
-        Raises ValueError, one line that begins with `source`, where it is no such text.
+        source: what messages call the file. Raises ValueError, one line that begins with `source`, where it
+        is no such text (`_read`). Fields that are not known are ignored.
         """
         try:
             document = json_value(text)
@@ -102,14 +106,19 @@ class ModelFile:
     def from_mat(cls, content: bytes, source: str = "model file") -> ModelFile:
         """Model file of the bytes that `to_mat` made.
 
-        Raises ValueError, one line that begins with `source`, where they are no such file.
+        source: what messages call the file. Raises ValueError, one line that begins with `source`, where they
+        are no such file (`mat_variables`, `_read`). Variables that are not known are ignored.
         """
         document: dict[str, Any] = _plain(mat_variables(content, source))
         return _read(document, source)
 
 
 def _plain(value: Any) -> Any:
-    """A MATLAB variable as it would stand in JSON: text, a number, an array, or fields."""
+    """A MATLAB variable as it would stand in JSON: text, a number, an array, or fields.
+
+    An array of one number becomes that number; whatever else is found stays, for the readers of fields to
+    refuse.
+    """
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
@@ -119,7 +128,8 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
     """Model file of the fields that were read from `source`.
 
     Raises ValueError, one line that begins with `source`: another format or version, a field that is missing
-    or of another kind, or state matrices that are not those of the poles and coefficients.
+    or of another kind, poles or numbers that `Poles` or `GobfModel` refuses, or state matrices that are not
+    those of the poles and coefficients. A whole number that is infinite: OverflowError.
     """
     if document.get("format") != FORMAT:
         shown = repr(document["format"])[:_SHOWN_CHARACTERS] if "format" in document else "missing"
@@ -159,7 +169,11 @@ def _read(document: Mapping[str, Any], source: str) -> ModelFile:
 
 
 def _read_ellipses(document: Any, dt_s: float) -> FrequencyUncertainty:
-    """Ellipses of their fields in a file; dt_s, s, is the model's. Raises ValueError for wrong fields."""
+    """Ellipses of their fields in a file; dt_s, s, is the model's.
+
+    Raises ValueError for fields that are missing or of another kind, a covariance whose size is no multiple
+    of 4, and what `FrequencyUncertainty` refuses: shapes, order, numbers not finite, level.
+    """
     if not isinstance(document, Mapping):
         raise ValueError("'ellipses' must hold fields; expected the ones that were written")
     fields = {name: read(document, name) for name, read in _ELLIPSES.items()}
@@ -177,7 +191,10 @@ def _field(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _array(document: Mapping[str, Any], name: str) -> Any:
-    """Array of numbers of a field, of any shape. Raises ValueError where it is none."""
+    """Array of numbers of a field, of any shape. Raises ValueError where it is missing or none.
+
+    An empty one of any type passes; NaN and infinities are for the classes behind to refuse.
+    """
     value = _field(document, name)
     try:
         array = np.asarray(value)
@@ -190,7 +207,10 @@ def _array(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _vector(document: Mapping[str, Any], name: str) -> Any:
-    """Real numbers of a field, (n,). Raises ValueError where they are complex or no numbers."""
+    """Real numbers of a field, (n,), from an array of any shape, row by row.
+
+    Raises ValueError where they are missing, complex or no numbers.
+    """
     array = _array(document, name)
     if array.dtype.kind == "c":
         raise ValueError(f"the field '{name}' must be real")
@@ -200,7 +220,7 @@ def _vector(document: Mapping[str, Any], name: str) -> Any:
 def _complex_vector(document: Mapping[str, Any], name: str) -> Any:
     """Complex numbers of a field, (n,): from MATLAB as they are, from JSON rows [real part, imaginary part].
 
-    Raises ValueError for other rows.
+    Raises ValueError for other rows, and where the field is missing or holds no numbers.
     """
     array = _array(document, name)
     if array.size == 0:
@@ -214,7 +234,10 @@ def _complex_vector(document: Mapping[str, Any], name: str) -> Any:
 
 
 def _number(document: Mapping[str, Any], name: str) -> float:
-    """Number of a field, as a float. Raises ValueError for anything else, true and false included."""
+    """Number of a field, as a float; NaN and infinities pass.
+
+    Raises ValueError for anything else, true and false included, and where the field is missing.
+    """
     value = _field(document, name)
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise ValueError(f"the field '{name}' must be a number")
@@ -222,7 +245,8 @@ def _number(document: Mapping[str, Any], name: str) -> float:
 
 
 def _count(document: Mapping[str, Any], name: str) -> int:
-    """Whole number of a field, at least 0. Raises ValueError for anything else."""
+    """Whole number of a field, at least 0. Raises ValueError for anything else, OverflowError for
+    infinity."""
     value = _number(document, name)
     if not (value >= 0 and value == int(value)):
         raise ValueError(f"the field '{name}' must be a whole number, at least 0; got {value}")
@@ -230,7 +254,7 @@ def _count(document: Mapping[str, Any], name: str) -> int:
 
 
 def _text(document: Mapping[str, Any], name: str) -> str:
-    """Text of a field. Raises ValueError for anything else."""
+    """Text of a field. Raises ValueError for anything else, and where the field is missing."""
     value = _field(document, name)
     if not isinstance(value, str):
         raise ValueError(f"the field '{name}' must be text")

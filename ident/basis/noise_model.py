@@ -23,12 +23,17 @@ from ident.data.arrays import RealArray
 # what is not by up to the root of this number, 100. From 1e2 to 1e8 no ellipse of ten simulated arms in noise
 # with a pole at .9 moved by 1 %.
 LARGEST_CONDITION = 1e4
+# Largest magnitude of a root that was reflected: one on the circle itself, which reflection leaves there, is
+# pulled in by a millionth, a time constant of a million rows. That is as good as none in records of up to
+# some hundred thousand. Chosen.
+_LARGEST_REFLECTED = 1 - 1e-6
 
 
 class NoiseModel(ABC):
     """Stationary noise v = H(q) e of one output, e white of unit variance, H(q) = 1 + h_1 q^-1 + ...
 
-    Every model can be inverted: `coloured` undoes `filtered`. A new kind of noise is one subclass.
+    Every model can be inverted: `coloured` undoes `filtered`. A new kind of noise is one subclass, which
+    refuses coefficients that it cannot use when it is made; signals are not checked, and NaN in them stays.
     """
 
     @property
@@ -56,7 +61,7 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def filtered(self, signals: RealArray) -> RealArray:
-        """H^-1(q) signals from rest, (T,) or (T, n) along the first axis."""
+        """H^-1(q) signals from rest, (T,) or (T, n) along the first axis, in their units."""
 
     @abstractmethod
     def coloured(self, innovations: RealArray) -> RealArray:
@@ -64,13 +69,17 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def autocovariance(self, max_lag: int) -> RealArray:
-        """E v_t v_(t-k), k = 0 .. max_lag, (max_lag + 1,), for innovations of unit variance."""
+        """E v_t v_(t-k), k = 0 .. max_lag, (max_lag + 1,), for innovations of unit variance.
+
+        max_lag: at least 0, which need not be checked.
+        """
 
     @abstractmethod
     def relative_spectrum(self, n_samples: int) -> RealArray:
         """|H|^2 over the variance of the noise at the lines of an FFT of n_samples, (n_samples // 2 + 1,).
 
-        Line k stands at 2 pi k / n_samples radians a sample. The mean over the whole circle is 1.
+        Line k stands at 2 pi k / n_samples radians a sample. The mean over the whole circle is 1. n_samples
+        has to exceed the order, which need not be checked.
         """
 
     @property
@@ -88,7 +97,7 @@ class NoiseModel(ABC):
         """(n_start, n_start) lower triangle that whitens the first samples of a record of this noise.
 
         It is the inverse Cholesky factor of their covariance, or zeros where that is nearly singular
-        (`LARGEST_CONDITION`): then these rows are left out.
+        (`LARGEST_CONDITION`) or has NaN: then these rows are left out. (0, 0) for white noise.
         """
         n = self.n_start
         if n == 0:
@@ -119,7 +128,8 @@ class NoiseModel(ABC):
         -------
         ndarray, of the same shape
             The first `n_start` rows by `first_rows` (zero where they are left out), the others `filtered`.
-            White noise gives back `signals` itself.
+            White noise, and signals without rows or columns, give back `signals` itself. Fewer rows than
+            n_start get the corner of `first_rows`.
         """
         if self.is_white or signals.size == 0:
             return signals
@@ -129,7 +139,10 @@ class NoiseModel(ABC):
         return white
 
     def without_start(self, signals: RealArray) -> RealArray:
-        """`filtered` signals (T,) or (T, n) without the first `n_start` rows: the past is in the record."""
+        """`filtered` signals (T,) or (T, n) without the first `n_start` rows: the past is in the record.
+
+        No rows where T is not more than n_start.
+        """
         return self.filtered(signals)[self.n_start :]
 
 
@@ -138,9 +151,14 @@ def monic_polynomial(coefficients: RealArray, name: str) -> RealArray:
 
     Parameters
     ----------
-    coefficients : ndarray
+    coefficients : ndarray, shape (n + 1,)
     name : str
         What the message calls the polynomial.
+
+    Returns
+    -------
+    ndarray, shape (n + 1,)
+        As float64; roots may be anywhere.
 
     Raises
     ------
@@ -159,14 +177,13 @@ def reflected_inside(polynomial: RealArray) -> RealArray:
     """The monic polynomial (n + 1,) in q^-1 of the same magnitude on the unit circle, with all roots inside.
 
     Its magnitude is the same up to a constant factor. Roots on or outside the circle are reflected; a
-    polynomial that has none there is given back itself.
+    polynomial that has none there is given back itself. Its numbers are finite (`monic_polynomial`): numpy's
+    LinAlgError else.
     """
     roots = np.asarray(np.roots(polynomial), dtype=np.complex128)
     outside = np.abs(roots) >= 1
     if not np.any(outside):
         return polynomial
-    # On the circle itself reflection changes nothing; a root there is pulled in by a millionth, a time
-    # constant of a million rows: as good as none in records of up to some hundred thousand.
-    radius = np.minimum(1.0 / np.abs(roots[outside]), 1 - 1e-6)
+    radius = np.minimum(1.0 / np.abs(roots[outside]), _LARGEST_REFLECTED)
     roots[outside] = radius * np.exp(1j * np.angle(roots[outside]))
     return np.asarray(np.real(np.poly(roots)), dtype=np.float64)

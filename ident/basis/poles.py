@@ -21,8 +21,8 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 class Poles:
     """Discrete-time poles inside the circle: real (R,), then pairs (P,), each by its pole above the axis.
 
-    Zeros (FIR) and equal poles are allowed; the order is that of the basis functions. Raises ValueError if a
-    pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
+    No unit. Zeros (FIR) and equal poles are allowed; the order is that of the basis functions. Raises
+    ValueError if a pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
     """
 
     real: RealArray = field(default_factory=lambda: np.zeros(0))
@@ -75,8 +75,9 @@ class Poles:
         Raises
         ------
         ValueError
-            dt_s is not positive, a damping ratio is not between 0 and 1, a damped frequency is not between 0
-            and pi / dt_s, or a pole would not lie inside the circle.
+            dt_s is not positive, omega_rad_s and zeta are not equally long, a damping ratio is not between 0
+            and 1, a damped frequency is not between 0 and pi / dt_s, or a pole would not lie inside the
+            circle.
         """
         if not (np.isfinite(dt_s) and dt_s > 0):
             raise ValueError(f"dt_s must be positive; got {dt_s}")
@@ -119,7 +120,7 @@ class Poles:
         return np.concatenate([self.real.astype(np.complex128), pair_poles])
 
     def writable(self) -> tuple[RealArray, ComplexArray]:
-        """Copies of real and pairs as compiled code takes them (`ident.data.arrays.kernel_array`)."""
+        """Copies of real (R,) and pairs (P,) as compiled code takes them: contiguous and writable."""
         return self.real.copy(), self.pairs.copy()
 
     def blocks(self) -> tuple[Poles, ...]:
@@ -129,18 +130,19 @@ class Poles:
         return (*reals, *pairs)
 
     def without_real(self, index: int | slice) -> Poles:
-        """These poles but the real one (or those) at `index`."""
+        """These poles but the real one (or those) at `index`, 0 .. R - 1. IndexError for a number beyond."""
         return Poles(np.delete(self.real, index), self.pairs)
 
     def without_pair(self, index: int | slice) -> Poles:
-        """These poles but the pair (or those) at `index`."""
+        """These poles but the pair (or those) at `index`, 0 .. P - 1. IndexError for a number beyond."""
         return Poles(self.real, np.delete(self.pairs, index))
 
     def doubled(self, n_fixed: tuple[int, int] = (0, 0)) -> Poles:
         """Every pole twice, neighbours equal, but the first of each type, fixed, once.
 
         The basis of these poles, Phi2, spans the derivatives of the basis functions by their poles. n_fixed:
-        numbers of fixed real poles and of fixed pairs.
+        numbers of fixed real poles and of fixed pairs; larger ones than there are fix all, which is not
+        refused.
         """
         n_fixed_real, n_fixed_pairs = n_fixed
         real = np.concatenate([self.real[:n_fixed_real], np.repeat(self.real[n_fixed_real:], 2)])
@@ -165,7 +167,8 @@ class Poles:
     def moved(self, changes: RealArray) -> Poles:
         """These poles after changes (B,): of each real pole, then of real and imaginary part of each pair.
 
-        Raises ValueError if a pole leaves the circle, or a pair the upper half plane.
+        B = R + 2 P, no unit. Raises ValueError if a pole leaves the circle, or a pair the upper half plane,
+        or (numpy's) for another number of changes.
         """
         n_real = self.real.size
         # A row (real, imaginary) for each pair, then as complex numbers.
@@ -173,11 +176,11 @@ class Poles:
         return Poles(self.real + changes[:n_real], self.pairs + by_pair @ (1, 1j))
 
     def appended(self, other: Poles) -> Poles:
-        """These poles and then the other's, real before pairs."""
+        """These poles and then the other's, real before pairs; equal ones stay, then they repeat."""
         return Poles(np.concatenate([self.real, other.real]), np.concatenate([self.pairs, other.pairs]))
 
     def omega_rad_s(self, dt_s: float) -> RealArray:
-        """Undamped natural frequency |log p|/dt of each pair, (P,), rad/s."""
+        """Undamped natural frequency |log p|/dt of each pair, (P,), rad/s. dt_s: s, positive, not checked."""
         return np.asarray(np.abs(np.log(self.pairs)) / dt_s, dtype=np.float64)
 
     def zeta(self) -> RealArray:
@@ -189,6 +192,7 @@ class Poles:
         """Decay rate -log(a)/dt of each real pole, (R,), 1/s.
 
         A pole a <= 0 has no real continuous-time counterpart: its rate is -log|a|/dt, infinite at a = 0.
+        dt_s: s, positive, not checked.
         """
         # A pole at zero is a sample of delay: infinitely fast, and no reason for a warning.
         with np.errstate(divide="ignore"):

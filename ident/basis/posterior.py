@@ -87,7 +87,8 @@ def _centre_and_covariance(
 ) -> tuple[ComplexArray, RealArray]:
     """Centre (F,) and covariances (F, 2, 2) of real and imaginary part at frequencies, rad/s.
 
-    They are given as the bytes and the shape of an array, which a cache can compare.
+    They are given as the bytes and the shape of a float64 array, which a cache can compare; the posterior is
+    compared by identity. Raises ValueError as `ResponsePosterior.frequency_rows`.
     """
     omega_rad_s = np.frombuffer(omega).reshape(shape)
     rows = posterior.frequency_rows(omega_rad_s)
@@ -97,7 +98,8 @@ def _centre_and_covariance(
 def _delays(z: ComplexArray, most: int) -> ComplexArray:
     """z^-1 .. z^-most at points z (F,) of the unit circle, (F, most).
 
-    By doubling: an exponential of each takes many times as long.
+    By doubling: an exponential of each takes many times as long. (F, 0) for most = 0. That z is on the circle
+    is not checked: elsewhere the numbers are powers of conj(z).
     """
     powers = np.empty((z.size, most), dtype=np.complex128)
     # On the unit circle 1/z is the conjugate.
@@ -116,7 +118,8 @@ def _delays(z: ComplexArray, most: int) -> ComplexArray:
 class ResponsePosterior(Shown):
     """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
 
-    Raises ValueError if shapes do not fit, or a number is not finite or negative.
+    Raises ValueError if shapes do not fit, mean, factor or dt_s is not finite, dt_s is not positive, or a
+    count is negative.
 
     Attributes
     ----------
@@ -124,7 +127,8 @@ class ResponsePosterior(Shown):
         Of the L_i, B of them (doubled ones for the tangent method).
     mean : ndarray, shape (P,)
         In the order a (B,), d if has_feedthrough, h_1 .. h_L, and how far each mirror image of an unstable
-        pole is off, to first order (real; real and imaginary part of a pair).
+        pole is off, to first order (real; real and imaginary part of a pair). Output units per unit of the
+        input, but for these last ones, which have none.
     covariance_factor : ndarray, shape (P, P')
         S, where the covariance is S S^T.
     dt_s : float
@@ -189,7 +193,7 @@ class ResponsePosterior(Shown):
         Raises
         ------
         ValueError
-            A frequency outside that range, or omega = 0 when there are integrators.
+            A frequency outside that range or NaN, another shape, or omega = 0 when there are integrators.
 
         Notes
         -----
@@ -240,12 +244,18 @@ class ResponsePosterior(Shown):
         omega_rad_s : array-like, shape (F,)
             Strictly increasing frequencies, rad/s; limits as in `frequency_rows`.
         level : float
-            Probability that an ellipse holds the response at its frequency.
+            Probability that an ellipse holds the response at its frequency; 0.95 is what all reports use.
 
         Returns
         -------
         FrequencyUncertainty
             Centre (F,) and covariances (F, 2, 2) of real and imaginary part.
+
+        Raises
+        ------
+        ValueError
+            As `frequency_rows`; by `FrequencyUncertainty` for no frequency, frequencies that do not increase
+            and a level outside (0, 1).
         """
         omega = np.asarray(omega_rad_s, dtype=np.float64)
         centre, covariance = _centre_and_covariance(self, omega.tobytes(), omega.shape)
@@ -253,22 +263,31 @@ class ResponsePosterior(Shown):
         return FrequencyUncertainty(omega, centre, covariance, self.dt_s, level, method)
 
     def centre(self, omega_rad_s: npt.ArrayLike) -> ComplexArray:
-        """Posterior mean response (F,) at omega (F,), rad/s, without its uncertainty."""
+        """Posterior mean response (F,) at omega (F,), rad/s, in any order, without its uncertainty.
+
+        Output units per unit of the input. Raises ValueError as `frequency_rows`.
+        """
         return np.asarray(self.frequency_rows(omega_rad_s) @ self.mean)
 
     def sample(self, rng: np.random.Generator, n_draws: int) -> RealArray:
-        """Draws (n_draws, P) of the coefficients."""
+        """Draws (n_draws, P) of the coefficients, in the order of `mean`; n_draws at least 0 (ValueError
+        else)."""
         noise = rng.standard_normal((n_draws, self.covariance_factor.shape[1]))
         return np.asarray(self.mean + noise @ self.covariance_factor.T)
 
     def response_of(self, draws: RealArray, omega_rad_s: npt.ArrayLike) -> ComplexArray:
-        """Responses (n_draws, F) of coefficient draws (n_draws, P)."""
+        """Responses (n_draws, F) of coefficient draws (n_draws, P), at omega_rad_s (F,), rad/s, in any order.
+
+        Linear also in the places of unstable poles. Raises ValueError as `frequency_rows`, and (numpy's) for
+        draws of another P.
+        """
         return np.asarray(draws @ self.frequency_rows(omega_rad_s).T)
 
     def simulate(self, u: RealArray, coefficients: RealArray | None = None) -> RealArray:
         """Output (T,) from rest for the input u (T,), with the mean coefficients or a draw (P,).
 
-        Raises ValueError for an unstable plant, and for another number of coefficients.
+        In units of the output; from a NaN on NaN. Raises ValueError for an unstable plant, for another number
+        of coefficients, and for another shape of u than (T,) or (T, 1).
         """
         refuse_unstable(self.unstable)
         values = self.mean if coefficients is None else np.asarray(coefficients, dtype=np.float64)

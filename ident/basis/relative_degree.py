@@ -31,7 +31,7 @@ _NEAR_IDENTITY = 0.25
 # 1e-10, sixteen change nothing.
 _N_NODES = 8
 _gauss_nodes, _gauss_weights = np.polynomial.legendre.leggauss(_N_NODES)
-# From -1 .. 1, where numpy has them, to 0 .. 1.
+# Nodes moved from -1 .. 1, where numpy has them, to 0 .. 1.
 _NODES = (_gauss_nodes + 1) / 2
 
 # Weights for the same interval: half as long, so half of each.
@@ -49,19 +49,20 @@ def conditions(poles: Poles, integrators: int, relative_degree: int) -> RealArra
         B poles as in `GobfModel`: with integrators, the first real poles are the zeros that their filters
         cancel.
     integrators : int
-        Number of integrators.
+        Number of integrators, as many as there are zeros among the first real poles.
     relative_degree : int
         r, at least 1.
 
     Returns
     -------
     ndarray, shape (r - 1, B)
-        Row k is C A_c^k B_c dt^(k + 1).
+        Row k is C A_c^k B_c dt^(k + 1), no unit. (0, B) for r = 1, whatever the poles.
 
     Raises
     ------
     ValueError
-        A pole has no continuous-time counterpart, or there are fewer than r poles in all.
+        r is below 1; for r above 1: a real pole behind the first `integrators` is not above 0, one of those
+        is not 0, or there are fewer than r poles in all.
     """
     no_coefficients = np.zeros(poles.order)
     rows, _ = conditions_with_sensitivities(poles, integrators, relative_degree, no_coefficients, ())
@@ -93,8 +94,8 @@ def conditions_with_sensitivities(
     Raises
     ------
     ValueError
-        As `conditions`; also if a block is more than one real pole or one pair, or the first real poles are
-        not zero with integrators.
+        As `conditions`; also if a block is not one real pole or one pair. Not checked: that the blocks are
+        among the poles, and coefficients that are not finite, which make the functionals so.
     """
     if not relative_degree >= 1:
         raise ValueError(f"relative_degree must be at least 1; got {relative_degree}")
@@ -170,7 +171,9 @@ def conditions_with_sensitivities(
 def _square_root(matrix: Any) -> Any:
     """Square root (n, n) of a lower triangular complex matrix (n, n), from the diagonal outwards.
 
-    Written out because scipy's sqrtm loses two digits.
+    Written out because scipy's sqrtm loses two digits. Compiled: shape and triangle are not checked (what
+    stands above the diagonal is not read). An eigenvalue on the negative axis, or twice zero, has no such
+    root: the numbers are then wrong or not finite.
     """
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
@@ -188,8 +191,9 @@ def _square_root(matrix: Any) -> Any:
 def _log_moments(matrix: ComplexArray, count: int) -> ComplexArray:
     """First columns of log(T)^m for m = 1 .. count, as rows (count, n).
 
-    matrix: T (n, n), lower triangular, no eigenvalue on (-inf, 0]. With T = root^factor,
-    log(T) = factor log(root), and the quadrature is exact where the root is near the identity.
+    matrix: T (n, n), lower triangular, no eigenvalue on (-inf, 0], which is not checked. With T =
+    root^factor, log(T) = factor log(root), and the quadrature is exact where the root is near the identity
+    (`_NEAR_IDENTITY`). count: at least 0. T with NaN ends in NaN.
     """
     identity = np.eye(len(matrix))
     root = matrix
@@ -202,7 +206,7 @@ def _log_moments(matrix: ComplexArray, count: int) -> ComplexArray:
     offset = root - identity
     for _ in range(count):
         product = offset @ moments[-1]
-        # All nodes at once: (8, n, n) equations for (8, n, 1).
+        # All `_N_NODES` nodes at once: (8, n, n) equations for (8, n, 1).
         at_nodes = identity + _NODES[:, None, None] * offset
         parts = np.linalg.solve(at_nodes, product[:, None])
         moments.append(factor * _WEIGHTS @ parts[..., 0])
@@ -215,7 +219,8 @@ def null_space(rows: RealArray, column_scale: npt.ArrayLike) -> tuple[RealArray,
     Parameters
     ----------
     rows : ndarray, shape (K, B)
-        Conditions rows @ c = 0, of full rank.
+        Conditions rows @ c = 0, of full rank, K from 0 to B: not checked. A row of zeros gives NaN, more rows
+        than columns numpy's LinAlgError.
     column_scale : array-like, shape (B,)
         Lengths of the regression columns. Both results are orthogonal in coefficients times these lengths: a
         column that moves the output much shall count as much.

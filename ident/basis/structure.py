@@ -39,7 +39,7 @@ class Structure:
     relative_degree : int
         Of the continuous plant behind the hold (1: no direct term).
     unstable : Poles
-        Mirror images of the unstable poles, see `stabilised`.
+        Mirror images 1 / conj(p) of the unstable poles p, inside the circle; see `stabilised`.
     """
 
     integrators: int = 0
@@ -77,7 +77,10 @@ class Structure:
 def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
     """Input (1 - q^-1)^-integrators q^-delay u behind integrators and delay, from rest, (T,).
 
-    u (T,) or (T, 1): delayed by whole samples, then summed, the present sample included; both are exact.
+    u (T,) or (T, 1): delayed by whole samples, then summed, the present sample included; both are exact. Its
+    unit stays. integrators, delay_samples: at least 0. Not checked: a negative delay, or u with several
+    columns, ends in numpy's ValueError of shapes or in numbers that mean nothing. NaN stays, behind
+    integrators to the end.
     """
     u = one_signal(u)
     # At rest before the record: what the delay brings in from there is zero, all of it if the delay is
@@ -92,7 +95,8 @@ def filter_input(u: RealArray, integrators: int, delay_samples: int) -> RealArra
 def answered(signal: RealArray, delay_samples: int) -> RealArray:
     """Rows (T - delay, ...) of a signal (T, ...) of a record that answer to its recorded input.
 
-    The first `delay_samples` rows answer to what was before the record. Raises ValueError where none is left.
+    The first `delay_samples` rows answer to what was before the record. Raises ValueError where none is left;
+    a negative delay, which `Structure` refuses, would give the last rows.
     """
     if not len(signal) > delay_samples:
         raise ValueError(f"{len(signal)} samples, not more than the input delay {delay_samples}")
@@ -108,6 +112,11 @@ def stabilised(y: RealArray, unstable: Poles) -> RealArray:
         Output of one record.
     unstable : Poles
         Mirror images 1 / conj(p) of the unstable poles p; none: y itself is returned.
+
+    Raises
+    ------
+    ValueError
+        By `all_pass_signal`, for y of another shape, where there are unstable poles.
 
     Notes
     -----
@@ -129,7 +138,8 @@ def stabilised(y: RealArray, unstable: Poles) -> RealArray:
 def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArray:
     """Input behind integrators and delay in the rows that answer to u (T,), (T - delay,), from rest.
 
-    Raises ValueError where the record is not longer than the delay.
+    u (T,) or (T, 1), its unit stays. Raises ValueError where the record is not longer than the delay; else as
+    `filter_input`.
     """
     return answered(filter_input(u, integrators, delay_samples), delay_samples)
 
@@ -137,8 +147,9 @@ def driving_input(u: RealArray, integrators: int, delay_samples: int) -> RealArr
 def level_before(u: RealArray) -> float:
     """Input before a record u (T,) whose offset and initial state are unknown, in units of the input.
 
-    Zero, unless the input never comes near it; then its first value. Basis functions hold the difference in
-    their free responses, taps do not.
+    Zero if the input reaches or passes it; else its first value. Basis functions hold the difference in their
+    free responses, taps do not. NaN in u: its first value, too; numpy's ValueError for a record without
+    samples.
     """
     # An input that passes zero was most likely switched on from there.
     passes_zero = np.min(u) <= 0 <= np.max(u)
@@ -148,7 +159,8 @@ def level_before(u: RealArray) -> float:
 def front_response(omega_rad_s: RealArray, dt_s: float, integrators: int, delay_samples: int) -> ComplexArray:
     """Response (z/(z - 1))^integrators z^-delay of integrators and delay, (F,).
 
-    omega_rad_s (F,): rad/s, not 0 with integrators, where it is infinite. dt_s: sampling time, s.
+    omega_rad_s (F,): rad/s, not 0 with integrators, where it is infinite or NaN, with numpy's warning; up to
+    pi / dt_s, not checked. dt_s: sampling time, s. No unit.
     """
     response = np.exp(-1j * omega_rad_s * dt_s * delay_samples)
     if integrators:

@@ -38,8 +38,8 @@ _LARGEST_ANGLE_SHARE = 0.9
 # begins at two periods in the longest record (`ident.basis.coordinates`), so it begins at that frequency.
 _PERIODS_OF_LOWEST = 2
 # Least number of independent numbers that a residual is worth: the criterion takes its logarithm as the price
-# of a free number, and a residual of one colour throughout would be worth nothing. Chosen, so that the price
-# is above 1.
+# of a free number, and a residual of one colour throughout would be worth nothing. Chosen; the price, ln 3,
+# is then just above 1.
 _LEAST_WORTH = 3.0
 
 

@@ -42,7 +42,7 @@ _LEAST_RELIEF = 1 / 5
 # Share of |y|^2 below which J is rounding: residuals of 1e-13 of the output.
 _EXPLAINED = 1e-26
 # Decay over the longest record below which a pole cannot be told from one on the circle: it loses a
-# thousandth there, less than noise hides. Chosen.
+# thousandth there. Chosen.
 _STILL = 1e-3
 # Largest 1 - a of a real pole: those down to -.95 are reached by refinement only; they have no continuous
 # counterpart, so no search starts there.
@@ -208,12 +208,11 @@ def refine(
     fixed : Poles
         Poles that do not move.
     max_iterations : int
-        Most steps that gain. 60 is chosen; a refinement that ends there has not
-        converged.
+        Most steps that gain. 60 is chosen; a refinement that ends there has not converged.
     tolerance : float
-        Promised fall of J, as a share of it, below which a point counts as stationary. At 1e-9 poles are off
-        by a few 1e-5 of what noise moves them in a record of some thousand samples (J falls by about 1 / N a
-        deviation).
+        Promised fall of J, as a share of it, below which a point counts as stationary. d standard
+        deviations of a pole cost about d^2 / N of J, so that at 1e-9 poles are off by .003 of theirs for
+        N = 10 000 samples.
     damping : float
         Of the first step, `NEAR` an optimum or `FAR` from one.
 
