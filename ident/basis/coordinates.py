@@ -27,7 +27,7 @@ ZETA_LIMIT = 0.98
 # Least damping ratio of a pair: links have more, and an undamped pair with a free initial state fits any slow
 # disturbance (docs/decisions.md). A user who knows a lighter mode states `zeta_min`.
 ZETA_LEAST = 1e-3
-# Shortest record whose length shapes the box, samples: of fewer, the box would be empty or nearly so (from 5
+# Shortest record whose length shapes the box, samples: of fewer, the box would be empty or nearly so (from 4
 # down no frequency is left between two periods and the highest share). Chosen.
 _SHORTEST = 30
 # Slowest real pole of the box: it decays by this share of its value over the longest record. Slower ones look

@@ -47,6 +47,9 @@ class IdentOptions(Settings):
     refinement.
     """
 
+    # Most numbers that may be stated (8, 12), and that are chosen from the data (4, 5): chosen for arms, with
+    # a few lags and up to five modes below the Nyquist frequency. A search takes longer with the number of
+    # pairs.
     n_real: int | None = Field(None, ge=0, le=8, description="number of real poles; default: from the data")
     n_pairs: int | None = Field(None, ge=0, le=12, description="number of pole pairs; default: from the data")
     max_real: int = Field(
@@ -65,6 +68,7 @@ class IdentOptions(Settings):
         (),
         description="known poles outside the unit circle, each as real part, imaginary part >= 0",
     )
+    # Three integrators are torque to angle and one of a controller in the plant.
     integrators: int = Field(0, ge=0, le=3, description="known poles at z = 1, as exact input filters")
     feedthrough: bool = Field(
         False, description="direct term from the input to the output of the same sample"
@@ -99,6 +103,8 @@ class IdentOptions(Settings):
         description="log: log10 of decay, frequency and damping; raw: the paper's (x, beta, gamma), "
         "which often miss the best poles",
     )
+    # Effort of a search. The numbers are chosen: more cost time, and fewer are noticed, as refined starts
+    # that disagree are followed by more of them.
     evaluations: int = Field(
         250, ge=20, le=1_000_000, description="cost evaluations of the first global search"
     )
@@ -112,6 +118,8 @@ class IdentOptions(Settings):
         description="points of a global search that are refined; five times as many if the first disagree",
     )
 
+    # Bounds of damping ratios end at .98, `ident.basis.coordinates.ZETA_LIMIT`: beyond, a pair is two real
+    # poles.
     omega_min_rad_s: float | None = Field(
         None, gt=0, description="lowest natural frequency of a pair [rad/s]"
     )
@@ -130,7 +138,7 @@ class IdentOptions(Settings):
 
         `given` may be `Poles`, or a list of numbers and of such pairs: of a conjugate pair of complex numbers
         the upper one remains. What is neither stays as it is, for pydantic to refuse. Raises ValueError where
-        it is no list.
+        it is no list; a tuple of pairs comes back. Where poles lie is checked in `_consistent`.
         """
         poles = list(given.values) if isinstance(given, Poles) else given
         if not isinstance(poles, (list, tuple, np.ndarray)):
@@ -154,7 +162,11 @@ class IdentOptions(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> IdentOptions:
-        """These settings, which do not contradict one another. Raises ValueError where two do."""
+        """These settings, which do not contradict one another.
+
+        Raises ValueError where two do, or a known pole is on the wrong side of the unit circle;
+        ZeroDivisionError for an unstable pole at zero.
+        """
         for low, high in (
             ("omega_min_rad_s", "omega_max_rad_s"),
             ("zeta_min", "zeta_max"),
@@ -174,7 +186,10 @@ class IdentOptions(Settings):
         return self
 
     def _refuse_impossible_relative_degree(self) -> None:
-        """Raise ValueError where the stated relative degree and another setting exclude each other."""
+        """Raise ValueError where the stated relative degree and another setting exclude each other.
+
+        Those are a direct term, a fixed real pole that is not above 0, and numbers of poles that are too few.
+        """
         # Nobody asked for conditions.
         if self.relative_degree is None:
             return
@@ -201,17 +216,21 @@ class IdentOptions(Settings):
     _stated: frozenset[str] = PrivateAttr(default=frozenset())
 
     def model_post_init(self, context: Any) -> None:
-        """Remember which settings were stated."""
+        """Remember which settings were stated; pydantic calls it once the fields are checked."""
         self._stated = frozenset(self.model_fields_set)
 
     def is_stated(self, key: str) -> bool:
-        """Whether somebody set this key; not what the program chose from the data, for a copy."""
+        """Whether somebody set this key; not what the program chose from the data, for a copy.
+
+        False for a name that is no setting.
+        """
         return key in self._stated
 
     def fixed(self) -> Poles:
         """Fixed poles of the basis: zeros of the integrators, known poles, mirror images of unstable ones.
 
-        In that order within each type. Raises ValueError if one is not inside the circle.
+        In that order within each type. Raises ValueError if one is not inside the circle, ZeroDivisionError
+        as `unstable`: both are found when the settings are made.
 
         Each integrator adds a pole at z = 0. Its filter z/(z - 1) puts a zero there; with the pole the
         numerator is as free as with the integrator among the poles.
@@ -223,13 +242,19 @@ class IdentOptions(Settings):
         return Poles(real, pairs).appended(self.unstable())  # type: ignore[arg-type]
 
     def unstable(self) -> Poles:
-        """Mirror images 1 / conj(p) of the unstable poles p. Raises ValueError if |p| is not above 1."""
+        """Mirror images 1 / conj(p) of the unstable poles p, inside the circle.
+
+        Raises ValueError if |p| is not above 1, ZeroDivisionError for p = 0.
+        """
         real = [1 / re for re, im in self.unstable_poles if im == 0]
         pairs = [1 / complex(re, -im) for re, im in self.unstable_poles if im != 0]
         return Poles(real, pairs)  # type: ignore[arg-type]
 
     def with_unstable(self, mirrored: Poles) -> IdentOptions:
-        """Copy of these settings with the unstable poles whose mirror images are `mirrored`."""
+        """Copy of these settings with the unstable poles whose mirror images are `mirrored`.
+
+        The copy is not checked again; a mirror image at zero, of no pole, would be infinite.
+        """
         outside = []
         for image in (*mirrored.real, *mirrored.pairs):
             inverse = 1 / image
@@ -283,6 +308,7 @@ class EmbeddingOptions(Settings):
     estimate_initial_state: bool = Field(
         default=True, description="free response of all poles in each record"
     )
+    # One half: as likely as not, before the data are asked. Below 1, as odds are formed with it.
     prior_missed_mode: float = Field(
         default=0.5,
         ge=0.0,
@@ -293,6 +319,8 @@ class EmbeddingOptions(Settings):
     coloured_noise: bool | Literal["auto"] = Field(
         default=False, description="whiten with an AR model of the residuals, three rounds"
     )
+    # Eight coefficients hold drift, friction and sensor noise together; chosen. The limit of 100 keeps out
+    # typing errors.
     max_ar_order: int = Field(
         default=8,
         ge=1,
@@ -309,7 +337,10 @@ class EmbeddingOptions(Settings):
     @model_validator(mode="before")
     @classmethod
     def _order_asked_for(cls, stated: Any) -> Any:
-        """Stated settings, with coloured noise where a largest order of it was stated, and it was not."""
+        """Stated settings, with coloured noise where a largest order of it was stated, and it was not.
+
+        What is no mapping comes back as it is, for pydantic to refuse.
+        """
         if isinstance(stated, Mapping) and "max_ar_order" in stated:
             return {"coloured_noise": True, **stated}
         return stated
