@@ -170,7 +170,7 @@ class SearchSpace:
         return Poles(blocks[: self.n_real, 0], np.where(is_proper, pairs, _pairs(omega, zeta)))
 
     def levels(self, poles: Poles) -> RealArray:
-        """Where poles lie between the ends of the box by their first coordinate, (R + P,), 0 to 1.
+        """Where poles lie between the ends of the box by their first coordinate, (R + P,), 0 to 1; never NaN.
 
         `poles` may be of any number, R and P theirs. Those outside the box have the 0 or 1 of the side they
         are on.

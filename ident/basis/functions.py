@@ -204,7 +204,7 @@ def log_all_pass_slopes(poles: Poles, z: ComplexArray) -> ComplexArray:
     """
 
     def slope(p: ComplexArray) -> ComplexArray:
-        """d/dp log((1 - p z)/(z - p)) at all points and poles p (n,), (F, n)."""
+        """d/dp log((1 - p z)/(z - p)) at all points z and poles p (n,), (F, n); infinite at z = p."""
         points = z[:, None]
         return np.asarray(1 / (points - p) - points / (1 - p * points))
 

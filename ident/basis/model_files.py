@@ -73,7 +73,8 @@ class ModelFile:
         """JSON text; floats with as many digits as they have, so that reading gives the same bits."""
 
         def as_lists(array: Any) -> Any:
-            """Lists of an array, of a complex one (n,) as rows [real part, imaginary part]."""
+            """Lists of an array, of a complex one (n,) as rows [real part, imaginary part]; nothing is
+            refused."""
             if np.iscomplexobj(array):
                 array = np.column_stack([array.real, array.imag])
             return array.tolist()

@@ -65,7 +65,10 @@ class NoiseModel(ABC):
 
     @abstractmethod
     def coloured(self, innovations: RealArray) -> RealArray:
-        """H(q) innovations from rest, (T,) or (T, n) along the first axis: the inverse of `filtered`."""
+        """H(q) innovations from rest, (T,) or (T, n) along the first axis: the inverse of `filtered`.
+
+        Not checked: the innovations' shape; NaN stays.
+        """
 
     @abstractmethod
     def autocovariance(self, max_lag: int) -> RealArray:

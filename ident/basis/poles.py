@@ -176,7 +176,7 @@ class Poles:
         return Poles(self.real + changes[:n_real], self.pairs + by_pair @ (1, 1j))
 
     def appended(self, other: Poles) -> Poles:
-        """These poles and then the other's, real before pairs; equal ones stay, then they repeat."""
+        """These poles and then the other's, real before pairs; equal ones are not refused, they repeat."""
         return Poles(np.concatenate([self.real, other.real]), np.concatenate([self.pairs, other.pairs]))
 
     def omega_rad_s(self, dt_s: float) -> RealArray:

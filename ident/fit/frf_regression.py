@@ -221,7 +221,7 @@ class FrfRegression:
         price = float(np.log(worth))
 
         def value(rss: float, order: int) -> float:
-            """Criterion of a fit with J = rss and this order."""
+            """Criterion of a fit with J = rss (no unit) and this order; nothing is checked."""
             return share * rss / scale + self.n_parameters(order) * price
 
         return value
@@ -261,7 +261,7 @@ class FrfRegression:
             return np.asarray(residual @ residual - fall)
 
         def cost(unit: RealArray) -> float:
-            """J at a point (D,)."""
+            """J (no unit) at a point (D,) of the unit cube; nothing is checked."""
             return float(costs(unit[np.newaxis])[0])
 
         return CandidateCost(space, self.power, cost, costs)

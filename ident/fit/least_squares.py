@@ -226,7 +226,7 @@ class Regression:
         )  # fmt: skip
 
         def cost(unit: RealArray) -> float:
-            """J at a point (D,) of the unit cube."""
+            """J, output units squared, at a point (D,) of the unit cube; nothing is checked."""
             return float(cost_of_point(unit, *known))
 
         return CandidateCost(space, float(self.y @ self.y), cost)
@@ -252,7 +252,7 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
     floor = max(EXPLAINED * power, np.finfo(np.float64).tiny)
 
     def value(rss: float, order: int) -> float:
-        """Criterion of a fit with J = rss and this order."""
+        """Criterion of a fit with J = rss (unit of `power`) and this order; NaN for a J of NaN."""
         # Of N numbers Ne are independent, so the likelihood counts each Ne/N times.
         fall = worth * np.log(max(rss, floor) / data.n_samples)
         return float(fall + data.n_parameters(order) * np.log(worth))
@@ -263,6 +263,8 @@ def information_criterion(power: float, data: PoleProblem, worth: float) -> Call
 @dataclass(frozen=True, eq=False)
 class Projection:
     """Columns of a regression as rows, and the residual (N,) that they leave of the output.
+
+    `project` makes it; nothing is checked.
 
     Attributes
     ----------

@@ -62,7 +62,7 @@ class Linearisation(NamedTuple):
 class CandidateCost:
     """Residual sum of squares J over the unit cube of a search space, with other poles frozen.
 
-    It counts how often it was asked (`evaluations`).
+    It counts how often it was asked (`evaluations`). Points are not checked.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class CandidateCost:
 
 
 class Linearised(Protocol):
-    """Cost of poles and its change: what a local refinement needs of a `PoleProblem`."""
+    """Cost of poles and its change: what a local refinement needs of a `PoleProblem`; a protocol as that."""
 
     @property
     def power(self) -> float:

@@ -172,7 +172,7 @@ class Refined:
     poles : Poles
         Best poles, the fixed ones first of each type.
     rss : float
-        Their residual sum of squares J.
+        Their residual sum of squares J, square of the unit of the data; NaN where theirs is.
     iterations : int
         Steps that gained.
     converged : bool

@@ -132,7 +132,7 @@ class OutputRegressions:
         power = sum(float(output.y @ output.y) for output in self.each)
 
         def total(unit: RealArray) -> float:
-            """J at a point (D,) of the unit cube."""
+            """J, sum over the outputs, at a point (D,) of the unit cube; nothing is checked."""
             return sum(cost.at(unit) for cost in costs)
 
         return CandidateCost(space, power, total)

@@ -144,6 +144,9 @@ class RegressionBlock:
 class ReducedRegression:
     """Triangle of [F Psi y] after projecting the nuisance out: the sufficient statistics.
 
+    `reduce_stacked` makes and checks it. Entries are in output units, per unit of a coefficient where there
+    is one.
+
     Attributes
     ----------
     r11 : ndarray, shape (p, p)
@@ -198,7 +201,7 @@ class KernelPosterior:
     """Gaussian of theta and eta, conditional on the data.
 
     eta = kernel_mean + kernel_factor w', theta = R11^-1 (r1 - R12 eta + sqrt(noise_variance) w); w, w'
-    standard normal.
+    standard normal. `conditional_posterior` makes it; nothing is checked.
 
     Attributes
     ----------

@@ -124,6 +124,8 @@ class InputFactor(NamedTuple):
 class MatrixPosterior(Shown):
     """What records say of a matrix response, at any frequency: `at`.
 
+    `matrix_posterior` makes and checks it.
+
     Attributes
     ----------
     model : MimoModel
@@ -257,7 +259,8 @@ def matrix_posterior(
         Its model, structure, noise_covariance (Y, Y), residuals (T - delay, Y) of each record, and which
         modes have one shape (`rank_one`, `n_fixed`); order and shapes are taken as right.
     level : float
-        Probability of holding the response, frequency by frequency.
+        Probability of holding the response, frequency by frequency, between 0 and 1 (numpy's ValueError at
+        `at` beyond). 0.95 is what all reports use.
 
     Returns
     -------

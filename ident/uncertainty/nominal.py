@@ -104,6 +104,7 @@ def nominals_near(
     start = held.appended(poles.without(held))
     moved = search.descend(start, "nominal").poles
     yield _nearest(data, moved, posterior)
+    # Up to about twice the order, which is what each pole taken twice has. Chosen.
     while moved.order <= 2 * poles.order:
         moved = search.add_pair(moved).poles
         yield _nearest(data, moved, posterior)
@@ -131,6 +132,7 @@ def _nearest(data: FrfRegression, poles: Poles, posterior: ResponsePosterior) ->
     """Model on these poles that is nearest to the data, with structure and names of the posterior.
 
     data: the posterior's mean and ellipses (`_regression`). Coefficients that the data do not show are zero.
+    That the posterior's unstable poles are among the poles is checked by `GobfModel` (ValueError).
     """
     fit = fit_response(data, poles)
     return GobfModel(

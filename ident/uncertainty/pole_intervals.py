@@ -134,7 +134,8 @@ def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealA
         Of an arm with U unstable real poles and pairs (`ResponsePosterior.unstable`, which holds their mirror
         images a; how far each image is off are its last coefficients).
     level : float
-        Probability of each interval by itself, between 0 and 1; not checked: outside, the ends are NaN.
+        Probability of each interval by itself, between 0 and 1; not checked: outside, the ends are NaN. 0.95
+        is what all reports use.
 
     Returns
     -------

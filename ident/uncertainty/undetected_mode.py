@@ -184,6 +184,7 @@ class PairEvidence:
     noise_variance: RealArray
 
 
+# Remembered for sixteen lengths of record, far more than one identification has; it costs memory alone.
 @lru_cache(maxsize=16)
 def candidate_pairs(n_samples: int, above: float = 0.0) -> tuple[ComplexArray, RealArray]:
     """Poles (J,) of the upper half plane on a grid of lightly damped pairs, and prior weights (J,).
@@ -630,7 +631,8 @@ def with_pairs(rest: KernelPosterior, mixture: PairMixture) -> KernelPosterior:
     -------
     KernelPosterior
         Its kernel_mean has L + 2 K entries. It has the mean and the covariance of the mixture; alpha, lam and
-        log_evidence stay those of `rest`. With K = 0, that of `rest` but for rounding.
+        log_evidence stay those of `rest`. With K = 0, that of `rest` but for rounding. Weights that exceed 1
+        together are not checked.
 
     Notes
     -----
