@@ -1,4 +1,11 @@
-"""Dry friction, and a linear arm on given poles stepped between the samples with it at its shaft."""
+"""Dry friction, and a linear arm on given poles stepped between the samples with it at its shaft.
+
+A sampled model does not say where its arm is between two samples, which decides how long a shaft sticks. Here
+the poles are taken to continuous time, s = log(p) / dt, behind a zero-order hold, each twice, so that the
+coefficients may also move the poles, to first order. Coefficients on the basis functions become weights of
+these states by least squares over frequencies; the compiled stepper (`ident.friction.kernel`) then runs the
+arm with its friction, freely or corrected by an observer.
+"""
 
 from __future__ import annotations
 
@@ -15,19 +22,34 @@ from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, 
 from ident.data.record import Record
 from ident.friction.kernel import STEPS, STRIDES, ArmSteps, step_through
 
-# A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped.
+# A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped, as a
+# pole z. Chosen; it is gone within a sample.
 FASTEST_POLE = 2e-3
-
-
-# Ten microradians: what a stiff bearing or gear deflects before it slips.
+# Deflection before a shaft slips, rad: ten microradians, what a stiff bearing or gear deflects. A fit begins
+# with it and may move it by a factor of twenty.
 PRESLIDING = 1e-5
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """Dry friction at a shaft: level + excess exp(-|speed| / fall) while it slips, in units of the arm's
-    input. presliding: deflection before slipping; fall: in units of the position per second. Raises
-    ValueError."""
+    """Dry friction at a shaft: level + excess exp(-|speed| / fall) while it slips.
+
+    Attributes
+    ----------
+    level : float
+        Coulomb friction, units of the arm's input.
+    presliding : float
+        Deflection before slipping, units of the position.
+    excess : float
+        Of the friction at rest over the level (Stribeck), units of the input.
+    fall : float
+        Speed over which the excess falls, units of the position per second; inf: no such excess is fitted.
+
+    Raises
+    ------
+    ValueError
+        A negative level or breakaway force, a deflection or speed that is not positive.
+    """
 
     level: float
     presliding: float = PRESLIDING
@@ -35,33 +57,48 @@ class FrictionLaw:
     fall: float = np.inf
 
     def __post_init__(self) -> None:
+        """Raise ValueError where no dry friction is like this."""
         if not (self.level >= 0 and self.presliding > 0 and self.breakaway >= 0 and self.fall > 0):
             raise ValueError(f"no dry friction is like {self}")
 
     @property
     def breakaway(self) -> float:
-        """What it takes to move from rest."""
+        """Force that it takes to move from rest, units of the input."""
         return self.level + self.excess
 
     @property
     def n_logs(self) -> int:
-        """Parameters that are estimated as their logarithms: deflection, and speed of a Stribeck excess."""
-        return 1 + int(np.isfinite(self.fall))
+        """Number of parameters estimated as logarithms: the deflection, and a Stribeck excess's speed."""
+        return 2 if np.isfinite(self.fall) else 1
 
     @property
     def array(self) -> RealArray:
-        """(4,) for the kernel."""
+        """Numbers (4,) for the kernel: level, presliding, excess, fall."""
         return np.array([self.level, self.presliding, self.excess, self.fall])
 
 
 @dataclass(frozen=True, eq=False)
 class SteppedArm:
-    """Poles of an arm, each taken twice, as states in continuous time behind a zero-order hold.
+    """Poles of an arm, each taken twice, as N states in continuous time behind a zero-order hold.
 
-    poles: each once. A state j with rate s_j (1/s) obeys x' = s_j x + e, e the effort, or, where chain[j] is
-    true, x' = s_j x + x_before with x_before the state before it (a pole taken twice). The position is the
-    real part of the sum of weights x; weights (N, P) complex map the P = 2 order coefficients on the basis
-    functions of the doubled poles to the states.
+    A state j obeys x' = s_j x + e, e the effort (input less friction), or, where chain[j] is true,
+    x' = s_j x + x_before with x_before the state before it (a pole taken twice). The position is the real
+    part of the sum of weights x. M real states are the real parts of all N and the imaginary ones of those
+    that swing.
+
+    Attributes
+    ----------
+    poles : Poles
+        Each once.
+    structure : Structure
+        Integrators, dead time and unstable poles of the arm.
+    dt_s : float
+        Step of the records, s.
+    rates : ndarray of complex, shape (N,)
+        s_j, 1/s; an integrator comes first.
+    chain : ndarray of bool, shape (N,)
+    weights : ndarray of complex, shape (N, P)
+        From the P = 2 order coefficients on the basis functions of the doubled poles to the states.
     """
 
     poles: Poles
@@ -73,7 +110,29 @@ class SteppedArm:
 
     @classmethod
     def of(cls, poles: Poles, structure: Structure, dt_s: float) -> SteppedArm:
-        """Raises ValueError for more than one integrator or a direct term: friction needs a speed."""
+        """States of an arm on given poles, and their weights.
+
+        Parameters
+        ----------
+        poles : Poles
+            Of the arm, sampled at dt_s, each once; mirror images of unstable ones among them.
+        structure : Structure
+        dt_s : float
+
+        Returns
+        -------
+        SteppedArm
+
+        Raises
+        ------
+        ValueError
+            More than one integrator or a direct term: friction needs a speed.
+
+        Notes
+        -----
+        Weights are those by which the sampled responses of the states agree with the basis functions, by
+        least squares over 360 frequencies, relative to the size of the basis there.
+        """
         if structure.integrators > 1 or structure.feedthrough:
             raise ValueError(
                 "dry friction is identified for an output that is the position of the shaft: at most one "
@@ -83,62 +142,79 @@ class SteppedArm:
         real = np.maximum(poles.real, FASTEST_POLE).astype(np.complex128)
         single = np.concatenate([np.log(real), np.log(poles.pairs)]) / dt_s
         # Of the mirror image of an unstable pole one is that pole itself.
-        mirrored = np.concatenate([structure.unstable.real, structure.unstable.pairs])
-        images = np.isin(np.concatenate([poles.real, poles.pairs]), mirrored)
-        both = np.column_stack([np.where(images, -single.conj(), single), single]).ravel()
-        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), both])
+        unstable = np.concatenate([structure.unstable.real, structure.unstable.pairs])
+        images = np.isin(np.concatenate([poles.real, poles.pairs]), unstable)
+        doubled = np.column_stack([np.where(images, -single.conj(), single), single]).ravel()
+        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), doubled])
+        # The second state of a pole is driven by its first one, but for mirror images.
         second = np.column_stack([np.zeros(single.size, np.bool_), ~images]).ravel()
         chain = np.concatenate([np.zeros(structure.integrators, np.bool_), second])
-        # Coefficients of both forms agree where responses do: they span the same space.
-        omega = np.concatenate([np.geomspace(1e-4, 0.05, 60), np.linspace(0.05, 3.1, 300)]) / dt_s
+
+        # Coefficients of both forms agree where responses do: they span the same space. Frequencies in
+        # radians a sample, close to each other where the integrator and slow poles are.
+        slow = np.geomspace(1e-4, 0.05, 60)
+        fast = np.linspace(0.05, 3.1, 300)
+        omega = np.concatenate([slow, fast]) / dt_s
         z = np.exp(1j * omega * dt_s)
         states = _state_responses(z, rates, chain, dt_s)
         # The position is the real part of the sum, so that a pair stands for itself and its conjugate.
-        mirrored = _state_responses(z, rates.conj(), chain, dt_s)
+        conjugates = _state_responses(z, rates.conj(), chain, dt_s)
         twofold = np.abs(rates.imag) > 0
-        columns = np.hstack([(states + mirrored) / 2, 1j * (states - mirrored)[:, twofold] / 2])
+        columns = np.hstack([(states + conjugates) / 2, 1j * (states - conjugates)[:, twofold] / 2])
         front = front_response(omega, dt_s, structure.integrators, 0)
         front = front / all_pass_response(structure.unstable, z)
         basis = basis_response(poles.doubled(), z) * front[:, None]
+
+        # Every frequency counts alike, and every state: both differ by decades.
         scale = 1 / np.linalg.norm(basis, axis=1)[:, None]
-        a, b = (real_rows(scale * part) for part in (columns, basis))
-        length = np.linalg.norm(a, axis=0)
-        solved = np.linalg.lstsq(a / length, b, rcond=None)[0] / length[:, None]
+        state_rows = real_rows(scale * columns)
+        basis_rows = real_rows(scale * basis)
+        length = np.linalg.norm(state_rows, axis=0)
+        solved = np.linalg.lstsq(state_rows / length, basis_rows, rcond=None)[0] / length[:, None]
         weights = solved[: rates.size].astype(np.complex128)
         weights[twofold] += 1j * solved[rates.size :]
         return cls(poles, structure, dt_s, rates, chain, weights)
 
+    @property
+    def swings(self) -> BoolArray:
+        """Mask (N,) of the states that swing: their imaginary parts are real states, too."""
+        return np.asarray(self.rates.imag != 0)
+
     def parts(self, states: ComplexArray | BoolArray) -> RealArray:
-        """(M,) real parts of a number of each state (N,), and imaginary ones of those that swing."""
-        return np.concatenate([states.real, states.imag[self.rates.imag != 0]]).astype(np.float64)
+        """Real parts of a number of each state (N,), then imaginary ones of those that swing: (M,)."""
+        return np.concatenate([states.real, states.imag[self.swings]]).astype(np.float64)
 
     @property
     def once(self) -> BoolArray:
-        """(M,) real states of each pole taken once."""
-        return np.concatenate([~self.chain, ~self.chain[self.rates.imag != 0]])
+        """Mask (M,) of the real states that belong to poles taken once."""
+        return np.concatenate([~self.chain, ~self.chain[self.swings]])
 
     @cached_property
     def _flow(self) -> RealArray:
-        """(M + 1, M + 1) derivative of the real states, and of a held effort behind them."""
+        """Derivative (M + 1, M + 1), 1/s, of the real states and of a held effort, whose own row is 0."""
         rates = np.diag(self.rates) + np.diag(self.chain[1:], -1)
-        kept = np.append(np.full(self.rates.size, True), self.rates.imag != 0)
-        both = np.block([[rates.real, -rates.imag], [rates.imag, rates.real]])[np.ix_(kept, kept)]
-        onto = np.column_stack([both, self.parts(~self.chain)])
-        return np.vstack([onto, np.zeros(len(onto) + 1)])
+        # Of states that do not swing the imaginary part stays zero and is left out.
+        has_part = np.append(np.full(self.rates.size, True), self.swings)
+        real_form = np.block([[rates.real, -rates.imag], [rates.imag, rates.real]])
+        among_states = real_form[np.ix_(has_part, has_part)]
+        with_effort = np.column_stack([among_states, self.parts(~self.chain)])
+        return np.vstack([with_effort, np.zeros(len(with_effort) + 1)])
 
     def over(self, length_s: float) -> RealArray:
-        """(M + 1, M + 1) what a time makes of the real states and a held effort."""
+        """Transition matrix (M + 1, M + 1) of the real states and a held effort over a time, s."""
         return np.asarray(expm(self._flow * length_s))
 
     @cached_property
     def _powers(self) -> RealArray:
-        """(S + 1, M + 1, M + 1) after no step, and after each of a stride."""
+        """Transition matrices (S + 1, M + 1, M + 1) after no step, and after each step of a stride."""
         step = self.over(self.dt_s / STEPS)
         return np.array([np.linalg.matrix_power(step, k) for k in range(STEPS // STRIDES + 1)])
 
     def stepped(self, weights: ComplexArray) -> ArmSteps:
-        """What the kernels ask of an arm with weights (N,) of its states."""
-        out, powers = self.parts(weights.conj()), self._powers
+        """Matrices by which the kernels step an arm, for weights (N,) of its states in the position."""
+        out = self.parts(weights.conj())
+        powers = self._powers
+        # States at the end of a step that had unit effort, and so many steps later.
         pulses = powers[:-1, :-1, :-1] @ powers[1, :-1, -1]
         return ArmSteps(
             stride=powers[-1, :-1, :-1].copy(),
@@ -157,10 +233,29 @@ class SteppedArm:
         measured: RealArray | None = None,
         correction: ComplexArray | None = None,
     ) -> tuple[RealArray, RealArray]:
-        """Position (T,) and friction held over each sample (T,), in units of the input (T,), from rest; with
-        a correction (N,) that of an observer of the measured position (T,): the one it predicts."""
+        """Motion of the arm with friction, from rest, freely or as an observer predicts it.
+
+        Parameters
+        ----------
+        coefficients : ndarray, shape (P,)
+            On the basis functions of the doubled poles.
+        voltage : ndarray, shape (T,)
+            Input, held over each sample.
+        law : FrictionLaw
+        measured : ndarray, shape (T,), optional
+            Position that an observer is corrected by.
+        correction : ndarray of complex, shape (N,), optional
+            Gain of the observer (`ident.friction.observer.correction_of`); None: a free run.
+
+        Returns
+        -------
+        tuple of ndarray, shape (T,) each
+            Position, with a correction the one that the observer predicts; friction held over each sample, in
+            units of the input.
+        """
         weights = self.weights @ coefficients
-        position, friction = np.empty(voltage.size), np.empty(voltage.size)
+        position = np.empty(voltage.size)
+        friction = np.empty(voltage.size)
         gain = np.zeros(0)
         if correction is not None:
             gain = np.append(self.parts(correction), (weights * correction).real.sum())
@@ -178,19 +273,29 @@ class SteppedArm:
 
 
 def less_friction(record: Record, friction: RealArray, delay_samples: int) -> Record:
-    """The record with its input smaller by the friction (T,), which the input's delay does not delay."""
+    """A record with its input smaller by the friction (T,), in units of the input.
+
+    Friction is not delayed as the input is (`delay_samples`), so it is subtracted so many samples earlier;
+    its last value is repeated.
+    """
     shifted = np.concatenate([friction[delay_samples:], np.full(delay_samples, friction[-1])])
     return replace(record, input=record.input - shifted[:, None])
 
 
 def _state_responses(z: ComplexArray, rates: ComplexArray, chain: BoolArray, dt_s: float) -> ComplexArray:
-    """(F, N) responses of the sampled states to a held input."""
-    out = np.empty((z.size, rates.size), dtype=np.complex128)
-    for j, s in enumerate(rates):
-        decay = np.exp(s * dt_s)
-        onto = dt_s if s == 0 else (decay - 1) / s
+    """Responses (F, N) of the sampled states (`SteppedArm`) to a held input, at z (F,) on the unit circle.
+
+    A chained state is the derivative of the one before it with respect to its rate.
+    """
+    responses = np.empty((z.size, rates.size), dtype=np.complex128)
+    for j, rate in enumerate(rates):
+        decay = np.exp(rate * dt_s)
+        # What a unit input that is held over a sample adds to the state.
+        pulse = dt_s if rate == 0 else (decay - 1) / rate
         if chain[j]:
-            out[:, j] = (dt_s * decay * out[:, j - 1] + (dt_s * decay - onto) / s) / (z - decay)
+            driven = dt_s * decay * responses[:, j - 1]
+            direct = (dt_s * decay - pulse) / rate
+            responses[:, j] = (driven + direct) / (z - decay)
         else:
-            out[:, j] = onto / (z - decay)
-    return out
+            responses[:, j] = pulse / (z - decay)
+    return responses

@@ -22,10 +22,18 @@ import numpy as np
 
 from ident.data.arrays import COMPILED, INSIDE
 
-STRIDES, _STEPS = 2, 16  # strides of a sample, steps of a stride
-STEPS = STRIDES * _STEPS  # of a sample
-_LOAD_STEPS = 8  # steps of a sample of the load behind a spring, whose swing is slower than a shaft's stop
-_OVER = 8.0  # speeds, in units of `fall`, from which on the excess is gone
+# Strides of a sample: half a sample of slipping is taken at once.
+STRIDES = 2
+# Steps of a stride. With 32 steps of a sample the position is right to a hundredth of a milliradian (module's
+# docstring); twice as many take twice the time.
+_STEPS = 16
+# Steps of a sample.
+STEPS = STRIDES * _STEPS
+# Steps of a sample of the load behind a spring. Chosen: its swing is slower than a shaft's stop.
+_LOAD_STEPS = 8
+# Speed, in units of `fall`, from which on the excess is gone: e^-8 of it is left, 3e-4.
+_EXCESS_GONE = 8.0
+# Smallest normal double: a level or pulse of zero must not be divided by.
 _TINY = np.finfo(np.float64).tiny
 
 
@@ -46,19 +54,49 @@ class ArmSteps(NamedTuple):
     slope: Any
 
 
+# Loops over single numbers, here and below: array expressions would compile for seconds and allocate in every
+# step. Sums are in a fixed order, so that a log has the same friction in every process.
 @numba.njit(**INSIDE)
 def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s: float, law: Any) -> Any:
-    """One sample: mean and first moment (in samples) of the friction. Changes state (M,) and shaft (3,), its
-    position, deflection and speed, in place; free (S + M,) is room to work in."""
+    """Mean and first moment (in samples) of the friction over one sample, in units of the drive.
+
+    Parameters
+    ----------
+    drive : float
+        Input, held over the sample.
+    state : ndarray, shape (M,)
+        Real states of the arm; changed in place.
+    shaft : ndarray, shape (3,)
+        Position, deflection of the elastic element and speed; changed in place.
+    free : ndarray, shape (S + M,)
+        Room to work in: positions of a stride without friction, then states at its end.
+    arm : ArmSteps
+    dt_s : float
+        Length of the sample, s.
+    law : ndarray, shape (4,)
+        Level, presliding, excess, fall.
+    """
     n = state.size
-    gain = max(arm.pulse[0], _TINY)  # what a unit of effort adds to the position in one step
-    level, presliding, excess, fall = law[0], law[1], law[2], law[3]
-    position, deflection, speed = shaft[0], shaft[1], shaft[2]
+    # What a unit of effort adds to the position in one step.
+    gain = max(arm.pulse[0], _TINY)
+    level = law[0]
+    presliding = law[1]
+    excess = law[2]
+    fall = law[3]
+    position = shaft[0]
+    deflection = shaft[1]
+    speed = shaft[2]
     breakaway = max(level + excess, _TINY)
-    stiffness, limit, per_s = breakaway / presliding, level, STEPS / dt_s
-    most = max(limit, _TINY) / stiffness
-    soft, yields, fading = stiffness / (1 + 0.5 * stiffness * gain), 1 / stiffness, -1 / fall
-    total, moment = 0.0, 0.0
+    stiffness = breakaway / presliding
+    limit = level
+    steps_per_s = STEPS / dt_s
+    largest_deflection = max(limit, _TINY) / stiffness
+    # Stiffness of element and arm in series over half a step: the step is implicit.
+    soft = stiffness / (1 + 0.5 * stiffness * gain)
+    yields = 1 / stiffness
+    fading = -1 / fall
+    total = 0.0
+    moment = 0.0
     for stride in range(STRIDES):
         # Positions that the arm would have without friction, from the state on.
         pulses = 0.0
@@ -67,26 +105,32 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
             free[i] = pulses * drive
             for j in range(n):
                 free[i] += arm.ahead[i, j] * state[j]
-        constant = excess == 0 or abs(speed) > _OVER * fall
+
+        # A shaft that slips on in one direction has constant friction: the stride is one matrix product. It
+        # counts where position and speed at its end have gone on in that direction.
+        constant = excess == 0 or abs(speed) > _EXCESS_GONE * fall
         if constant and abs(deflection) >= max(level, _TINY) / stiffness:
             force = level if deflection > 0 else -level
-            new = free[_STEPS - 1] - pulses * force
-            start = speed = arm.slope[n] * (drive - force)
+            end = free[_STEPS - 1] - pulses * force
+            speed = arm.slope[n] * (drive - force)
+            start_speed = speed
             for i in range(n):
-                start += arm.slope[i] * state[i]
+                start_speed += arm.slope[i] * state[i]
                 free[_STEPS + i] = arm.held[i] * (drive - force)
                 for j in range(n):
                     free[_STEPS + i] += arm.stride[i, j] * state[j]
                 speed += arm.slope[i] * free[_STEPS + i]
-            still = excess == 0 or abs(speed) > _OVER * fall
-            if (new - position) * deflection > 0 and speed * deflection > 0 and still:
+            still_constant = excess == 0 or abs(speed) > _EXCESS_GONE * fall
+            if (end - position) * deflection > 0 and speed * deflection > 0 and still_constant:
                 for j in range(n):  # state[:] = ... compiles for two seconds
                     state[j] = free[_STEPS + j]
-                position = new
+                position = end
                 total += _STEPS * force
                 moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * STEPS)
                 continue
-            speed = start
+            speed = start_speed
+
+        # Otherwise step by step: each force moves the positions and the final state that follow it.
         for i in range(n):
             free[_STEPS + i] = arm.held[i] * drive
             for j in range(n):
@@ -94,22 +138,24 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
         for step in range(_STEPS):
             if excess != 0:
                 limit = max(level + excess * np.exp(abs(speed) * fading), 0.0)
-                most = yields * max(limit, _TINY)
+                largest_deflection = yields * max(limit, _TINY)
             force = soft * (deflection + 0.5 * (free[step] - position))
             force = min(max(force, -limit), limit)
             total += force
             moment += force * (_STEPS * stride + step + 0.5 - 0.5 * STEPS)
-            new = free[step] - gain * force
-            deflection = min(max(deflection + new - position, -most), most)
-            speed = (new - position) * per_s
-            position = new
+            end = free[step] - gain * force
+            deflection = min(max(deflection + end - position, -largest_deflection), largest_deflection)
+            speed = (end - position) * steps_per_s
+            position = end
             for i in range(step + 1, _STEPS):
                 free[i] -= arm.pulse[i - step] * force
             for j in range(n):
                 free[_STEPS + j] -= arm.pushes[step, j] * force
         for j in range(n):
             state[j] = free[_STEPS + j]
-    shaft[0], shaft[1], shaft[2] = position, deflection, speed
+    shaft[0] = position
+    shaft[1] = deflection
+    shaft[2] = speed
     return total / STEPS, moment / STEPS**2
 
 
@@ -128,11 +174,13 @@ def step_through(
 
     At every sample the states take correction (M,) times what the measured (T,) position is off the one
     predicted, which is the one that is told, and the position correction[M] times that; correction of size 0:
-    a free run.
+    a free run. law (4,): level, presliding, excess, fall; forces are in units of the drive.
     """
-    moments = np.empty(drive.size)
     n = arm.held.size
-    state, shaft, free = np.zeros(n), np.zeros(3), np.empty(_STEPS + n)
+    moments = np.empty(drive.size)
+    state = np.zeros(n)
+    shaft = np.zeros(3)
+    free = np.empty(_STEPS + n)
     for k in range(drive.size):
         position[k] = shaft[0]
         if correction.size:
@@ -141,44 +189,77 @@ def step_through(
                 state[j] += correction[j] * off
             shaft[0] += correction[n] * off
         friction[k], moments[k] = advance(drive[k], state, shaft, free, arm, dt_s, law)
+    # The force that moves a slow arm as far, held over a sample (module's docstring).
     for k in range(1, drive.size - 1):
         friction[k] += 0.5 * (moments[k - 1] - moments[k + 1])
 
 
 @numba.njit(**INSIDE)
 def hold_load(load: Any, start: float, end: float, spring: Any, dt_s: float) -> float:
-    """One sample of a load behind a motor that moves evenly from start to end: the mean of what reaches the
-    motor of its friction, per unit of the level. Changes load (4,) in place: position and speed, and those
-    that the friction by itself gives it, the motor held. spring: `ident.friction.spring.Spring.array`. Half
-    a drift, a kick in the middle, half a drift."""
-    h, soft, damp = dt_s / _LOAD_STEPS, spring[0] ** 2, 2 * spring[1] * spring[0]
-    level, excess, fall = spring[2], spring[3], spring[4]
-    place, speed, x, v = load[0], load[1], load[2], load[3]
-    rate, total = (end - start) / dt_s, 0.0
+    """Mean over one sample of what reaches the motor of the load's friction, per unit of its level.
+
+    Parameters
+    ----------
+    load : ndarray, shape (4,)
+        Position and speed of the load, and those that its friction by itself gives it, the motor held;
+        changed in place.
+    start, end : float
+        Positions of the motor, which moves evenly between them.
+    spring : ndarray, shape (6,)
+        `ident.friction.spring.Spring.array`.
+    dt_s : float
+        Length of the sample, s.
+
+    Notes
+    -----
+    Each step is half a drift, a kick in the middle, half a drift.
+    """
+    step_s = dt_s / _LOAD_STEPS
+    soft = spring[0] ** 2
+    damp = 2 * spring[1] * spring[0]
+    level = spring[2]
+    excess = spring[3]
+    fall = spring[4]
+    place = load[0]
+    speed = load[1]
+    held_place = load[2]
+    held_speed = load[3]
+    motor_speed = (end - start) / dt_s
+    total = 0.0
     for step in range(_LOAD_STEPS):
-        place += 0.5 * h * speed
-        x += 0.5 * h * v
-        twist = start + (step + 0.5) * h * rate - place
-        free = speed + h * (soft * twist + damp * (rate - speed))
-        most = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
-        kept = max(abs(free) - h * level * most, 0.0)
-        force = np.sign(free) * ((abs(free) - kept) / (h * level) if level > 0 else most)
-        speed = np.sign(free) * kept
-        v += h * (force - soft * x - damp * v)
-        total += soft * x + damp * v
-        place += 0.5 * h * speed
-        x += 0.5 * h * v
-    load[0], load[1], load[2], load[3] = place, speed, x, v
+        place += 0.5 * step_s * speed
+        held_place += 0.5 * step_s * held_speed
+        twist = start + (step + 0.5) * step_s * motor_speed - place
+        # Friction takes away speed, at most all of it: then the load stands and pulls back what the spring
+        # pulls.
+        free_speed = speed + step_s * (soft * twist + damp * (motor_speed - speed))
+        breakaway = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
+        slipping = max(abs(free_speed) - step_s * level * breakaway, 0.0)
+        force = np.sign(free_speed) * (
+            (abs(free_speed) - slipping) / (step_s * level) if level > 0 else breakaway
+        )
+        speed = np.sign(free_speed) * slipping
+        held_speed += step_s * (force - soft * held_place - damp * held_speed)
+        total += soft * held_place + damp * held_speed
+        place += 0.5 * step_s * speed
+        held_place += 0.5 * step_s * held_speed
+    load[0] = place
+    load[1] = speed
+    load[2] = held_place
+    load[3] = held_speed
     return total / _LOAD_STEPS
 
 
 @numba.njit(**COMPILED)
-def behind_motor(motor: Any, spring: Any, dt_s: float, found: Any) -> None:
-    """Fill found (T,) with what `hold_load` tells of each sample of a motor (T,), from rest."""
+def behind_motor(motor: Any, spring: Any, dt_s: float, force: Any) -> None:
+    """Fill force (T,), per unit of its level, with what `hold_load` says of each sample of a motor (T,).
+
+    The load starts at rest with the motor; after the last sample the motor stands.
+    """
     load = np.zeros(4)
     load[0] = motor[0]
     for k in range(motor.size):
-        found[k] = hold_load(load, motor[k], motor[min(k + 1, motor.size - 1)], spring, dt_s)
+        force[k] = hold_load(load, motor[k], motor[min(k + 1, motor.size - 1)], spring, dt_s)
 
 
 @numba.njit(**COMPILED)
@@ -203,20 +284,48 @@ def loop_through(
     """Fill measured (T,), command (T,) and limited (T,) of a loop from rest: that of
     `control_design.analysis.closed_loop.simulate` on this arm.
 
-    reference, noise (T,): set point, and what is added to the position before it is measured in steps[0].
-    added (T,): joins the law's command before it is limited. law (n + 1, n + 2): rows of the state and the
-    output, columns A, B, M and C, D, - of x+ = A x + B e + M (limited - wanted), wanted = C x + D e + added.
-    limits: of the command and of its change per sample, inf for none; steps: of measurement and command, 0
-    for none. delay, input_delay: samples until a command is given to the arm, and until it acts, through a
-    drive that lags by `lag` samples. spring: as of `hold_load`, level 0 for no friction at the load; it acts
-    a sample after its motion.
+    Parameters
+    ----------
+    reference, noise : ndarray, shape (T,)
+        Set point, and what is added to the position before it is measured in steps[0].
+    added : ndarray, shape (T,)
+        Joins the law's command before it is limited.
+    law : ndarray, shape (n + 1, n + 2)
+        Rows of the state and the output, columns A, B, M and C, D, - of x+ = A x + B e + M (limited -
+        wanted), wanted = C x + D e + added.
+    limits : ndarray, shape (2,)
+        Of the command and of its change per sample, inf for none.
+    steps : ndarray, shape (2,)
+        Of measurement and command, 0 for none.
+    delay, input_delay : int
+        Samples until a command is given to the arm, and until it acts.
+    lag : float
+        Of the drive between both, in samples.
+    arm : ArmSteps
+    dt_s : float
+    law_of_friction : ndarray, shape (4,)
+        Level, presliding, excess, fall.
+    spring : ndarray, shape (6,)
+        Of `hold_load`, level 0 for no friction at the load; it acts a sample after its motion.
+    measured, command : ndarray, shape (T,)
+        Position and command as the loop has them.
+    limited : ndarray of bool, shape (T,)
+        The command is not the one that the law wanted.
     """
     order = law.shape[0] - 1
-    state, x, later = np.zeros(arm.held.size), np.zeros(order), np.zeros(order)
-    shaft, free, last = np.zeros(3), np.empty(_STEPS + arm.held.size), 0.0
-    load, held, applied = np.zeros(4), 0.0, 0.0
-    queue, waiting = np.zeros(delay + 1), np.zeros(input_delay + 1)
+    state = np.zeros(arm.held.size)
+    x = np.zeros(order)
+    later = np.zeros(order)
+    shaft = np.zeros(3)
+    free = np.empty(_STEPS + arm.held.size)
+    last = 0.0
+    load = np.zeros(4)
+    load_force = 0.0
+    applied = 0.0
+    queue = np.zeros(delay + 1)
+    waiting = np.zeros(input_delay + 1)
     for k in range(reference.size):
+        # The control law.
         y = shaft[0] + noise[k]
         if steps[0] > 0:
             y = steps[0] * np.rint(y / steps[0])
@@ -233,14 +342,20 @@ def loop_through(
         for i in range(order):
             x[i] = later[i]
         last = u
+
+        # From the command to the force: rounding, computing time, dead time and lag of the drive.
         if steps[1] > 0:
             u = steps[1] * np.rint(u / steps[1])
         queue[k % (delay + 1)] = u
         u = queue[(k + 1) % (delay + 1)]
-        measured[k], command[k], limited[k] = y, u, last != wanted
+        measured[k] = y
+        command[k] = u
+        limited[k] = last != wanted
         waiting[k % (input_delay + 1)] = u
         applied += (waiting[(k + 1) % (input_delay + 1)] - applied) / (1 + lag)
+
+        # The arm, and the load behind it.
         before = shaft[0]
-        advance(applied - held, state, shaft, free, arm, dt_s, law_of_friction)
+        advance(applied - load_force, state, shaft, free, arm, dt_s, law_of_friction)
         if spring[5] > 0:
-            held = spring[5] * hold_load(load, before, shaft[0], spring, dt_s)
+            load_force = spring[5] * hold_load(load, before, shaft[0], spring, dt_s)

@@ -23,90 +23,169 @@ from ident.friction.arm import SteppedArm
 from ident.friction.gauss_newton import FrictionFit, LostError
 from ident.friction.inverse_dynamics import noise_of
 
-# Force over the position's noise: from an observer slower than the arm to one of the last two samples.
+# Ratios of force to noise of the position that are tried first, in units of rms command per noise: from an
+# observer slower than the arm to one of the last two samples. Chosen; eleven in five decades, factors of 3.2.
 _RATIOS = np.geomspace(1e-4, 10, 11)
+# Factors about the ratio of an earlier observer that are tried afterwards: arm and friction have changed a
+# little since, and repeated calls may walk further.
 NEARBY = np.array([0.5, 1.0, 2.0])
-# Share of the force that each state takes by itself, so that equal poles have a filter, too.
-_OWN = 1e-9
-# An observer that has forgotten its start to this has settled.
+# Share of the force's variance that each state takes by itself, so that equal poles have a filter, too.
+# Chosen: far above rounding, far below the force.
+_OWN_SHARE = 1e-9
+# Smallest weight of a state, as a share of the largest, by which states are scaled. Chosen: it only keeps a
+# state that the force does not reach from a division by zero.
+_SMALLEST_WEIGHT = 1e-12
+# An observer that has forgotten its start to this has settled. Chosen.
 _FORGOTTEN = 1e-3
-# Prediction errors count behind this part of a record, where the observer has found the state.
+# Largest slowest pole of an observer for which the settling is computed: at 1 its logarithm is zero.
+_SLOWEST_POLE = 1 - 1e-9
+# Prediction errors count behind this part (one in so many) of a record, where the observer has found the
+# state. Chosen.
 _START = 20
 
 
 def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> ComplexArray:
-    """(N,) gain of the steady Kalman filter for white noise of unit variance on the position and a white
-    force of standard deviation `ratio` at the input. Raises ValueError or LinAlgError where there is none."""
+    """Gain (N,) of the steady Kalman filter of an arm.
+
+    Parameters
+    ----------
+    arm : SteppedArm
+        Its N complex states; those of poles taken a second time are not corrected (0).
+    coefficients : ndarray, shape (P,)
+        Of the arm on its doubled poles.
+    ratio : float
+        Standard deviation of a white force at the input, beside white noise of unit variance on the position.
+
+    Returns
+    -------
+    ndarray of complex, shape (N,)
+        States per unit of prediction error of the position.
+
+    Raises
+    ------
+    ValueError or LinAlgError
+        The Riccati equation has no solution.
+    """
     a, b, c = _real_form(arm, coefficients)
-    size = np.maximum(np.abs(b), 1e-12 * np.abs(b).max())
-    a, b, c = a * (size / size[:, None]), b / size, c * size
-    noise = ratio**2 * (np.outer(b, b) + _OWN * np.eye(b.size))
+    # States in units of what the force moves them by: the Riccati equation is solved accurately then.
+    size = np.maximum(np.abs(b), _SMALLEST_WEIGHT * np.abs(b).max())
+    a = a * (size / size[:, None])
+    b = b / size
+    c = c * size
+    noise = ratio**2 * (np.outer(b, b) + _OWN_SHARE * np.eye(b.size))
     p = solve_discrete_are(a.T, c[:, None], noise, np.ones((1, 1)))
-    gain, found = size * (p @ c) / (c @ p @ c + 1), np.zeros(arm.rates.size, np.complex128)
-    found[~arm.chain] = gain[: np.sum(~arm.chain)]
-    found[~arm.chain & (arm.rates.imag != 0)] += 1j * gain[np.sum(~arm.chain) :]
-    return found
+    gain = size * (p @ c) / (c @ p @ c + 1)
+
+    # Real parts come first, then the imaginary parts of states that swing.
+    first = ~arm.chain
+    n_first = np.sum(first)
+    correction = np.zeros(arm.rates.size, np.complex128)
+    correction[first] = gain[:n_first]
+    correction[first & arm.swings] += 1j * gain[n_first:]
+    return correction
 
 
 def _real_form(arm: SteppedArm, coefficients: RealArray) -> tuple[RealArray, RealArray, RealArray]:
-    """A, B, C of the sampled arm with each pole once and real states."""
-    whole, out = arm.over(arm.dt_s)[:-1], arm.parts((arm.weights @ coefficients).conj())
-    return whole[np.ix_(arm.once, np.append(arm.once, False))], whole[arm.once, -1], out[arm.once]
+    """A (M, M), B (M,) and C (M,) of the sampled arm with each pole once and M real states.
+
+    B is per unit of a force held over a sample; C gives the position in output units.
+    """
+    transition = arm.over(arm.dt_s)[:-1]
+    out = arm.parts((arm.weights @ coefficients).conj())
+    # The last column belongs to the held effort.
+    a = transition[np.ix_(arm.once, np.append(arm.once, False))]
+    b = transition[arm.once, -1]
+    return a, b, out[arm.once]
 
 
 @dataclass(frozen=True, eq=False)
 class ObserverFilter:
-    """H^-1 of y = G u + H e in second-order sections, and samples after which it has forgotten its start."""
+    """Whitening filter H^-1 of y = G u + H e, where the observer of a fit predicts y.
+
+    Attributes
+    ----------
+    sections : ndarray, shape (S, 6)
+        Second-order sections.
+    settled : int
+        Samples after which the filter has forgotten its start.
+    """
 
     sections: RealArray
     settled: int
 
     @classmethod
-    def of(cls, found: FrictionFit) -> ObserverFilter:
-        """That of a fit with an observer."""
-        assert found.correction is not None
-        arm = found.arm
-        a, _, c = _real_form(arm, found.coefficients)
-        gain = arm.parts(found.correction)[arm.once]
-        inner = np.linalg.eigvals(a - np.outer(a @ gain, c)).astype(np.complex128)
-        zeros = np.linalg.eigvals(a).astype(np.complex128)
-        slowest = min(float(np.max(np.abs(inner))), 1 - 1e-9)
-        return cls(np.asarray(zpk2sos(zeros, inner, 1.0)), int(np.ceil(np.log(_FORGOTTEN) / np.log(slowest))))  # type: ignore[arg-type]
+    def of(cls, fit: FrictionFit) -> ObserverFilter:
+        """Whitening filter of a fit with an observer: zeros at the arm's poles, poles at the observer's."""
+        assert fit.correction is not None
+        arm = fit.arm
+        a, _, c = _real_form(arm, fit.coefficients)
+        gain = arm.parts(fit.correction)[arm.once]
+        observer_poles = np.linalg.eigvals(a - np.outer(a @ gain, c)).astype(np.complex128)
+        arm_poles = np.linalg.eigvals(a).astype(np.complex128)
+        slowest = min(float(np.max(np.abs(observer_poles))), _SLOWEST_POLE)
+        settled = int(np.ceil(np.log(_FORGOTTEN) / np.log(slowest)))
+        sections = np.asarray(zpk2sos(arm_poles, observer_poles, 1.0))  # type: ignore[arg-type]
+        return cls(sections, settled)
 
     def __call__(self, signal: RealArray) -> RealArray:
-        """A signal of the position (T, ...) through the filter, without the rows in which it settles, at most
-        half."""
+        """A signal (T, ...) through the filter, without the rows in which it settles, at most half."""
         filtered = sosfilt(self.sections, signal - signal[:1], axis=0)
         return np.asarray(filtered[min(self.settled, len(signal) // 2) :])
 
     def filtered(self, record: Record) -> Record:
-        """Input and output through the filter."""
+        """A record with input and output through the filter, shorter by what settles, without reference."""
         return replace(
             record, input=self(record.input), output=self(record.output), reference=None, reference_names=()
         )
 
 
 @lru_cache(maxsize=64)
-def prediction_errors(found: FrictionFit, records: tuple[Record, ...]) -> float:
-    """Sum of squares of the prediction errors, without the start of each record; infinite where it is
-    lost."""
+def prediction_errors(fit: FrictionFit, records: tuple[Record, ...]) -> float:
+    """Sum of squares of the prediction errors (output units squared), without the start of each record.
+
+    Infinite where the simulation is lost. Answers of recent fits are remembered: steps compare one fit many
+    times.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
-        parts = [found.residual(record) for record in records]
-        total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in parts)
+        residuals = [fit.residual(record) for record in records]
+        total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in residuals)
     return total if np.isfinite(total) else np.inf
 
 
-def observed(found: FrictionFit, records: Sequence[Record], nearby: RealArray = NEARBY) -> FrictionFit:
-    """The fit with the observer that predicts best, near the one it has: nearby, its force as a share of that
-    one's. Raises LostError where none follows."""
+def observed(fit: FrictionFit, records: Sequence[Record], nearby: RealArray = NEARBY) -> FrictionFit:
+    """A fit with the observer that predicts its records best.
+
+    Parameters
+    ----------
+    fit : FrictionFit
+        Without an observer all ratios of force to noise are tried, with one those near its own.
+    records : sequence of Record
+    nearby : ndarray, shape (K,)
+        Ratios that are tried, as shares of the ratio of the observer that the fit has.
+
+    Returns
+    -------
+    FrictionFit
+
+    Raises
+    ------
+    LostError
+        No observer follows the records.
+    """
     noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
     rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
-    tried = list[tuple[float, FrictionFit]]()
-    for ratio in _RATIOS * rms / noise if found.correction is None else found.ratio * nearby:
+    ratios = _RATIOS * rms / noise if fit.correction is None else fit.ratio * nearby
+    best = None
+    least_errors = np.inf
+    for ratio in ratios:
         with suppress(ValueError, np.linalg.LinAlgError):
-            correction = correction_of(found.arm, found.coefficients, float(ratio))
-            one = replace(found, correction=correction, ratio=float(ratio))
-            tried.append((prediction_errors(one, tuple(records)), one))
-    if not tried:
+            correction = correction_of(fit.arm, fit.coefficients, float(ratio))
+            candidate = replace(fit, correction=correction, ratio=float(ratio))
+            errors = prediction_errors(candidate, tuple(records))
+            # The first one stands even where its errors are infinite: the fit may still step out of there.
+            if best is None or errors < least_errors:
+                best = candidate
+                least_errors = errors
+    if best is None:
         raise LostError
-    return min(tried, key=lambda one: one[0])[1]
+    return best
