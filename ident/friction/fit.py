@@ -227,10 +227,10 @@ def _off_the_force(model: GobfModel) -> tuple[float, float]:
     modes_rad_s = model.poles.omega_rad_s(dt_s)[is_light]
     if modes_rad_s.size:
         first = float(modes_rad_s.min())
-        places = (0.1 * first, first)
+        places = [0.1 * first, first]
     else:
         first = float(_WITHOUT_MODE * np.pi / dt_s)
-        places = (0.1 * first,)
+        places = [0.1 * first]
 
     worst_place = 0.0
     worst_deg = 0.0

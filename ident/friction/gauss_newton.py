@@ -1,13 +1,18 @@
 """A linear arm and its dry friction as least squares: derivatives, Gauss-Newton steps, covariance.
 
 The simulation of `ident.friction.arm` is differentiated with respect to the coefficients of the arm on its
-doubled poles and to the parameters of the friction's law; the poles themselves stay.
+doubled poles and to the parameters of the friction's law; the poles themselves stay. `descended` steps a free
+run from a start (`started`) as long as its residual falls, `with_covariance` says what the records leave
+open. `FrictionFit` holds the result and makes of a record its motion, its friction, and the record without
+it, also where an observer follows the log (`ident.friction.in_loop`). A vector of law parameters is (level,
+log presliding) or (level, log presliding, excess, log fall): logarithms stand at odd places.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -22,25 +27,44 @@ from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
 from ident.friction.spring import Spring
 from ident.uncertainty.embedding_algebra import triangle_of
 
-# Standard deviation of the logarithms in the law (pre-sliding deflection, Stribeck speed), a priori.
+# Standard deviation of the logarithms in the law (pre-sliding deflection, Stribeck speed), a priori: two of
+# them are a factor of twenty. Chosen.
 STD_LOG = 1.5
-_HELD = 1e4  # over the deviation of a logarithm that is to stay: 1e-4
-# How well a joint's friction repeats from record to record at best, as a share of its level.
+# Weight of what is expected of a logarithm that is to stay: one over its deviation, 1e-4.
+_HELD = 1e4
+# How well a joint's friction repeats from record to record at best, as a share of its level: a common level
+# would be known better than any simulation of friction is right (docs/decisions.md).
 _REPEATS = 1e-3
-# Gauss-Newton steps at most; a step, and its parts where the whole does not lower the residual.
-_STEPS, LENGTHS = 8, (1.0, 0.5, 0.25, 0.1)
-# A residual sum of squares that falls by less than this many noise variances is at its end.
+# Gauss-Newton steps at most. Chosen; they end where the residual no longer falls.
+_STEPS = 8
+# A step, and its parts where the whole does not lower the residual.
+LENGTHS = (1.0, 0.5, 0.25, 0.1)
+# Least level after a step, as a share of the level before. Chosen: one step may not lose the friction.
+_LEAST_LEVEL_SHARE = 0.6
+# Largest step of a logarithm: a factor of e. Beyond that the linearised friction is another law.
+_LARGEST_LOG_STEP = 1
+# A residual sum of squares that falls by less than this many noise variances is at its end: half of what
+# one more parameter explains of noise alone.
 WORTH = 0.5
-# Sizes of the changes that derivatives are taken from, relative to the motion and to the level: of the
-# simulation, whose friction turns at other times after a large change, and where an observer tells it.
+# Size of the changes that derivatives of a simulation are taken from, relative to the motion and to the
+# level: its friction turns at other times after a large change.
 _CHANGE = 1e-6
-_CHANGE_OF_LEVEL, CHANGE_OF_LOG, _CHANGE_BEYOND = 2e-3, 0.02, 0.05
+# Where an observer tells the friction, changes are relative to the level, large beside its rounding: of the
+# level and the excess,
+_CHANGE_OF_LEVEL = 2e-3
+# of logarithms,
+CHANGE_OF_LOG = 0.02
+# and of the level beyond a spring, whose load stands or slips. All three chosen.
+_CHANGE_BEYOND = 0.05
+# Smallest singular value that counts, as a share of the largest. Rounding of doubles.
+_RANK = 1e-12
 
 
 class LostError(ValueError):
     """No simulation or observer follows the logs with this arm and law."""
 
     def __init__(self) -> None:
+        """An error that tells the user what to state instead."""
         super().__init__(
             "no model of the arm with dry friction follows the logs; response = 'as recorded' needs none, "
             "n_real and n_pairs state the number of poles"
@@ -51,16 +75,39 @@ class LostError(ValueError):
 class FrictionFit:
     """A linear arm with dry friction, fitted to records of its shaft's position.
 
-    law: in units of the input. model: the arm without friction, each pole once; arm, coefficients (P,): on
-    each pole twice. covariance_factor (P + Q, .): of the coefficients and the Q parameters of the law (level,
-    logarithm of the deflection; excess, logarithm of its speed). noise_std: output units. between: standard
-    deviation of the level from record to record.
-
-    Where an observer follows the records: correction (N,), the observer's (`step_through`) for a force of
-    `ratio` at the input (in its unit per unit of the noise); the constant force, bias, and the level beyond
-    the first spring (`spring`), both in units of the input, each with a row of the covariance. centre: from
-    where positions of an arm that does not integrate are told. lag: of the drive, in samples: the command
-    reaches the shaft through 1 / (1 + lag (1 - q^-1)), the friction does not.
+    Attributes
+    ----------
+    law : FrictionLaw
+        In units of the input.
+    model : GobfModel
+        The arm without friction, each pole once.
+    arm : SteppedArm
+        The arm with each pole twice, in continuous time.
+    coefficients : ndarray, shape (P,)
+        Of `arm`, on the basis functions of the doubled poles.
+    covariance_factor : ndarray, shape (P + Q, K)
+        F of the covariance F F' of the coefficients and the Q parameters of the law (level, logarithm of the
+        deflection; excess, logarithm of its speed); behind an observer further rows follow in the order lag,
+        bias, level beyond the spring, each where it was fitted.
+    noise_std : float
+        Of the residual, output units.
+    between : float
+        Standard deviation of the level from record to record, units of the input.
+    correction : ndarray of complex, shape (N,), or None
+        Gain of the observer that follows the records (`step_through`); None: a free run.
+    ratio : float
+        Force that the observer was made for, in units of the input per unit of the position's noise.
+    bias : float
+        Constant force, units of the input.
+    spring : Spring or None
+        The first spring of the arm, where friction acts beyond it.
+    beyond : float
+        Level of the friction beyond the spring, units of the input.
+    centre : float
+        From where positions of an arm that does not integrate are told, output units.
+    lag : float
+        Of the drive, in samples: the command reaches the shaft through 1 / (1 + lag (1 - q^-1)), the friction
+        does not.
     """
 
     law: FrictionLaw
@@ -91,14 +138,19 @@ class FrictionFit:
 
     @property
     def level_std(self) -> float:
-        """Standard deviation of the level that the records have in common."""
-        rows = [self.coefficients.size, *([-1] if self.spring is not None else [])]
+        """Standard deviation of the level that the records have in common, units of the input."""
+        rows = [self.coefficients.size]
+        if self.spring is not None:
+            # The level beyond the spring has the last row.
+            rows.append(-1)
         return float(np.linalg.norm(self.covariance_factor[rows].sum(axis=0)))
 
     def moved(self, change: RealArray) -> tuple[RealArray, FrictionLaw]:
-        """Coefficients and law after a change (P + Q, or more), no parameter below zero."""
-        n, parameters = self.coefficients.size, parameters_of(self.law)
-        return self.coefficients + change[:n], law_of(parameters + change[n : n + parameters.size])
+        """Coefficients (P,) and law after a change (P + Q, or more), no force of the law below zero."""
+        n = self.coefficients.size
+        parameters = parameters_of(self.law)
+        law = law_of(parameters + change[n : n + parameters.size])
+        return self.coefficients + change[:n], law
 
     @property
     def significant(self) -> bool:
@@ -106,270 +158,501 @@ class FrictionFit:
         return self.level > 3 * self.level_std
 
     def motion(self, record: Record, law: FrictionLaw | None = None) -> tuple[RealArray, RealArray]:
-        """Simulated position (T,) and friction in units of the input (T,), held over each sample, under the
-        fit's law or the one given."""
+        """Simulated motion of the shaft in a record, free or as the observer predicts it.
+
+        Parameters
+        ----------
+        record : Record
+            One input, and the position as the one output.
+        law : FrictionLaw, optional
+            Default that of the fit.
+
+        Returns
+        -------
+        tuple of ndarray, shape (T,) each
+            Position; friction at the shaft in units of the input, held over each sample, without the bias and
+            the friction beyond a spring.
+        """
         law = law or self.law
         if self.correction is None:
             return self.arm.run(self.coefficients, record.input[:, 0], law)
-        delay, position = self.arm.structure.input_delay_samples, self.observed_position(record)
+        delay = self.arm.structure.input_delay_samples
+        position = self.observed_position(record)
         driving = less_friction(self.behind_drive(record), self.steady(record), delay).input[:, 0]
         return self.arm.run(self.coefficients, driving, law, position, self.correction)
 
     def observed_position(self, record: Record) -> RealArray:
-        """(T,) from where an observer counts: the start, where the arm integrates."""
+        """Position (T,) above the point an observer counts from: the start, where the arm integrates."""
         position = record.output[:, 0]
-        return np.asarray(position - (position[0] if self.arm.structure.integrators else self.centre))
+        origin = position[0] if self.arm.structure.integrators else self.centre
+        return np.asarray(position - origin)
 
     def steady(self, record: Record) -> RealArray:
-        """(T,) bias and friction beyond the spring, at the shaft: what the observer need not simulate."""
+        """Bias and friction beyond the spring (T,), at the shaft, units of the input.
+
+        The observer need not simulate them: they follow from the record.
+        """
         force = np.full(record.n_samples, self.bias)
         return force if self.spring is None else force + self.force_beyond(record, self.beyond, self.law)
 
     def force_beyond(self, record: Record, level: float, law: FrictionLaw) -> RealArray:
-        """(T,) friction of a level beyond the spring, as it acts at the shaft; law: that of the shaft."""
+        """Friction (T,) of a level beyond the spring, as it acts at the shaft; all in units of the input.
+
+        `law` is that of the shaft; the friction of the load falls with speed alike.
+        """
         assert self.spring is not None
         return level * self.spring.force(record.output[:, 0], level, law)
 
     def residual(self, record: Record) -> RealArray:
-        """(T - delay,) what the simulation leaves of the position, less its mean, in rows that answer to the
-        input."""
-        left = answered(record.output[:, 0] - self.motion(record)[0], self.arm.structure.input_delay_samples)
-        return np.asarray(left - left.mean())
+        """What the simulation leaves of the position (T - delay,), less its mean, output units.
+
+        Rows that answer to an input before the record are left out.
+        """
+        position = self.motion(record)[0]
+        residual = answered(record.output[:, 0] - position, self.arm.structure.input_delay_samples)
+        return np.asarray(residual - residual.mean())
 
     def behind_drive(self, record: Record) -> Record:
-        """The record with what the drive's lag makes of its input."""
+        """A record with what the drive's lag makes of its input, which starts steady."""
         if not self.lag:
             return record
         pole = self.lag / (1 + self.lag)
-        return replace(
-            record,
-            input=record.input[0] + lfilter([1 - pole], [1, -pole], record.input - record.input[0], axis=0),
-        )
+        start = record.input[0]
+        return replace(record, input=start + lfilter([1 - pole], [1, -pole], record.input - start, axis=0))
 
     def forced(self, record: Record) -> Record:
-        """The record with the force on a linear arm as its input: command behind the drive less friction.
-        Raises LostError where that is not finite."""
-        return less_friction(
-            self.behind_drive(record), self._friction(record), self.arm.structure.input_delay_samples
-        )
+        """A record with the force on a linear arm as its input: command behind the drive less friction.
+
+        Raises
+        ------
+        LostError
+            The friction is not finite.
+        """
+        delay = self.arm.structure.input_delay_samples
+        return less_friction(self.behind_drive(record), self._friction(record), delay)
 
     def taken_off(self, record: Record) -> Record:
-        """The record with its input smaller by the friction, as a command makes it. Raises LostError."""
+        """A record with its input smaller by the friction, as a command before the drive's lag would make it.
+
+        Raises
+        ------
+        LostError
+            The friction is not finite.
+        """
         friction = self._friction(record)
-        return less_friction(
-            record,
-            friction + self.lag * np.diff(friction, prepend=friction[0]),
-            self.arm.structure.input_delay_samples,
-        )
+        through_drive = friction + self.lag * np.diff(friction, prepend=friction[0])
+        return less_friction(record, through_drive, self.arm.structure.input_delay_samples)
 
     def _friction(self, record: Record) -> RealArray:
+        """Friction (T,), units of the input; behind an observer with bias and what is beyond a spring.
+
+        Raises LostError where it is not finite.
+        """
         friction = self.motion(record)[1]
         if not np.all(np.isfinite(friction)):
             raise LostError
         return friction + self.steady(record) if self.observed else friction
 
     def drive_response(self, omega_rad_s: RealArray) -> ComplexArray:
-        """(F,) of the drive's lag."""
+        """Frequency response (F,) of the drive's lag, without unit, at omega_rad_s (F,)."""
         return np.asarray(1 / (1 + self.lag * (1 - np.exp(-1j * omega_rad_s * self.arm.dt_s))))
 
 
 def parameters_of(law: FrictionLaw) -> RealArray:
-    """(Q,) level, logarithm of the pre-sliding deflection; of Stribeck friction excess, logarithm of its
-    speed."""
-    plain = [law.level, np.log(law.presliding)]
-    return np.array([*plain, law.excess, np.log(law.fall)] if np.isfinite(law.fall) else plain)
+    """Parameters of a law as a vector, shape (2,) or, where friction falls with speed, (4,).
+
+    Level, logarithm of the pre-sliding deflection; excess, logarithm of its speed. Units of `FrictionLaw`.
+    """
+    parameters = [law.level, np.log(law.presliding)]
+    if np.isfinite(law.fall):
+        parameters += [law.excess, np.log(law.fall)]
+    return np.array(parameters)
 
 
 def law_of(parameters: RealArray) -> FrictionLaw:
-    level, presliding, *falling = parameters.tolist()
-    law = FrictionLaw(max(level, 0.0), float(np.exp(presliding)))
-    return replace(law, excess=max(falling[0], 0.0), fall=float(np.exp(falling[1]))) if falling else law
+    """Law of the parameters (2,) or (4,) of `parameters_of`, no force below zero."""
+    level, log_presliding, *falling = parameters.tolist()
+    law = FrictionLaw(max(level, 0.0), float(np.exp(log_presliding)))
+    if not falling:
+        return law
+    excess, log_fall = falling
+    return replace(law, excess=max(excess, 0.0), fall=float(np.exp(log_fall)))
 
 
-def linearised(
-    arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray
-) -> tuple[RealArray, RealArray, RealArray, RealArray]:
-    """The simulation with input u (T,) to first order: position and friction (T,), and the derivatives of
-    both (T, P + Q) with respect to the coefficients and the law; the friction follows every change."""
+class Linearised(NamedTuple):
+    """A simulation of T samples to first order in P coefficients and Q parameters of the law.
+
+    position, friction (T,): output and input units; position_by, friction_by (T, P + Q): their derivatives.
+    """
+
+    position: RealArray
+    friction: RealArray
+    position_by: RealArray
+    friction_by: RealArray
+
+
+def linearised(arm: SteppedArm, coefficients: RealArray, law: FrictionLaw, u: RealArray) -> Linearised:
+    """The simulation of an arm with friction to first order.
+
+    Parameters
+    ----------
+    arm : SteppedArm
+    coefficients : ndarray, shape (P,)
+    law : FrictionLaw
+    u : ndarray, shape (T,)
+        Input.
+
+    Returns
+    -------
+    Linearised
+        The friction follows every change.
+
+    Notes
+    -----
+    One-sided differences, for a simulation with a small change runs through the same turns. Each change moves
+    the position's rms step by 1e-6 of itself.
+    """
     position, friction = arm.run(coefficients, u, law)
     structure = arm.structure
     effort = filter_input(u, 0, structure.input_delay_samples) - friction
     columns = regressor(arm.poles.doubled(), filter_input(effort, structure.integrators, 0))
     speed = float(np.std(np.diff(position)))
     parameters = parameters_of(law)
-    by = np.empty((u.size, columns.shape[1] + parameters.size))
-    friction_by = np.empty_like(by)
+    position_by = np.empty((u.size, columns.shape[1] + parameters.size))
+    friction_by = np.empty_like(position_by)
 
-    def differentiate(j: int, size: float, changed: RealArray, by_changed: FrictionLaw) -> None:
-        ends = arm.run(changed, u, by_changed)
-        by[:, j], friction_by[:, j] = (ends[0] - position) / size, (ends[1] - friction) / size
+    def differentiate(j: int, size: float, changed: RealArray, changed_law: FrictionLaw) -> None:
+        """Fill columns j from a simulation with coefficients (P,) or law changed by a size."""
+        changed_position, changed_friction = arm.run(changed, u, changed_law)
+        position_by[:, j] = (changed_position - position) / size
+        friction_by[:, j] = (changed_friction - friction) / size
 
     for j, column in enumerate(columns.T):
+        column_speed = max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
         change = np.zeros(coefficients.size)
-        change[j] = _CHANGE * speed / max(float(np.std(np.diff(column))), np.finfo(np.float64).tiny)
+        change[j] = _CHANGE * speed / column_speed
         differentiate(j, change[j], coefficients + change, law)
     for k in range(parameters.size):
         change = np.zeros(parameters.size)
+        is_logarithm = k % 2 == 1
         # An excess has no size of its own before it is known, and cannot be negative.
-        change[k] = _CHANGE if k % 2 else _CHANGE * law.level
+        change[k] = _CHANGE if is_logarithm else _CHANGE * law.level
         differentiate(columns.shape[1] + k, change[k], coefficients, law_of(parameters + change))
-    return position, friction, by, friction_by
+    return Linearised(position, friction, position_by, friction_by)
 
 
-def equations(found: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
-    """Of every record the derivatives (T - delay, P + Q) of the simulated position, and what it leaves."""
-    delay = found.arm.structure.input_delay_samples
-    local = [linearised(found.arm, found.coefficients, found.law, record.input[:, 0]) for record in records]
-    both = zip(records, local, strict=True)
-    left = [answered(record.output[:, 0] - position, delay) for record, (position, *_) in both]
-    return [answered(by, delay) for _, _, by, _ in local], left
+def equations(fit: FrictionFit, records: Sequence[Record]) -> tuple[list[RealArray], list[RealArray]]:
+    """Equations of a Gauss-Newton step of a free run, record by record.
+
+    Parameters
+    ----------
+    fit : FrictionFit
+        Without an observer.
+    records : sequence of Record
+
+    Returns
+    -------
+    tuple of two lists of ndarray
+        Derivatives (T - delay, P + Q) of the simulated position, and what it leaves of the measured one
+        (T - delay,), output units.
+    """
+    delay = fit.arm.structure.input_delay_samples
+    blocks = []
+    targets = []
+    for record in records:
+        local = linearised(fit.arm, fit.coefficients, fit.law, record.input[:, 0])
+        blocks.append(answered(local.position_by, delay))
+        targets.append(answered(record.output[:, 0] - local.position, delay))
+    return blocks, targets
 
 
-def driven_by_law(found: FrictionFit, record: Record) -> RealArray:
-    """(T, Q) derivatives of the arm's (stabilised) position with respect to the parameters of the law, to the
-    drive's lag where there is one, to the bias of an integrating arm and to the level beyond a spring, where
-    an observer tells the friction of a record."""
-    arm = replace(found.model.stable_part, input_delay_samples=0)
-    friction, parameters = found.motion(record)[1], parameters_of(found.law)
-    beyond = 0.0 if found.spring is None else found.force_beyond(record, found.beyond, found.law)
+def driven_by_law(fit: FrictionFit, record: Record) -> RealArray:
+    """Derivatives (T, Q') of an arm's (stabilised) position where an observer tells the friction of a record.
+
+    Parameters
+    ----------
+    fit : FrictionFit
+        With an observer.
+    record : Record
+
+    Returns
+    -------
+    ndarray, shape (T, Q')
+        Output units per unit of: the parameters of the law (2 or 4), the drive's lag where there is one, the
+        bias of an integrating arm, the level beyond a spring where there is one.
+
+    Notes
+    -----
+    The observer follows the measured motion whatever the parameters are, so that a change of the friction is
+    a change of the linear arm's input.
+    """
+    structure = fit.arm.structure
+    arm = replace(fit.model.stable_part, input_delay_samples=0)
+    friction = fit.motion(record)[1]
+    parameters = parameters_of(fit.law)
+    force_beyond: RealArray | float = 0.0
+    if fit.spring is not None:
+        force_beyond = fit.force_beyond(record, fit.beyond, fit.law)
     columns = []
     for k in range(parameters.size):
+        is_logarithm = k % 2 == 1
+        size = CHANGE_OF_LOG if is_logarithm else _CHANGE_OF_LEVEL * fit.level
         change = np.zeros(parameters.size)
-        change[k] = size = CHANGE_OF_LOG if k % 2 else _CHANGE_OF_LEVEL * found.level
+        change[k] = size
         law = law_of(parameters + change)
-        columns.append((found.motion(record, law)[1] - friction) / size)
-        if found.spring is not None and np.isfinite(found.law.fall):
-            columns[-1] = columns[-1] + (found.force_beyond(record, found.beyond, law) - beyond) / size
-    if found.lag:
-        faster = np.diff(found.behind_drive(found.behind_drive(record)).input[:, 0], prepend=record.input[0])
-        columns.append(filter_input(faster, 0, found.arm.structure.input_delay_samples))
-    if found.arm.structure.integrators:
+        column = (fit.motion(record, law)[1] - friction) / size
+        if fit.spring is not None and np.isfinite(fit.law.fall):
+            # The friction of the load falls with speed as that of the shaft.
+            column = column + (fit.force_beyond(record, fit.beyond, law) - force_beyond) / size
+        columns.append(column)
+    if fit.lag:
+        # More lag takes away what the command, behind the drive twice, changes by in a sample.
+        twice = fit.behind_drive(fit.behind_drive(record)).input[:, 0]
+        faster = np.diff(twice, prepend=record.input[0])
+        columns.append(filter_input(faster, 0, structure.input_delay_samples))
+    if structure.integrators:
         columns.append(np.ones(friction.size))
-    if found.spring is not None:
-        size = _CHANGE_BEYOND * found.level
-        columns.append((found.force_beyond(record, found.beyond + size, found.law) - beyond) / size)
+    if fit.spring is not None:
+        size = _CHANGE_BEYOND * fit.level
+        larger = fit.force_beyond(record, fit.beyond + size, fit.law)
+        columns.append((larger - force_beyond) / size)
     return np.column_stack([-arm.simulate(column) for column in columns])
 
 
 def started(model: GobfModel, structure: Structure, law: FrictionLaw) -> FrictionFit:
-    """Where Gauss-Newton steps on the poles of a model begin; nothing is known of the noise yet."""
+    """Where Gauss-Newton steps on the poles of a model begin; nothing is known of the noise yet.
+
+    Parameters
+    ----------
+    model : GobfModel
+        Of the arm without friction; its response is taken over to its poles taken twice.
+    structure : Structure
+    law : FrictionLaw
+
+    Returns
+    -------
+    FrictionFit
+        With covariance factor, noise and spread of the level zero.
+
+    Raises
+    ------
+    ValueError
+        More than one integrator, or a direct term.
+    """
     arm = SteppedArm.of(model.poles, structure, model.dt_s)
-    # Of the model's response on its poles taken twice.
+    # Least squares over 400 frequencies up to Nyquist's; the doubled poles span the response exactly.
     z = np.exp(1j * np.linspace(1e-3, np.pi, 400))
-    basis, response = basis_response(arm.poles.doubled(), z), basis_response(model.poles, z)
-    target = real_rows(response @ model.coefficients)
-    coefficients = np.asarray(np.linalg.lstsq(real_rows(basis), target, rcond=None)[0])
-    nothing = np.zeros((coefficients.size + parameters_of(law).size, 1))
-    return FrictionFit(law, model, arm, coefficients, nothing, 0.0, 0.0)
+    doubled_basis = basis_response(arm.poles.doubled(), z)
+    basis = basis_response(model.poles, z)
+    target = real_rows(basis @ model.coefficients)
+    coefficients = np.asarray(np.linalg.lstsq(real_rows(doubled_basis), target, rcond=None)[0])
+    no_covariance = np.zeros((coefficients.size + parameters_of(law).size, 1))
+    return FrictionFit(law, model, arm, coefficients, no_covariance, 0.0, 0.0)
 
 
 def descended(
-    found: FrictionFit, records: Sequence[Record], presliding: float, least: float, *, held: bool = True
+    fit: FrictionFit,
+    records: Sequence[Record],
+    presliding: float,
+    least_level: float,
+    *,
+    held: bool = True,
 ) -> FrictionFit:
-    """Gauss-Newton steps from found, as long as the residual falls; the level stays above least.
+    """A fit after Gauss-Newton steps of its free run, as long as the residual falls, with its covariance.
 
-    held: logarithms in the law stay, for far from the arm they would take up what is wrong with it. Otherwise
-    the pre-sliding deflection is expected near presliding, a Stribeck speed where it begins.
+    Parameters
+    ----------
+    fit : FrictionFit
+        Where the steps begin.
+    records : sequence of Record
+        At rest at their first sample.
+    presliding : float
+        Deflection that is expected, units of the position; of no effect where held.
+    least_level : float
+        Which the level stays above, units of the input.
+    held : bool
+        Logarithms in the law stay, for far from the arm they would take up what is wrong with it. Otherwise
+        the pre-sliding deflection is expected near `presliding`, a Stribeck speed where it begins.
+
+    Returns
+    -------
+    FrictionFit
+
+    Raises
+    ------
+    LostError
+        The simulation runs away.
     """
-    n = sum(found.residual(record).size for record in records)
-    expected = parameters_of(found.law if held else replace(found.law, presliding=presliding))
-    p, q = found.coefficients.size, expected.size
-    logs, trust = np.arange(1, q, 2), _HELD if held else 1 / STD_LOG
-    noise = np.sqrt(simulated_rss(found, records) / n)
-    for left in reversed(range(_STEPS)):
-        blocks, targets = equations(found, records)
+    n = sum(fit.residual(record).size for record in records)
+    expected_law = fit.law if held else replace(fit.law, presliding=presliding)
+    expected = parameters_of(expected_law)
+    trust = _HELD if held else 1 / STD_LOG
+    n_coefficients = fit.coefficients.size
+    n_parameters = expected.size
+    logs = np.arange(1, n_parameters, 2)
+    noise = np.sqrt(simulated_rss(fit, records) / n)
+    for steps_left in reversed(range(_STEPS)):
+        blocks, targets = equations(fit, records)
         # What is expected of a logarithm is one more measurement of it.
-        known = np.zeros((logs.size, p + q + 1))
-        known[:, p + logs] = np.eye(logs.size)
-        known[:, -1] = (expected - parameters_of(found.law))[logs]
-        change, _, rss, rest = least_squares(blocks, targets, trust * noise * known)
-        noise = np.sqrt(rest / n)
-        for length in LENGTHS if left else ():
-            step = length * change
-            step[p] = max(step[p], max(0.6 * found.level, least) - found.level)
-            step[p + logs] = np.clip(step[p + logs], -1, 1)
-            coefficients, law = found.moved(step)
-            there = replace(found, coefficients=coefficients, law=law)
-            off = trust * noise * (parameters_of(law) - expected)[logs]
-            if simulated_rss(there, records) + off @ off < rss - WORTH * noise**2:
-                found = there
+        known = np.zeros((logs.size, n_coefficients + n_parameters + 1))
+        known[:, n_coefficients + logs] = np.eye(logs.size)
+        known[:, -1] = (expected - parameters_of(fit.law))[logs]
+        solution = least_squares(blocks, targets, trust * noise * known)
+        noise = np.sqrt(solution.residual_rss / n)
+        # The last round only makes the equations that the covariance is read from.
+        lengths = LENGTHS if steps_left else ()
+        for length in lengths:
+            step = length * solution.change
+            lowest = max(_LEAST_LEVEL_SHARE * fit.level, least_level)
+            step[n_coefficients] = max(step[n_coefficients], lowest - fit.level)
+            log_steps = step[n_coefficients + logs]
+            step[n_coefficients + logs] = np.clip(log_steps, -_LARGEST_LOG_STEP, _LARGEST_LOG_STEP)
+            coefficients, law = fit.moved(step)
+            candidate = replace(fit, coefficients=coefficients, law=law)
+            off_expected = trust * noise * (parameters_of(law) - expected)[logs]
+            candidate_rss = simulated_rss(candidate, records) + off_expected @ off_expected
+            if candidate_rss < solution.target_rss - WORTH * noise**2:
+                fit = candidate
                 break
         else:
             break
-    return with_covariance(found, blocks, targets, float(noise))
+    return with_covariance(fit, blocks, targets, float(noise))
 
 
 def with_covariance(
-    found: FrictionFit, blocks: Sequence[RealArray], targets: Sequence[RealArray], noise: float
+    fit: FrictionFit, blocks: Sequence[RealArray], targets: Sequence[RealArray], noise: float
 ) -> FrictionFit:
-    """The fit with what its equations (`equations`) and a noise of this size leave open.
+    """A fit with what its equations leave open: covariance factor, noise and spread of the level.
 
+    Parameters
+    ----------
+    fit : FrictionFit
+        With P coefficients and Q parameters of the law.
+    blocks, targets : sequence of ndarray, shapes (M, P + Q, or more) and (M,)
+        Equations of each record (`equations`).
+    noise : float
+        Standard deviation of the residual, in the units of the targets.
+
+    Returns
+    -------
+    FrictionFit
+
+    Raises
+    ------
+    LostError
+        A column of the equations is lost beside numbers of a simulation that runs away.
+
+    Notes
+    -----
     Every record has a level of its own, about the common one; it and the logarithms in the law are known
     beforehand, as further measurements.
     """
-    count, n = len(blocks), sum(target.size for target in targets)
-    p, q = found.coefficients.size, parameters_of(found.law).size
-    logs = np.arange(1, q, 2)
-    between = _between_records(blocks, targets, p, _REPEATS * found.level)
-    own = [np.outer(between * block[:, p], np.arange(count) == k) for k, block in enumerate(blocks)]
-    known = np.zeros((logs.size + count, blocks[0].shape[1] + count + 1))
-    known[: logs.size, p + logs] = noise / STD_LOG * np.eye(logs.size)
-    known[logs.size :, -count - 1 : -1] = noise * np.eye(count)
-    _, triangle, rss, rest = least_squares(
-        [np.hstack(pair) for pair in zip(blocks, own, strict=True)], targets, known
-    )
-    scale = np.linalg.norm(triangle, axis=0)
-    if not np.all(scale > 0):  # beside numbers of a simulation that runs away
+    n_records = len(blocks)
+    n = sum(target.size for target in targets)
+    n_coefficients = fit.coefficients.size
+    logs = np.arange(1, parameters_of(fit.law).size, 2)
+    between = _between_records(blocks, targets, n_coefficients, _REPEATS * fit.level)
+    wider_blocks = []
+    for k, block in enumerate(blocks):
+        own_level = np.outer(between * block[:, n_coefficients], np.arange(n_records) == k)
+        wider_blocks.append(np.hstack([block, own_level]))
+    known = np.zeros((logs.size + n_records, blocks[0].shape[1] + n_records + 1))
+    known[: logs.size, n_coefficients + logs] = noise / STD_LOG * np.eye(logs.size)
+    known[logs.size :, -n_records - 1 : -1] = noise * np.eye(n_records)
+    solution = least_squares(wider_blocks, targets, known)
+    scale = np.linalg.norm(solution.triangle, axis=0)
+    if not np.all(scale > 0):
         raise LostError
+
     # The covariance is that of the noise, not of a residual that another step would still lower.
-    factor = np.sqrt(rest / n) * solve_triangular(triangle / scale, np.eye(scale.size)) / scale[:, None]
+    noise_std = np.sqrt(solution.residual_rss / n)
+    inverse = solve_triangular(solution.triangle / scale, np.eye(scale.size))
+    factor = noise_std * inverse / scale[:, None]
+    # Without the levels of the single records, and with no more columns than rows.
     factor = np.asarray(np.linalg.qr(factor[: blocks[0].shape[1]].T, mode="r")).T
-    return replace(found, covariance_factor=factor, noise_std=float(np.sqrt(rss / n)), between=between)
+    target_std = float(np.sqrt(solution.target_rss / n))
+    return replace(fit, covariance_factor=factor, noise_std=target_std, between=between)
 
 
 def _between_records(
-    blocks: Sequence[RealArray], targets: Sequence[RealArray], p: int, least: float
+    blocks: Sequence[RealArray], targets: Sequence[RealArray], level_column: int, least: float
 ) -> float:
-    """Standard deviation of the level (column p) from record to record, not below least (DerSimonian and
-    Laird, Controlled Clinical Trials 7, 1986)."""
-    count = len(blocks)
-    if count == 1:
+    """Standard deviation of the level from record to record, in units of the input, not below `least`.
+
+    `blocks` (M, P + Q) and `targets` (M,) are equations of each record; the level has one column of them.
+    Each record is given a level of its own; of their spread that is taken off which their own errors explain
+    (DerSimonian and Laird, Controlled Clinical Trials 7, 1986). `least` where there is one record.
+    """
+    n_records = len(blocks)
+    if n_records == 1:
         return least
-    own = [
-        np.hstack([np.delete(block, p, axis=1), np.outer(block[:, p], np.arange(count) == k)])
-        for k, block in enumerate(blocks)
-    ]
+    with_own_levels = []
+    for k, block in enumerate(blocks):
+        common = np.delete(block, level_column, axis=1)
+        own_level = np.outer(block[:, level_column], np.arange(n_records) == k)
+        with_own_levels.append(np.hstack([common, own_level]))
     n = sum(target.size for target in targets)
-    change, triangle, _, rest = least_squares(own, targets, np.zeros((0, own[0].shape[1] + 1)))
-    scale = np.linalg.norm(triangle, axis=0)
-    scale[scale == 0] = 1.0
-    inverse = np.linalg.pinv(triangle / scale)[-count:] / scale[-count:, None]
-    weight = n / rest / np.sum(inverse**2, axis=1)
-    levels = change[-count:]
+    nothing_known = np.zeros((0, with_own_levels[0].shape[1] + 1))
+    solution = least_squares(with_own_levels, targets, nothing_known)
+    scale = np.linalg.norm(solution.triangle, axis=0)
+    is_empty = scale == 0
+    scale[is_empty] = 1.0
+    inverse = np.linalg.pinv(solution.triangle / scale)[-n_records:] / scale[-n_records:, None]
+    weight = n / solution.residual_rss / np.sum(inverse**2, axis=1)
+    levels = solution.change[-n_records:]
     spread = float(np.sum(weight * (levels - np.average(levels, weights=weight)) ** 2))
-    variance = (spread - (count - 1)) / (weight.sum() - np.sum(weight**2) / weight.sum())
+    effective_weight = weight.sum() - np.sum(weight**2) / weight.sum()
+    variance = (spread - (n_records - 1)) / effective_weight
     return float(np.sqrt(max(variance, least**2)))
 
 
-def simulated_rss(found: FrictionFit, records: Sequence[Record]) -> float:
-    """Sum of squares of the residuals, each record's less its mean."""
-    return float(sum(np.sum(found.residual(record) ** 2) for record in records))
+def simulated_rss(fit: FrictionFit, records: Sequence[Record]) -> float:
+    """Sum of squares of the residuals, each record's less its mean, output units squared."""
+    return float(sum(np.sum(fit.residual(record) ** 2) for record in records))
 
 
-def least_squares(
-    blocks: Sequence[RealArray], targets: Sequence[RealArray], known: RealArray
-) -> tuple[RealArray, RealArray, float, float]:
-    """Solution of the stacked rows, each record less its mean, and of known (., P + 1), rows and target, as
-    they are; the triangle R, the sum of squares of the targets and what the solution leaves of it. Raises
-    LostError where something is not finite.
+class Solution(NamedTuple):
+    """Least squares of P unknowns.
+
+    change (P,): the unknowns; triangle (P, P): R of the equations, R'R their normal matrix; target_rss: sum
+    of squares of the targets, residual_rss: of what the solution leaves of them.
+    """
+
+    change: RealArray
+    triangle: RealArray
+    target_rss: float
+    residual_rss: float
+
+
+def least_squares(blocks: Sequence[RealArray], targets: Sequence[RealArray], known: RealArray) -> Solution:
+    """Solution of the stacked equations of all records, each less its mean, and of what is known beforehand.
+
+    Parameters
+    ----------
+    blocks, targets : sequence of ndarray, shapes (M, P) and (M,)
+        Equations of each record.
+    known : ndarray, shape (K, P + 1)
+        Further rows, taken as they are, and their targets in the last column; K may be 0.
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    LostError
+        Something is not finite.
     """
     with np.errstate(invalid="ignore", over="ignore"):
-        a = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
-        b = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
-        length = np.linalg.norm(a, axis=0)
-        length[length == 0] = 1.0
-        triangle = triangle_of(np.column_stack([a / length, b]))
+        rows = np.vstack([*(block - block.mean(axis=0) for block in blocks), known[:, :-1]])
+        target = np.concatenate([*(target - target.mean() for target in targets), known[:, -1]])
+        # Columns of length one: units differ by many decades.
+        length = np.linalg.norm(rows, axis=0)
+        is_empty = length == 0
+        length[is_empty] = 1.0
+        triangle = triangle_of(np.column_stack([rows / length, target]))
     if not np.all(np.isfinite(triangle)):
         raise LostError
-    solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=1e-12)[0] / length
-    return solution, triangle[:-1, :-1] * length, float(b @ b), float(triangle[-1, -1] ** 2)
+    change = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=_RANK)[0] / length
+    residual_rss = float(triangle[-1, -1] ** 2)
+    return Solution(change, triangle[:-1, :-1] * length, float(target @ target), residual_rss)

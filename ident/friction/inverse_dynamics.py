@@ -30,7 +30,7 @@ _TINY_OVER_NOISE = 1e-9
 _LEAST_NOISE = 1e-6
 # Frequencies below which inverse dynamics are tried. Chosen.
 _BANDS = 8
-# Periods of the lowest of them in the shortest record. Chosen: fewer would leave a regression no rows.
+# Periods of the lowest of them in the shortest record. Chosen.
 _PERIODS = 8
 # Exponent of the edge of a band, 1 / (1 + (f / f0)^8). Chosen: steep, but with little ringing.
 _STEEPNESS = 8

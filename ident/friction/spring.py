@@ -17,11 +17,11 @@ from ident.data.arrays import RealArray
 from ident.friction.arm import FrictionLaw
 from ident.friction.kernel import behind_motor
 
-# Damping ratio above which a zero is no load behind a spring, nor a pole its mode. Chosen: belts and gears
-# have a tenth of it; twice as much would admit zeros that do not swing.
+# Damping ratio above which a zero is no load behind a spring, nor a pole its mode. Chosen; twice as much
+# would admit zeros that do not swing.
 _LARGEST_DAMPING = 0.5
 # Frequency at which the inertia is read off, as a share of the zero's. Chosen: below the zero, where the arm
-# is an inertia, and above what friction and bias disturb.
+# is an inertia.
 _RIGID = 0.5
 
 
