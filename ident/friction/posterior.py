@@ -1,5 +1,12 @@
-"""Ellipses around the response behind the friction, whose level and the motion it depends on are estimated,
-too: both are columns beside the basis functions in the regression of `ident.uncertainty.embedding`."""
+"""Ellipses around the response behind the friction, whose level is estimated with it.
+
+The level of the friction, and for a free run the motion it depends on, are columns beside the basis functions
+in the regression of `ident.uncertainty.embedding`: what is not known of the friction widens the ellipses
+(`without_friction`). Behind an observer the friction is known from the measured motion; the ellipses are then
+widened by what parts of the logs differ in, and by a share of the friction that looks like a linear force
+(`_behind_observed`). What is open adds to the arm's force, not to its response: `of_force` bends the ellipses
+along arcs of circles. `other_output_without_friction` does as much for the tip of an arm.
+"""
 
 from __future__ import annotations
 
@@ -28,30 +35,58 @@ from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
 from ident.uncertainty.pole_intervals import laurent_rows, pole_intervals
 
-# Share of the level that a linear force which shows in no residual may have (deviation).
+# Share of the friction that a linear force which shows in no residual may have, one standard deviation.
+# Chosen: no law of friction is exact (docs/closed_loop_logs.md). Doubled, ellipses at low frequency are
+# nearly twice as wide where friction is much of the command.
 _SHAPE = 0.05
-_LENGTHS = 100  # of the longest record: the lowest frequency
-# Normals along which the response is bent, points of an arc, its parts that are kept as a share of the
-# largest; of powers its square.
-_MOST_CURVED, _STEPS, _SMALL = 3, 17, 1e-3
-_MOST_GAIN = 3.0  # of an arc, over the centre: a damping that is not told from none has no end
-# Size of an ellipse over the rms of even points of the arc it holds (1.7 of a line); at most, where the sign
-# of the gain is known, as a share of it.
-_REACH, _LARGEST = 1.7, 0.9
+# Lowest frequency of the ellipses, as a part of that of one radian in the longest record. Chosen: far below
+# what a record tells.
+_LENGTHS = 100
+# Normals along which the response is bent: damping, stiffness and friction.
+_MOST_CURVED = 3
+# Points of an arc, even in force, and as many even in gain. Chosen: an arc is smooth.
+_STEPS = 17
+# Parts of an arc that count, as a share of the largest; of powers its square. Chosen, far below an ellipse.
+_SMALL = 1e-3
+# Largest gain of an arc, over the centre: a damping that is not told from none has no end. Larger gains only
+# make a loop with integral action tighter (docs/closed_loop_logs.md).
+_MOST_GAIN = 3.0
+# Size of an ellipse over the rms of even points of the arc it holds: 1.7, the square root of 3, of a line.
+_REACH = 1.7
+# Size of an ellipse at most, where the sign of the gain is known, as a share of the gain: zero is outside.
+_LARGEST = 0.9
 # Further real poles over the grid, which bent gains stand on: to .1 %, where four about the slowest left 16.
 _FURTHER = 20
+# Slowest of them in units of the lowest frequency, and fastest as a part of the highest. Chosen: within the
+# grid, where their shapes differ.
+_SLOWEST_FURTHER = 10
+_FASTEST_FURTHER = 3
 # Lowest missing mode, over the highest of the model: a nearer one the search would have found.
-_BEYOND = 1.1
+_ABOVE_MODES = 1.1
+# Largest change of the logarithm of a decay rate in a round: a factor of e.
+_LARGEST_LOG_STEP = 1
+# Powers of s that a part of the friction may look like: stiffness, damping, inertia.
+_FORCES = 3
 
 
 @dataclass(frozen=True, eq=False)
 class BehindFriction:
     """What records say of an arm and of the friction at its shaft, together.
 
-    response: from the input to an output, as if there were no dry friction; shaft: the same of the shaft's
-    position, to first order; level + level_factor (P',) times unit normals: level of the friction. All three
-    stand on the same P' unit normals. poles: of the arm, which shaft has twice: those of the model, the real
-    ones moved to where the records have them beside an unknown level.
+    Attributes
+    ----------
+    response : ResponsePosterior
+        From the input to an output, as if there were no dry friction.
+    shaft : ResponsePosterior
+        From the input to the shaft's position, to first order.
+    level : float
+        Of the friction, units of the input.
+    level_factor : ndarray, shape (P',)
+        The level is `level` + level_factor times unit normals; response and shaft stand on the same P' ones.
+    friction : FrictionFit
+    poles : Poles
+        Of the arm, which shaft has twice: those of the model, the real ones moved to where the records have
+        them beside an unknown level.
     """
 
     response: ResponsePosterior
@@ -64,108 +99,171 @@ class BehindFriction:
 
 def without_friction(
     records: Sequence[Record],
-    found: FrictionFit,
+    fit: FrictionFit,
     model: GobfModel | None = None,
     options: EmbeddingOptions | None = None,
 ) -> BehindFriction:
     """Posterior of the response from input to the shaft's position, as if there were no dry friction.
 
-    records: those of the fit, as measured. model: of the arm, fitted with the friction taken off; default
-    that of the fit. The level of the friction is estimated again with the response. Raises ValueError as
-    `tangent`.
+    Parameters
+    ----------
+    records : sequence of Record
+        Those of the fit, as measured.
+    fit : FrictionFit
+    model : GobfModel, optional
+        Of the arm, fitted with the friction taken off; default that of the fit.
+    options : EmbeddingOptions, optional
+        Of the regression.
+
+    Returns
+    -------
+    BehindFriction
+        The level of the friction is estimated again with the response.
+
+    Raises
+    ------
+    ValueError
+        As `tangent`.
+
+    Notes
+    -----
+    With D the derivatives of the simulated position by the coefficients c, d those by the law, y = y0 +
+    D (c - c0) + d (law - law0): the columns of D stand in place of the basis functions, d beside them.
     """
-    if found.correction is not None:
-        return _behind_observed(records, found, model or found.model, options)
+    if fit.correction is not None:
+        return _behind_observed(records, fit, model or fit.model, options)
     if model is not None:
-        found = moved_to(found, records, model)
-    corrected, beside, n = [], [], found.coefficients.size
+        fit = moved_to(fit, records, model)
+    n = fit.coefficients.size
+    n_logs = fit.law.n_logs
+    delay = fit.arm.structure.input_delay_samples
+    corrected = []
+    beside = []
     for k, record in enumerate(records):
-        position, friction, by, _ = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
-        # To first order y = y0 + D (c - c0) + d (level - level0): rows for the coefficients c themselves.
-        target = record.output[:, 0] - position + by[:, :n] @ found.coefficients
-        less = less_friction(record, friction, found.arm.structure.input_delay_samples)
-        corrected.append(replace(less, output=target[:, None]))
+        local = linearised(fit.arm, fit.coefficients, fit.law, record.input[:, 0])
+        by = local.position_by
+        # Rows for the coefficients c themselves, not for what they change by.
+        target = record.output[:, 0] - local.position + by[:, :n] @ fit.coefficients
+        frictionless = less_friction(record, local.friction, delay)
+        corrected.append(replace(frictionless, output=target[:, None]))
         # Known beforehand, to one: logarithms in the law, and how far this record's level is off.
-        plain, logs = by[:, n::2], STD_LOG * by[:, n + 1 :: 2]
-        own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        beside.append(Beside(by[:, :n], np.hstack([plain, logs, own])))
-    response, change, factor = tangent_beside(
-        corrected, found.model, beside, options, n_known=logs.shape[1] + len(records)
-    )
-    return BehindFriction(
-        response, response, found.level + float(change[0]), factor[0], found, found.model.poles
-    )
+        forces = by[:, n::2]
+        logs = STD_LOG * by[:, n + 1 :: 2]
+        own_level = np.outer(fit.between * forces[:, 0], np.arange(len(records)) == k)
+        beside.append(Beside(by[:, :n], np.hstack([forces, logs, own_level])))
+    n_known = n_logs + len(records)
+    response, change, factor = tangent_beside(corrected, fit.model, beside, options, n_known=n_known)
+    level = fit.level + float(change[0])
+    return BehindFriction(response, response, level, factor[0], fit, fit.model.poles)
 
 
 def _behind_observed(
     records: Sequence[Record], found: FrictionFit, model: GobfModel, options: EmbeddingOptions | None
 ) -> BehindFriction:
-    """The same where an observer tells the friction from the measured motion: it does not depend on the arm,
-    to first order."""
-    less, beside, options = list[Record](), list[Beside](), options or EmbeddingOptions()
+    """Posterior behind a friction that an observer tells from the measured motion.
+
+    To first order this friction does not depend on the arm. `records` are those of the fit `found`, `model`
+    is the arm behind its friction. Raises ValueError as `tangent`, LostError where the observer does not
+    follow.
+    """
+    n_logs = found.law.n_logs
+    frictionless = []
+    beside = []
     for k, record in enumerate(records):
+        # Columns: level, log deflection (excess, log speed), lag, bias, level beyond a spring.
         by_law = driven_by_law(found, record)
-        logs = STD_LOG * by_law[:, 1::2][:, : found.law.n_logs]
-        # The basis has the drive's lag; how far that moves the friction which is taken off is neglected.
-        others = [*(1 + 2 * np.arange(found.law.n_logs)), *([2 * found.law.n_logs] if found.lag else [])]
-        plain = np.delete(by_law, others, axis=1)
-        own = np.outer(found.between * plain[:, 0], np.arange(len(records)) == k)
-        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([plain, logs, own])))
-        less.append(found.taken_off(record))
+        logs = STD_LOG * by_law[:, 1::2][:, :n_logs]
+        no_forces = [1 + 2 * place for place in range(n_logs)]
+        if found.lag:
+            # The basis has the drive's lag; how far that moves the friction which is taken off is neglected.
+            no_forces.append(2 * n_logs)
+        forces = np.delete(by_law, no_forces, axis=1)
+        own_level = np.outer(found.between * forces[:, 0], np.arange(len(records)) == k)
+        columns = np.hstack([forces, logs, own_level])
+        beside.append(Beside(np.zeros((record.n_samples, 0)), columns))
+        frictionless.append(found.taken_off(record))
+
     # What drives an arm away from its simulation is never white: as missed modes five slow ones were added.
-    options = options.model_copy(
-        update={"coloured_noise": True, "max_ar_order": max(options.max_ar_order, NOISE_ORDERS[-1])}
-    )
+    options = options or EmbeddingOptions()
+    ar_order = max(options.max_ar_order, NOISE_ORDERS[-1])
+    options = options.model_copy(update={"coloured_noise": True, "max_ar_order": ar_order})
     # Above those of the model, where logs excite little, one may be missing.
-    swinging = model.poles.pairs if model.poles.pairs.size else model.poles.real[model.poles.real > 0]
-    above = _BEYOND * float(np.max(np.abs(np.log(swinging)), initial=0.0))
+    poles = model.poles
+    is_moving = poles.real > 0
+    highest = poles.pairs if poles.pairs.size else poles.real[is_moving]
+    missed_above = _ABOVE_MODES * float(np.max(np.abs(np.log(highest)), initial=0.0))
+
     # Viscous and dry friction trade: a pole moved far beyond its interval would turn the tangent round below
-    # the data.
-    poles, classes = model.poles, [speed_classes(record) for record in records]
-    for left in reversed(range(ROUNDS)):
+    # the data. So real poles are moved, and the regression is repeated, until each is within its interval.
+    classes = [speed_classes(record) for record in records]
+    for rounds_left in reversed(range(ROUNDS)):
         response, change, factor = tangent_beside(
-            less,
+            frictionless,
             replace(model, poles=poles),
             beside,
             options,
-            n_known=found.law.n_logs + len(records),
-            missed_above=above,
+            n_known=n_logs + len(records),
+            missed_above=missed_above,
             classes=classes,
         )
-        stable, n = poles.without(model.unstable), response.poles.order
-        real, slow = stable.real.copy(), stable.real > 0
-        simple, double = np.reshape(
-            [np.real(laurent_rows(response.poles, pole)) @ response.mean[:n] for pole in real[slow].tolist()],
-            (-1, 2),
-        ).T
-        # Of the logarithm of the decay rate, as its interval.
-        log, rate = double / simple / (real[slow] * np.log(real[slow])), -np.log(real[slow]) / model.dt_s
-        outside = np.abs(log) > np.log(pole_intervals(response, stable).decay_per_s[slow, 1] / rate)
-        if not left or not outside.any():
+        stable = poles.without(model.unstable)
+        n = response.poles.order
+        real = stable.real.copy()
+        decays = stable.real > 0
+        moves = []
+        for pole in real[decays].tolist():
+            moves.append(np.real(laurent_rows(response.poles, pole)) @ response.mean[:n])
+        simple, double = np.reshape(moves, (-1, 2)).T
+        # Changes of the logarithm of the decay rate, to first order, and the half width of its interval.
+        log_change = double / simple / (real[decays] * np.log(real[decays]))
+        rate = -np.log(real[decays]) / model.dt_s
+        upper = pole_intervals(response, stable).decay_per_s[decays, 1]
+        outside = np.abs(log_change) > np.log(upper / rate)
+        if rounds_left == 0 or not outside.any():
             break
-        real[slow] **= np.exp(np.where(outside, np.clip(log, -1, 1), 0.0))
+        steps = np.where(outside, np.clip(log_change, -_LARGEST_LOG_STEP, _LARGEST_LOG_STEP), 0.0)
+        real[decays] **= np.exp(steps)
         poles = Poles(real, stable.pairs).appended(model.unstable)
+
+    # Wider by what parts of the logs differ in, and by forces that no residual shows.
     noise = response.report.noise if response.report else WHITE_NOISE
     wider = np.sqrt(heterogeneity(found, records, noise.without_start))
-    by_force = _by_linear_force(found, records, less, response)
+    by_force = _by_linear_force(found, records, frictionless, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
-    response, straight, onto = of_force(
-        response, poles, max(record.n_samples for record in less) * model.dt_s
-    )
-    both = [0, *([plain.shape[1] - 1] if found.spring is not None else [])]
-    spread = np.append(wider * factor[both].sum(axis=0), np.zeros(by_force.shape[1]))
-    return BehindFriction(
-        response, straight, found.level + float(change[both].sum()), onto @ spread, found, poles
-    )
+    longest_s = max(record.n_samples for record in frictionless) * model.dt_s
+    response, straight, onto = of_force(response, poles, longest_s)
+
+    # The level at the shaft is the first column of the forces, that beyond a spring the last.
+    levels = [0]
+    if found.spring is not None:
+        levels.append(forces.shape[1] - 1)
+    level = found.level + float(change[levels].sum())
+    spread = np.append(wider * factor[levels].sum(axis=0), np.zeros(by_force.shape[1]))
+    return BehindFriction(response, straight, level, onto @ spread, found, poles)
 
 
 def of_force(
     response: ResponsePosterior, poles: Poles, longest_s: float
 ) -> tuple[ResponsePosterior, ResponsePosterior, RealArray]:
-    """The same where what the data leave open adds to the arm's force, not to its response; to first order;
-    the unit normals they stand on now, (P'', P') times those before. poles: of the arm, which the response
-    has twice.
+    """A posterior where what the data leave open adds to the arm's force, not to its response.
 
+    Parameters
+    ----------
+    response : ResponsePosterior
+        Whose covariance is that of the response, to first order, on P' unit normals.
+    poles : Poles
+        Of the arm, which the response has twice.
+    longest_s : float
+        Length of the longest record, s.
+
+    Returns
+    -------
+    tuple of ResponsePosterior, ResponsePosterior and ndarray of shape (P'', P')
+        The bent posterior; the straight one on the P'' unit normals it stands on now; these normals in terms
+        of those before.
+
+    Notes
+    -----
     An arm answers with G = 1 / D, and what is not known of it at low frequency (damping, stiffness, friction
     like them) adds to D: with x the relative change of G along a normal t, G becomes G / (1 - x t), an arc of
     a circle. Along the normals that move the gain below the first light mode most, ellipses about the middle
@@ -177,127 +275,200 @@ def of_force(
         return response, response, np.eye(response.covariance_factor.shape[1])
     omega = _frequencies(response, longest_s)
     rows = response.frequency_rows(omega)
-    gain, moved = rows @ response.mean, rows @ response.covariance_factor
+    gain = rows @ response.mean
+    moved = rows @ response.covariance_factor
     change = moved / gain[:, None]
-    # Above the frequency where the gain is known best it is no longer the force of a slow motion.
-    low = omega < np.min(
-        poles.omega_rad_s(response.dt_s)[poles.zeta() < LARGEST_DAMPING],
-        initial=omega[np.argmin(np.linalg.norm(change, axis=1))],
-    )
-    along = np.linalg.svd(real_rows(np.where(low[:, None], change, 0.0)), full_matrices=False)[2][
-        :_MOST_CURVED
-    ]
-    radius, least = chi2_radius(LEVEL), 1 / _MOST_GAIN
-    upright = np.real((1j * omega[0]) ** response.integrators * gain[0]) > 0
-    centre, columns = np.ones(omega.size, np.complex128), list[ComplexArray]()
-    onto = [np.eye(along.shape[1]) - along.T @ along]
-    for k, direction in enumerate(along):
+
+    # Directions that move the gain most at low frequency. Above the frequency where the gain is known best it
+    # is no longer the force of a slow motion.
+    is_mode = poles.zeta() < LARGEST_DAMPING
+    modes_rad_s = poles.omega_rad_s(response.dt_s)[is_mode]
+    best_known = omega[np.argmin(np.linalg.norm(change, axis=1))]
+    low = omega < np.min(modes_rad_s, initial=best_known)
+    low_change = real_rows(np.where(low[:, None], change, 0.0))
+    directions = np.linalg.svd(low_change, full_matrices=False)[2][:_MOST_CURVED]
+
+    # An arc along each; its centre moves that of all, its parts stand in place of the normal.
+    radius = chi2_radius(LEVEL)
+    least = 1 / _MOST_GAIN
+    lowest_gain = np.real((1j * omega[0]) ** response.integrators * gain[0])
+    upright = lowest_gain > 0
+    centre = np.ones(omega.size, np.complex128)
+    columns = list[ComplexArray]()
+    onto = [np.eye(directions.shape[1]) - directions.T @ directions]
+    for k, direction in enumerate(directions):
         x = change @ direction
+        at_rest = x[0].real
         ends = np.array([-radius, radius])
-        if abs(x[0].real) > least:
-            turns = (1 - least) / x[0].real if upright else (1 + least) / x[0].real
+        if abs(at_rest) > least:
             if upright:
-                ends = np.clip(ends, *sorted((-np.sign(turns) * np.inf, turns)))
+                # The arc ends where the gain is the largest that is held.
+                turns = (1 - least) / at_rest
+                bounds = sorted((-np.sign(turns) * np.inf, turns))
+                ends = np.clip(ends, *bounds)
             elif k == 0:
+                # The centre is turned against its command: the arc begins where it no longer is.
+                turns = (1 + least) / at_rest
                 ends = turns + np.array([0.0, np.sign(turns) * radius])
         # Even steps of the force, and of the gain, at standstill.
-        even = 1 - 1 / np.linspace(1 / (1 - x[0].real * ends[0]), 1 / (1 - x[0].real * ends[1]), _STEPS)
-        left = 1 - np.outer(x, np.concatenate([np.linspace(ends[0], ends[1], _STEPS), even / x[0].real]))
-        arc = np.where(low[:, None], 1 / np.where(np.abs(left) > 0.5 * least, left, least), 2 - left)
+        first_gain = 1 / (1 - at_rest * ends[0])
+        last_gain = 1 / (1 - at_rest * ends[1])
+        even_in_force = np.linspace(ends[0], ends[1], _STEPS)
+        even_in_gain = 1 - 1 / np.linspace(first_gain, last_gain, _STEPS)
+        force = 1 - np.outer(x, np.concatenate([even_in_force, even_in_gain / at_rest]))
+        # Near a force of zero the gain has no end. Above the low frequencies to first order, as before.
+        divisor = np.where(np.abs(force) > 0.5 * least, force, least)
+        arc = np.where(low[:, None], 1 / divisor, 2 - force)
         middle = (arc[:, 0] + arc[:, -1]) / 2
         parts = _parts_of(np.asarray(arc - middle[:, None], np.complex128), np.asarray(middle))
         centre += middle - 1
-        columns += [parts]
+        columns.append(parts)
         # Of its parts the first takes the normal's place.
-        onto += [np.vstack([direction, np.zeros((parts.shape[1] - 1, direction.size))])]
+        further = np.zeros((parts.shape[1] - 1, direction.size))
+        onto.append(np.vstack([direction, further]))
+
     # On more poles, which take up all of it: real ones, and those of the arm once more.
-    poles = poles.appended(
-        Poles(np.exp(-np.geomspace(10 * omega[0], omega[-1] / 3, _FURTHER) * response.dt_s))
-    )
+    slowest = _SLOWEST_FURTHER * omega[0]
+    fastest = omega[-1] / _FASTEST_FURTHER
+    further_rates = np.geomspace(slowest, fastest, _FURTHER)
+    poles = poles.appended(Poles(np.exp(-further_rates * response.dt_s)))
     nothing = np.zeros((response.mean.size + poles.order, 1))
     bent = replace(
         response, poles=response.poles.appended(poles), mean=nothing[:, 0], covariance_factor=nothing
     )
-    wanted = np.column_stack([centre, (moved @ onto[0]) / gain[:, None], *columns])
+    straight_part = (moved @ onto[0]) / gain[:, None]
+    wanted = np.column_stack([centre, straight_part, *columns])
     # Errors as a share of the gain, or of what is not known of it: a zero between the modes would outweigh
     # them all. Nearly equal poles would get large coefficients, and proofs between grid points fail.
-    each = 1 / np.hypot(1, np.linalg.norm(change, axis=1))[:, None]
-    basis = real_rows(bent.frequency_rows(omega) / gain[:, None] * each)
+    weight = 1 / np.hypot(1, np.linalg.norm(change, axis=1))[:, None]
+    basis = real_rows(bent.frequency_rows(omega) / gain[:, None] * weight)
     length = np.maximum(np.linalg.norm(basis, axis=0), np.finfo(np.float64).tiny)[:, None]
-    found = np.linalg.lstsq(basis / length.T, real_rows(wanted * each), rcond=_SMALL**2)[0] / length
-    bent, normals = replace(bent, mean=found[:, 0], covariance_factor=found[:, 1:]), np.vstack(onto)
-    return bent, replace(response, covariance_factor=response.covariance_factor @ normals.T), normals
+    target = real_rows(wanted * weight)
+    solved = np.linalg.lstsq(basis / length.T, target, rcond=_SMALL**2)[0] / length
+    bent = replace(bent, mean=solved[:, 0], covariance_factor=solved[:, 1:])
+    normals = np.vstack(onto)
+    straight = replace(response, covariance_factor=response.covariance_factor @ normals.T)
+    return bent, straight, normals
 
 
 def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
-    """(F, N) columns whose ellipses at the level hold the points (F, K) of an arc about the middle (F,) of
-    its ends, but not zero at the lowest frequency, where everything is real and only the first counts."""
-    parts, sizes, _ = np.linalg.svd(real_rows(arc) / np.sqrt(arc.shape[1]), full_matrices=False)
+    """Columns (F, N) whose ellipses at the level hold an arc, relative to the gain.
+
+    The points (F, K) of the arc are told from the middle (F,) of its ends. Zero is outside at the lowest
+    frequency, where everything is real and only the first column counts.
+    """
+    left, sizes, _ = np.linalg.svd(real_rows(arc) / np.sqrt(arc.shape[1]), full_matrices=False)
     n = int(np.count_nonzero(sizes > _SMALL * sizes[0]))
-    parts = parts[: middle.size, :n] * sizes[:n] + 1j * parts[middle.size :, :n] * sizes[:n]
-    parts = parts @ np.linalg.qr(np.column_stack([parts[0].real, np.eye(n)]))[0]
-    most = np.append(min(_REACH, _LARGEST * abs(middle[0]) / abs(parts[0, 0])), np.full(n - 1, _REACH))
-    return np.asarray(parts * most / chi2_radius(LEVEL), np.complex128)
+    parts = left[: middle.size, :n] * sizes[:n] + 1j * left[middle.size :, :n] * sizes[:n]
+    # Turned so that only the first part moves the gain at the lowest frequency.
+    turn = np.linalg.qr(np.column_stack([parts[0].real, np.eye(n)]))[0]
+    parts = parts @ turn
+    without_zero = _LARGEST * abs(middle[0]) / abs(parts[0, 0])
+    reach = np.append(min(_REACH, without_zero), np.full(n - 1, _REACH))
+    return np.asarray(parts * reach / chi2_radius(LEVEL), np.complex128)
 
 
 def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:
-    """(F,) [rad/s], as dense as what a kernel does between them."""
+    """Frequencies (F,), rad/s, as dense as what a kernel of the response does between them.
+
+    From far below one radian in the longest record (s) to the Nyquist frequency.
+    """
     nyquist = np.pi / response.dt_s
-    slow = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, FREQUENCIES)
-    return np.union1d(
-        slow, nyquist * np.arange(1, 2 * response.fir_length + 1) / (2 * response.fir_length + 1)
-    )
+    spaced = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, FREQUENCIES)
+    # Two points for each tap of the kernel.
+    n_points = 2 * response.fir_length
+    even = nyquist * np.arange(1, n_points + 1) / (n_points + 1)
+    return np.union1d(spaced, even)
 
 
 def _by_linear_force(
-    friction: FrictionFit, records: Sequence[Record], less: Sequence[Record], response: ResponsePosterior
+    friction: FrictionFit,
+    records: Sequence[Record],
+    frictionless: Sequence[Record],
+    response: ResponsePosterior,
 ) -> RealArray:
-    """(P, S) changes of the response's coefficients by a part of the friction that looks like a linear force,
-    which no data tell: k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that integrates),
-    each a share of the friction, rms over the records. less: the records with the friction taken off."""
+    """Changes (P, S) of a response's coefficients by a part of the friction that looks like a linear force.
+
+    No data tell such a part. A force k y^(i) changes G by k s^i G^2 (i up to 2; no stiffness in an arm that
+    integrates), each a share of the friction, rms over the records. `frictionless` are the records with the
+    friction taken off.
+    """
     omega = _frequencies(response, max(record.n_samples for record in records) * response.dt_s)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
-    force = [(one.input - other.input)[:, 0] for one, other in zip(records, less, strict=True)]
-    moved = [smoothed(record.output[:, 0]) for record in records]
+    forces = []
+    for record, driven in zip(records, frictionless, strict=True):
+        forces.append((record.input - driven.input)[:, 0])
+    motions = [smoothed(record.output[:, 0]) for record in records]
+    # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
+    n_doubled = response.poles.order
+    basis = real_rows(rows[:, :n_doubled] / gain[:, None])
     columns = list[RealArray]()
-    for i in range(3):
-        if i >= response.integrators:
-            size = _SHAPE * np.sqrt(sum(map(np.var, force)) / sum(map(np.var, moved)))
-            change = size * (1j * omega) ** i * gain / friction.drive_response(omega)
-            # On the doubled poles, which hold G^2 s^i but for the delay, relative to G.
-            basis = real_rows(rows[:, : response.poles.order] / gain[:, None])
+    for power in range(_FORCES):
+        if power >= response.integrators:
+            size = _SHAPE * np.sqrt(sum(map(np.var, forces)) / sum(map(np.var, motions)))
+            change = size * (1j * omega) ** power * gain / friction.drive_response(omega)
             columns.append(np.asarray(np.linalg.lstsq(basis, real_rows(change), rcond=None)[0]))
-        moved = [np.gradient(one, response.dt_s) for one in moved]
-    return np.pad(np.column_stack(columns), ((0, response.mean.size - response.poles.order), (0, 0)))
+        motions = [np.gradient(motion, response.dt_s) for motion in motions]
+    n_others = response.mean.size - n_doubled
+    return np.pad(np.column_stack(columns), ((0, n_others), (0, 0)))
 
 
 def other_output_without_friction(
     records: Sequence[Record],
-    found: FrictionFit,
+    fit: FrictionFit,
     model: GobfModel,
     options: EmbeddingOptions | None = None,
 ) -> BehindFriction:
-    """The same for another output of the arm, which the same friction reaches through the motor's shaft.
-    records: with that output; model: fitted to them with the friction taken off."""
+    """Posterior of the response to another output of the arm, as if there were no dry friction at its shaft.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        With that output; the friction reaches it through the motor's shaft.
+    fit : FrictionFit
+        Of the shaft's position in the same experiments, a free run.
+    model : GobfModel
+        Fitted to the records with the friction taken off.
+    options : EmbeddingOptions, optional
+        Of the regression.
+
+    Returns
+    -------
+    BehindFriction
+        `shaft` is the fit's response, moved by what the other output says of it.
+
+    Raises
+    ------
+    ValueError
+        As `tangent`.
+    """
     undelayed = replace(model, input_delay_samples=0)
-    less, beside, n = list[Record](), list[Beside](), found.coefficients.size
+    structure = fit.arm.structure
+    n = fit.coefficients.size
+    frictionless = []
+    beside = []
     for k, record in enumerate(records):
-        _, friction, _, by = linearised(found.arm, found.coefficients, found.law, record.input[:, 0])
-        less.append(less_friction(record, friction, found.arm.structure.input_delay_samples))
-        columns = np.column_stack([-by @ found.covariance_factor, -found.between * by[:, n]])
+        local = linearised(fit.arm, fit.coefficients, fit.law, record.input[:, 0])
+        frictionless.append(less_friction(record, local.friction, structure.input_delay_samples))
+        # What the friction may be beside the fit's: along its normals, and by this record's own level.
+        along_normals = -local.friction_by @ fit.covariance_factor
+        own = -fit.between * local.friction_by[:, n]
+        columns = np.column_stack([along_normals, own])
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
-        own = np.outer(driven[:, -1], np.arange(len(records)) == k)
-        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([driven[:, :-1], own])))
-    shared = found.covariance_factor.shape[1]
-    response, mean, factor = tangent_beside(less, model, beside, options, n_known=shared + len(records))
-    moved, spread = (found.covariance_factor @ part[:shared] for part in (mean, factor))
+        own_level = np.outer(driven[:, -1], np.arange(len(records)) == k)
+        beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([driven[:, :-1], own_level])))
+    n_normals = fit.covariance_factor.shape[1]
+    n_known = n_normals + len(records)
+    response, mean, factor = tangent_beside(frictionless, model, beside, options, n_known=n_known)
+    moved = fit.covariance_factor @ mean[:n_normals]
+    spread = fit.covariance_factor @ factor[:n_normals]
     shaft = ResponsePosterior(
-        found.arm.poles.doubled(),
-        found.coefficients + moved[:n],
+        fit.arm.poles.doubled(),
+        fit.coefficients + moved[:n],
         spread[:n],
         model.dt_s,
-        integrators=found.arm.structure.integrators,
-        input_delay_samples=found.arm.structure.input_delay_samples,
+        integrators=structure.integrators,
+        input_delay_samples=structure.input_delay_samples,
     )
-    return BehindFriction(response, shaft, found.level + float(moved[n]), spread[n], found, model.poles)
+    return BehindFriction(response, shaft, fit.level + float(moved[n]), spread[n], fit, model.poles)
