@@ -453,8 +453,8 @@ def other_output_without_friction(
         frictionless.append(less_friction(record, local.friction, structure.input_delay_samples))
         # What the friction may be beside the fit's: along its normals, and by this record's own level.
         along_normals = -local.friction_by @ fit.covariance_factor
-        own = -fit.between * local.friction_by[:, n]
-        columns = np.column_stack([along_normals, own])
+        by_own_level = -fit.between * local.friction_by[:, n]
+        columns = np.column_stack([along_normals, by_own_level])
         driven = np.column_stack([undelayed.simulate(column) for column in columns.T])
         own_level = np.outer(driven[:, -1], np.arange(len(records)) == k)
         beside.append(Beside(np.zeros((record.n_samples, 0)), np.hstack([driven[:, :-1], own_level])))
