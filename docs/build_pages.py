@@ -300,7 +300,10 @@ def docstring(name: str, thing: Any) -> str:
         if section in ("Notes", "References", "See also"):
             parts.append(f"**{section}**\n\n{prose(part.description)}")
     if described.examples:
-        code = "\n".join(example.snippet or example.description or "" for example in described.examples)
+        lines = []
+        for example in described.examples:
+            lines.extend(text for text in (example.snippet, example.description) if text)
+        code = "\n".join(lines)
         parts.append(f"**Examples**\n\n```python\n{code}\n```")
     return "\n\n".join(part for part in parts if part)
 

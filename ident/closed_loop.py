@@ -226,9 +226,12 @@ def two_stage_several(
         progress(0.5 * number / len(records), "from references to inputs")
         unexplained.append(_unexplained(record))
 
-    # The plant, three times: of the logs as they are, then of records that the plant before has opened. The
-    # second fit sees as noise what feedback did, so it may choose another order; the third one keeps that.
-    # The numbers are places on the bar of progress; the first marks the fit whose order is not kept.
+    # The plant, three times: of the logs as they are, then twice of records that the plant before has opened.
+    # The first fit is biased by what feedback did, and its order with it, so the second one chooses anew; the
+    # third one keeps that order, on records that a better plant has opened. A plant of one input and output
+    # has its order from its own noise model and is fitted twice (`two_stage`); why once more here is not
+    # known: chosen. Free shapes: every output has numerators of its own on the common poles. The numbers are
+    # places on the bar of progress; the first marks the fit whose order is not kept.
     opened = list(records)
     for share in (0.5, 0.7, 0.9):
         progress(share, "without what the loop fed back")

@@ -366,8 +366,8 @@ class SampledLoop:
 
         Notes
         -----
-        draws is D; 0 gives empty arrays. The performance channel is drawn only where a requirement is about
-        it, and its ValueError (`drawn`: no samples can be drawn) goes up.
+        draws is D; 0 gives empty arrays. The performance channel's draws are used only where a requirement is
+        about it, but one that no samples can be drawn from is refused in any case (ValueError of `drawn`).
         """
         has_asked_channel = False
         for each in self.data.weightings:

@@ -193,7 +193,8 @@ class PlantData:
         Parameters
         ----------
         k : (F,) complex array
-            Controller values without delay, finite and F of them (not checked: nan gives nan).
+            Controller values without delay, finite and F of them (not checked: nan gives nan, but 0 for a
+            requirement on K S).
 
         Returns
         -------

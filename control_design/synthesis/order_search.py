@@ -69,8 +69,8 @@ _AGREE = 1.001
 # Least damping ratio of fitted poles: a narrow resonance of a start stays, and hides between grid points.
 # Chosen.
 _NO_RESONANCE = 0.3
-# Rounds of fits with random weights, after the one with the weights of the bound: frequencies that a low
-# order can do without. Chosen.
+# Rounds of fits with random weights over frequency, after the one that weighs all relative errors alike: a
+# low order can do without some frequencies. Chosen.
 _WEIGHTED_ROUNDS = 3
 # Steps that every fit gets before the best of a round goes on alone. Read off the paths of random designs 0
 # to 21: after ten it mostly, not always, leads to the best end of its round; after five less often.

@@ -146,9 +146,34 @@ def inverse_all_pass(poles: Poles) -> tuple[RealArray, RealArray, RealArray, Rea
 
 
 def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
-    """Values (F, B) of the basis functions at the points z (F,); NaN or infinite at a pole.
+    r"""Values of the basis functions.
 
-    Raises ValueError for z of another number of dimensions.
+    Parameters
+    ----------
+    poles : Poles
+        Of the B basis functions.
+    z : (F,) complex array
+        Points, e^{j omega dt} on the unit circle.
+
+    Returns
+    -------
+    (F, B) complex array
+        NaN or infinite at a pole.
+
+    Raises
+    ------
+    ValueError
+        For z of another number of dimensions.
+
+    Notes
+    -----
+    For poles p_k, one after the other,
+
+    .. math::
+
+        L_k(z) = \frac{\sqrt{1 - |p_k|^2}}{z - p_k} \prod_{i < k} \frac{1 - \bar p_i z}{z - p_i},
+
+    in the real form that has two functions for a pair (Ninness and Gustafsson, IEEE TAC 42(4), 1997).
     """
     return _response_and_all_pass(poles, z)[0]
 
@@ -260,10 +285,24 @@ def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
 
 
 def regressor(poles: Poles, u: RealArray) -> RealArray:
-    """Basis functions driven by u (T,) or (T, 1) from rest, (T, B).
+    """Basis functions driven by a signal from rest: the columns of a regression.
 
-    Phi[k, i] = [L_i(q) u](k), in the unit of u; Phi[0] = 0. From a NaN on all is NaN; (0, B) for T = 0.
-    Raises ValueError for another shape of u.
+    Parameters
+    ----------
+    poles : Poles
+        Of the B basis functions L_i.
+    u : (T,) or (T, 1) array
+        The signal.
+
+    Returns
+    -------
+    (T, B) array
+        Phi[k, i] = [L_i(q) u](k), in the unit of u; Phi[0] = 0. From a NaN on all is NaN.
+
+    Raises
+    ------
+    ValueError
+        For another shape of u.
     """
     return _through(poles, u)[0].T
 

@@ -44,13 +44,41 @@ _LARGEST_ZERO = 1e4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GobfModel(Shown):
-    """G(z) = [sum_i c_i L_i(z) + feedthrough] (z/(z-1))^integrators z^-input_delay_samples, paper (3) and
-    (5).
+    r"""A linear model of one input and one output on generalised orthonormal basis functions (GOBF).
 
-    coefficients (B,): one per basis function, real poles first, then two per pair, output units per input
-    unit, as feedthrough. unstable: mirror images 1 / conj(p) of poles p outside the circle, each among the
-    poles: G is the above divided by their all-pass B(z). Raises ValueError if the shapes do not fit, a number
-    is not finite or dt_s is not positive.
+    Parameters
+    ----------
+    poles : Poles
+        Of the B basis functions, inside the unit circle.
+    coefficients : (B,) array
+        One per basis function, real poles first, then two per pair; output units per input unit.
+    dt_s : float
+        Sampling period in seconds, positive.
+    feedthrough : float
+        Direct term, output units per input unit.
+    integrators : int
+        Poles at z = 1.
+    input_delay_samples : int
+        Dead time.
+    input_name, output_name : str
+        Columns of the records.
+    unstable : Poles
+        Mirror images 1 / conj(p) of poles p outside the circle, each among `poles`.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit, a number is not finite or dt_s is not positive.
+
+    Notes
+    -----
+    With basis functions L_i, integrators n and dead time d
+
+    .. math::
+
+        G(z) = \Bigl[\sum_i c_i L_i(z) + c_0\Bigr] \Bigl(\frac{z}{z - 1}\Bigr)^{n} z^{-d},
+
+    divided by the all-pass of `unstable` where there are any (Ziaei and Wang 2006, (3) and (5)).
 
     Examples
     --------

@@ -19,10 +19,19 @@ from ident.data.arrays import ComplexArray, RealArray, lock
 
 @dataclass(frozen=True, eq=False)
 class Poles:
-    """Discrete-time poles inside the circle: real (R,), then pairs (P,), each by its pole above the axis.
+    """Discrete-time poles inside the unit circle, in the order of their basis functions.
 
-    No unit. Zeros (FIR) and equal poles are allowed; the order is that of the basis functions. Raises
-    ValueError if a pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
+    Parameters
+    ----------
+    real : (R,) array
+        Real poles; zeros (FIR) and equal poles are allowed.
+    pairs : (P,) complex array
+        Of every conjugate pair the pole above the real axis.
+
+    Raises
+    ------
+    ValueError
+        If a pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
     """
 
     real: RealArray = field(default_factory=lambda: np.zeros(0))

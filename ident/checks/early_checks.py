@@ -29,9 +29,9 @@ from ident.data.finding import WHITE_LAGS, Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.data.wrapping import spikes_in, wraps_at
 
-# Samples of which the longest record needs more. Every model's residuals are tested over WHITE_LAGS lags, and
-# such a test needs more than two samples a lag: with fewer no identification ends, whatever the order of its
-# model.
+# Samples of which the longest record needs more, and rows away from one reading or after the input's start:
+# 50. Every model's residuals are tested over WHITE_LAGS = 25 lags, and such a test needs more than two
+# samples a lag: with fewer no identification ends, whatever the order of its model.
 FEWEST_SAMPLES = 2 * WHITE_LAGS
 
 # Relative to its motion: a column that differs by no more from a multiple of another one is its copy. Text

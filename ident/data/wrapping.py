@@ -43,8 +43,8 @@ def _timer_periods() -> tuple[float, ...]:
 
 
 def _ends_of_integers() -> frozenset[float]:
-    """Return the largest and smallest signed and unsigned integers of 16, 32 and 64 bits, and their
-    neighbours, which programs write for no reading."""
+    """Return the largest and smallest signed integers of 16, 32 and 64 bits, the largest unsigned ones of 16
+    and 32, and their neighbours, which programs write for no reading."""
     ends = []
     # A signed integer of n bits ends at 2^(n - 1).
     for bits in (15, 16, 31, 32, 63):
@@ -260,11 +260,12 @@ def no_reading(values: RealArray, *, command: bool = False) -> IntArray:
 def _stands_for_nothing(value: float) -> bool:
     """Whether programs write this number where there is no reading.
 
-    Such numbers are three nines and more, another digit four times and more, an end of an integer's range
-    (`ENDS_OF_INTEGERS`), and more than any meter shows. Ten digits are looked at. False for 0; infinity
-    counts.
+    Such numbers are three to ten nines, another digit four to ten times, either with zeros behind it or a
+    decimal point within (9.99, 7777000), an end of an integer's range (`ENDS_OF_INTEGERS`), and what is
+    larger than any meter shows (`INFINITE`). False for 0; infinity counts.
     """
-    # 999 is written more often than 777: the other digits have to come four times.
+    # 999 is written more often than 777: the other digits have to come four times. Ten digits are what an
+    # integer of 32 bits has; a reading of floating point repeats no digit as often by chance.
     digits = f"{abs(value):.10g}".replace(".", "").rstrip("0")
     fewest_digits = 3 if digits.startswith("9") else 4
     repeats_one_digit = len(set(digits)) == 1 and len(digits) >= fewest_digits

@@ -185,8 +185,9 @@ class ResidualColour:
     Attributes
     ----------
     effective_samples : float
-        Independent samples it is worth, N / (1 + 2 sum rho_k^2) over lags to 200 or a tenth of the shortest
-        record (Bartlett): by that factor colour widens the scatter of J.
+        Independent samples it is worth, N / (1 + 2 sum (rho_k^2 - 1/N)) over lags to 200 or a tenth of the
+        shortest record (Bartlett; 1/N is what white noise has by chance): by that factor colour widens the
+        scatter of J.
     white : bool
         Autocorrelations at lags 1 .. 25 (`WHITE_LAGS`) are no larger, all together, than those of white noise
         99 times in 100 (`TEST_LEVEL`; Box and Pierce); never so where a record has less than 250 samples, ten

@@ -57,9 +57,9 @@ _REACH = 1.7
 _LARGEST = 0.9
 # Further real poles over the grid, which bent gains stand on: to .1 %, where four about the slowest left 16.
 _FURTHER = 20
-# Slowest of them in units of the lowest frequency, and fastest as a part of the highest. Chosen: within the
-# grid, where their shapes differ.
+# Slowest of them in units of the lowest frequency. Chosen: within the grid, where their shapes differ.
 _SLOWEST_FURTHER = 10
+# Fastest of them, as this part of the highest frequency. Chosen likewise.
 _FASTEST_FURTHER = 3
 # Lowest missing mode, over the highest of the model: a nearer one the search would have found.
 _ABOVE_MODES = 1.1
