@@ -94,7 +94,8 @@ class NominalLoop:
         self._d = np.asarray(system.D, dtype=float)
 
     def poles(self, a: Real, b: Real, c: Real, d: Real) -> Complex:
-        """Closed-loop poles (n,) in z with a controller u = K e, e = -y.
+        """Closed-loop poles in z with a controller u = K e, e = -y: as many as plant and delay (n) and
+        controller have states.
 
         Parameters
         ----------
@@ -104,9 +105,9 @@ class NominalLoop:
 
         Returns
         -------
-        (n,) complex array
-            Of plant, delay and controller; one infinite pole for an algebraic loop, det(1 + D_K D_G) = 0, and
-            where a matrix is not finite.
+        (N,) complex array
+            N the states of plant, delay and controller; one infinite pole for an algebraic loop, det(1 + D_K
+            D_G) = 0, and where a matrix is not finite.
         """
         n = self._a.shape[0]
         if not (np.all(np.isfinite(a)) and np.all(np.isfinite(c))):

@@ -193,8 +193,8 @@ class PlantData:
         Parameters
         ----------
         k : (F,) complex array
-            Controller values without delay, finite and F of them (not checked: nan gives nan, but 0 for a
-            requirement on K S).
+            Controller values without delay, finite and F of them (not checked: a nan gives inf for S and G S,
+            0 for K S and for the distance, nan for T).
 
         Returns
         -------

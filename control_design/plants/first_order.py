@@ -370,7 +370,8 @@ class RationalResponse:
         """Expansion (F,) of the response times (z - 1)^cleared on F intervals; cleared takes integrators
         away.
 
-        A root at the middle of an interval gives inf or nan, see `FrequencyIntervals.pole`.
+        A pole at the middle of an interval gives inf or nan (`FrequencyIntervals.pole`), a zero there a value
+        of 0.
         """
         result = intervals.constant(self.gain)
         zero_order = np.argsort(np.abs(self.zeros_minus_1), kind="stable")

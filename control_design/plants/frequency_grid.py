@@ -189,7 +189,8 @@ def frequency_grid(
     Raises
     ------
     ValueError, IndexError
-        By numpy, for ends that are zero or negative, or a lowest frequency above Nyquist.
+        By numpy, for an end that is zero, or a lowest frequency above Nyquist. Negative ends are not refused
+        and give negative frequencies: callers take them from a plant.
     """
     per_mode = max(_LEAST_MODE_POINTS, n_mode // max(len(modes), 1))
     parts = [np.geomspace(omega_min_rad_s, nyquist_rad_s, n_log), np.asarray(extra, dtype=np.float64)]

@@ -163,8 +163,9 @@ def posterior_expansion(
     Parameters
     ----------
     posterior : ResponsePosterior
-        A Gaussian over the coefficients (P,) of basis functions and impulse response, with mean (P,) and
-        covariance_factor (P, Q), behind integrators, a delay in samples and unstable poles.
+        A Gaussian over numbers (P,): coefficients of basis functions and impulse response and, behind them,
+        offsets of the unstable poles to first order. mean (P,), covariance_factor (P, Q); integrators, a
+        delay in samples and the unstable poles are common to all columns.
     intervals : FrequencyIntervals
         F of them.
     cleared : int
