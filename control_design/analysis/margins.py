@@ -55,7 +55,7 @@ _REAL_CENTRE = 1e-6
 _FREQUENCY_TOLERANCE = 1e-13
 
 # Relative tolerance of `brentq`, which takes none below 4 roundings of doubles, 9e-16.
-_LEAST_BRENTQ_TOLERANCE = 1e-14
+_BRENTQ_RELATIVE_TOLERANCE = 1e-14
 
 # Ellipses with a major axis below this (the loop gain has no unit, and is 1 at the circle) have no boundary
 # to speak of; their centre's crossings are sought instead. Some thousand roundings of 1.
@@ -284,7 +284,7 @@ def _crossings(
             # A sign that rounding makes: one of the ends is the crossing.
             return _Crossing(low, complex(value[k]))
         tolerance = _FREQUENCY_TOLERANCE * high
-        place = float(brentq(side_at, low, high, xtol=tolerance, rtol=_LEAST_BRENTQ_TOLERANCE))
+        place = float(brentq(side_at, low, high, xtol=tolerance, rtol=_BRENTQ_RELATIVE_TOLERANCE))
         return _Crossing(place, complex(loop_gain(np.array([place]))[0]))
 
     # Crossings of the negative real axis: where the imaginary part changes sign, or touches zero.

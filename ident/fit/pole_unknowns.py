@@ -55,8 +55,8 @@ _CLOSE = 1e-7
 # Least angle of a pair per sample, rad: a pair has to lie above the axis, and no record shows one so slow.
 _LEAST_ANGLE_RAD = 1e-12
 # Largest angle of a pair per sample, over pi: beyond pi a mode is folded back, and at pi its pair is a real
-# pole. Chosen; it has to be the number of `ident.fit.refinement`.
-_LARGEST_ANGLE_SHARE = 0.995
+# pole. Chosen; bounds of a refinement end there, too.
+LARGEST_ANGLE_SHARE = 0.995
 # Least square of a direction's length, in place of zero: a pole that moves nothing has a scale to divide by.
 _TINY = 1e-300
 # Least pivot of the damped normal matrix of unit diagonal, whose products are rounded to 1e-16: a step is
@@ -99,7 +99,7 @@ def clip_parameters(x: Any, n_free_real: int, bounds: Any) -> Any:
         zeta = min(max(s / omega, bounds[_ZETA_MIN]), bounds[_ZETA_MAX])
         omega = min(max(omega, bounds[_OMEGA_MIN]), bounds[_OMEGA_MAX])
         decay = max(zeta * omega, bounds[_S_MIN])
-        angle = min(omega * math.sqrt(1 - zeta * zeta), _LARGEST_ANGLE_SHARE * np.pi)
+        angle = min(omega * math.sqrt(1 - zeta * zeta), LARGEST_ANGLE_SHARE * np.pi)
         # Decay at which the damping ratio is the largest: s = f zeta / sqrt(1 - zeta^2).
         widest = angle * bounds[_ZETA_MAX] / math.sqrt(1 - bounds[_ZETA_MAX] ** 2)
         inside[i] = max(decay, min(narrowest(angle, bounds), widest))

@@ -18,7 +18,14 @@ from ident.basis.coordinates import ZETA_LEAST, ZETA_LIMIT
 from ident.basis.options import IdentOptions
 from ident.basis.poles import NO_POLES, Poles
 from ident.data.arrays import RealArray
-from ident.fit.pole_unknowns import chain_rule, damped_step, free_parameters, scaled_system, start
+from ident.fit.pole_unknowns import (
+    LARGEST_ANGLE_SHARE,
+    chain_rule,
+    damped_step,
+    free_parameters,
+    scaled_system,
+    start,
+)
 from ident.fit.problem import Linearisation, Linearised
 
 # Damping of the first step near an optimum, in units of the scaled normal matrix: practically a full step.
@@ -50,9 +57,6 @@ _LARGEST_DISTANCE = 1.95
 # Lowest frequency of a pair, rad in the longest record: 1/63 of a period there looks like a straight line.
 # Chosen.
 _LEAST_ANGLE_PER_RECORD = 0.1
-# Largest angle of a pair per sample, over pi: beyond pi a mode is folded back, and at pi its pair is a real
-# pole. Chosen; `ident.fit.pole_unknowns` has the same number.
-_LARGEST_ANGLE_SHARE = 0.995
 
 
 @dataclass(frozen=True)
@@ -95,7 +99,7 @@ class Bounds:
         stated bound beyond what a record shows can leave a side empty, which is not refused here.
         """
         still = _STILL / longest
-        largest_angle = _LARGEST_ANGLE_SHARE * np.pi
+        largest_angle = LARGEST_ANGLE_SHARE * np.pi
 
         def distance(decay_per_s: float | None, default: float) -> float:
             """1 - a of a stated decay, 1/s, or the default (of 1 - a) where it is None."""

@@ -837,9 +837,11 @@ def sandwiched(factor: RealArray, scores: RealArray) -> RealArray:
 def symmetric_factor(covariance: RealArray) -> RealArray:
     """Factor S (L,L') with S S^T = covariance (L,L), directions below rounding (`_ROUNDING`) left out.
 
-    L at least 1; the symmetric part counts. L' = 0 for a covariance of zeros, and, silently, for one with
-    NaN.
+    L at least 1; the symmetric part counts. L' = 0 for a covariance of zeros. ValueError for one that is not
+    finite: an empty factor would say that nothing is uncertain.
     """
+    if not np.all(np.isfinite(covariance)):
+        raise ValueError("the covariance of the coefficients has a value that is not finite")
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     certain = np.zeros(values.size, dtype=np.bool_)
     if values[-1] > 0:

@@ -17,6 +17,7 @@ from ident.uncertainty.embedding_algebra import (
     nuisance_basis,
     pieces,
     reduce_regression,
+    symmetric_factor,
     tc_factor,
 )
 from validation.paper.classical import prior_posterior
@@ -223,3 +224,14 @@ def test_a_record_longer_than_a_piece_is_reduced_as_if_it_were_whole():
     np.testing.assert_allclose(np.abs(reduced.r22), np.abs(triangle[2:5, 2:5]), atol=1e-9)
     assert reduced.unexplained == pytest.approx(triangle[-1, -1] ** 2, rel=1e-10)
     assert reduced.n_rows == n - 1
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_covariance_that_is_no_number_is_refused_and_not_taken_for_certainty(bad):
+    covariance = np.diag([4.0, 1.0, 0.0])
+    factor = symmetric_factor(covariance)
+    assert factor.shape == (3, 2)
+    np.testing.assert_allclose(factor @ factor.T, covariance, rtol=0, atol=1e-15)
+    covariance[2, 0] = bad
+    with pytest.raises(ValueError, match="finite"):
+        symmetric_factor(covariance)
