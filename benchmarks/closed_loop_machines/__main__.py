@@ -1,6 +1,8 @@
 """Logs of machines under their own controllers, made by an independent simulator, through
 `flexlink run LOG...`, nothing typed, to a controller: what came out, against the truth (criteria: judge.py).
 
+The ten kinds unless --kinds names others; the further ones (machines.FURTHER_KINDS) are quick, tip, load,
+clipped, late.
 Seeds with seed mod 6 below 4 record the reference. Series 1 is for development.
     python -m benchmarks.closed_loop_machines --make-only LOGS    writes logs, and the truth to LOGS_truth
 """

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import scipy.signal
 
-from benchmarks.closed_loop_machines.machines import KINDS, TAU, Draft, draft
+from benchmarks.closed_loop_machines.machines import ALL_KINDS, TAU, Draft, draft
 from benchmarks.closed_loop_machines.simulator import Array, Plant
 
 CLASSES = ("multisine", "prbs", "chirp", "moves")
@@ -64,17 +64,19 @@ class Machine:
         return {"r": reference, **self.plant.run(self.draft.law, reference, start, noise)}
 
     def rng(self, log: int) -> np.random.Generator:
-        return np.random.default_rng([self.series, KINDS.index(self.kind), self.seed, 1 + log])
+        return np.random.default_rng([self.series, ALL_KINDS.index(self.kind), self.seed, 1 + log])
 
 
 def machine(kind: str, seed: int, series: int = 1) -> Machine:
     """The machine of a seed. Friction is 2 to 30 % of the rms command of its logs."""
-    rng = np.random.default_rng([series, KINDS.index(kind), seed])
+    rng = np.random.default_rng([series, ALL_KINDS.index(kind), seed])
     d, u = draft(kind, seed, rng), rng.uniform
     reported = kind == "belt" and (series, seed) == (1, 0)
     logs = int(rng.choice([3, 4]))
     main = str(rng.choice(CLASSES, p=[0.35, 0.25, 0.2, 0.2]))
     classes = [main if rng.random() < 0.8 else str(rng.choice(CLASSES)) for _ in range(logs)]
+    if kind == "clipped":
+        classes = ["chirp"] * logs
     levels = [1.0, 0.5, 1.0, 0.5][:logs] if rng.random() < 0.4 else [1.0] * logs
     rest, duration = [bool(rng.random() < 0.6) for _ in range(logs)], round(float(u(8, 20)), 1)
     if d.plant.dt_s < 4e-4:
@@ -88,7 +90,10 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
         duration, away, model, logs = 16.0, 0.0, 0.0, 4
     centre = (d.q_operating + away) * d.plant.scale
     habits = tuple(classes), tuple(levels), tuple(rest), duration, centre, seed % 6 < 4
-    bare = Machine(kind, seed, series, d, d.plant, *habits, kind == "saturation" and seed % 6 in (2, 4))
+    is_limited = kind in ("saturation", "clipped")
+    if kind == "clipped":  # a tenth of the samples more, and more
+        clip -= 0.1
+    bare = Machine(kind, seed, series, d, d.plant, *habits, is_limited and seed % 6 in (2, 4))
     plant, level = replace(d.plant, ripple=np.zeros(3)), 0.0
     for _ in range(10):  # friction raises the command that it is a share of
         ran = [replace(bare, plant=plant).record(log, bare.rng(log)) for log in range(logs)]
@@ -113,7 +118,7 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
     peaks = np.concatenate([np.abs(one["u"][begin:]) for one, begin in ran])
     if not np.all(np.isfinite(peaks)):
         raise RuntimeError(f"{bare.name} of series {series} does not hold")
-    limit = float(np.quantile(peaks, clip)) if kind == "saturation" else 2.5 * float(np.max(peaks))
+    limit = float(np.quantile(peaks, clip)) if is_limited else 2.5 * float(np.max(peaks))
     return replace(rough, plant=replace(plant, limit=limit))
 
 

@@ -1,4 +1,4 @@
-"""Ten kinds of machine and the controllers that people give them, drawn from a seed.
+"""Ten kinds of machine, five further ones, and the controllers that people give them, drawn from a seed.
 
 Everything is drawn before friction: friction is a share of the command, which the recorded motion decides
 (`logs.machine`). Belt drive, seed 0 of series 1, is the log reported by a user.
@@ -30,6 +30,19 @@ _ROWS = {
     "saturation": ((0.5, 5), (1, 4), (5, 15), (0.02, 0.06), (0.1, 1), (0.2, 0.4), (0.05, 0.3), 0.8, "ra rv"),
 }  # fmt: skip
 KINDS = tuple(_ROWS)
+# What the ten leave out: a loop at 4 kHz whose logs are too short for its coasting time; the sensor at the
+# load and the friction at the motor; the friction at the load; a chirp at the drive's limit; a delay of five
+# samples.
+_FURTHER_ROWS = {
+    "quick": ((0.5, 5), (0.1, 1), (20, 60), (0.02, 0.06), (0.1, 1), (0.15, 0.35), (0.01, 0.1), 1.0, "ra da"),
+    "tip": ((0.5, 5), (0.3, 2), (5, 20), (0.02, 0.06), (0.1, 1), (0.06, 0.15), (0.03, 0.3), 1.0, "ra da"),
+    "load": ((0.5, 5), (0.5, 3), (8, 30), (0.02, 0.06), (0.1, 1), (0.1, 0.3), (0.03, 0.3), 0.0, "ra ma rt"),
+    "clipped": ((0.5, 5), (1, 4), (5, 15), (0.02, 0.06), (0.1, 1), (0.2, 0.4), (0.05, 0.3), 0.8, "ra rv dt"),
+    "late": ((0.5, 5), (1, 4), (5, 15), (0.02, 0.06), (0.1, 1), (0.1, 0.25), (0.03, 0.3), 0.8, "ra da rv"),
+}
+FURTHER_KINDS = tuple(_FURTHER_ROWS)
+# A kind's place is part of its seed.
+ALL_KINDS = KINDS + FURTHER_KINDS
 # Output unit per rad (None: millimetres of a screw), column of time, reference, input by its letter, output.
 _OUTPUTS = {
     "r": (1.0, "t_ms", "ref_rad", "enc_rad"),
@@ -58,7 +71,7 @@ class Draft(NamedTuple):
 
 def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     """Plant, controller and habits of one machine; no friction, no limit."""
-    one: dict[str, Any] = dict(zip(_NAMES, _ROWS[kind], strict=True))
+    one: dict[str, Any] = dict(zip(_NAMES, (_ROWS | _FURTHER_ROWS)[kind], strict=True))
     u = rng.uniform
     reported = kind == "belt" and rng.bit_generator.seed_seq.entropy == [1, 0, 0]  # type: ignore[attr-defined]
     motor, ratio = 1e-3 * float(np.exp(u(*np.log(one["inertia"])))), float(u(*one["ratio"]))
@@ -72,6 +85,10 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     least = max(12 * anti * np.sqrt(1 + ratio), 1000 * (kind == "screw"))
     rates = [rate for rate in _RATES_HZ if rate >= least]
     rate, delay = float(rng.choice(rates[:3])), int(rng.random() < 0.5)
+    if kind == "quick":
+        rate = 4000.0
+    if kind == "late":
+        delay = 5
     if reported:
         motor, load, anti, zeta, torque, per_rad, counts = 2e-3, 5e-3, 5.0, 0.0374, 0.6, 1.0, 16384
         columns, rate, delay = ("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), 1000.0, 1
@@ -83,6 +100,8 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
         viscous[0] = 4e-3
     if kind == "play":
         springs[0, 4] = 0.5e-4
+    if kind == "quick":
+        viscous[0] = total / u(5, 20)
     if kind == "link":  # a clamped beam: share of the inertia and frequency of its first three modes
         shares, times = np.array([0.9707, 0.0247, 0.0032]), np.array([1, 6.267, 17.55])
         inertia = np.concatenate([[motor + load * (1 - shares.sum())], load * shares])
@@ -96,9 +115,10 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     waves = {"joint": (1.0, 2 * gear), "belt": (0.3, 12.0)}.get(kind, (0.0, 12.0))
     ripple = np.array([*waves, u(0, TAU)])
     size = inertia.size
+    at_load = kind == "tip" or (kind == "screw" and seed % 2 == 1)
     plant = Plant(
         inertia, viscous, gravity, springs, np.tile([0, 0, 1.0, 0, 0], (size, 1)), ripple, torque,
-        int(kind == "screw" and seed % 2), scale, 1 / rate, delay, TAU * scale / (counts * gear), np.inf,
+        int(at_load), scale, 1 / rate, delay, TAU * scale / (counts * gear), np.inf,
     )  # fmt: skip
     poles = plant.linear(q_operating)[3]
     bandwidth = u(*one["bandwidth"]) * TAU * anti
