@@ -5,7 +5,7 @@ With p = (2/dt)(z - 1)/(z + 1)/scale, on the unit circle p = j (2/dt) tan(omega 
     second order  (n2 p^2 + n1 p + n0)/(p^2 + e^a p + e^b)
     first order   (n1 p + n0)/(p + e^a)
     integrator    (n1 p + n0)/p
-    notch         (p^2 + e^c p + e^b)/(p^2 + e^a p + e^b)
+    a part        PID, notch or low-pass in an engineer's parameters (`parts`)
 
 and the controller is their product. Denominators are searched by their logarithms, so that every parameter
 vector gives a stable controller (but for an integrator). `Cascade` is the structure; its methods read a
@@ -20,16 +20,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from control_design.controllers.parts import Part
 from control_design.plants.ellipses import Complex, Real
 
-SectionKind = Literal["integrator", "first_order", "second_order", "notch"]
+SectionKind = Literal["integrator", "first_order", "second_order"]
+Section = SectionKind | Part
 
 # How many parameters of each kind of section belong to its numerator and to its denominator.
-_NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 1}
-_DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2, "notch": 2}
-
-# Kinds with a pair of poles, whose denominator has the parameters (a, b).
-_PAIR_KINDS = ("second_order", "notch")
+_NUMERATORS: dict[SectionKind, int] = {"integrator": 2, "first_order": 2, "second_order": 3}
+_DENOMINATORS: dict[SectionKind, int] = {"integrator": 0, "first_order": 1, "second_order": 2}
 
 # Relative amount by which a bound on the denominators may be missed before a controller is refused: a
 # thousand times the 1e-6 by which a step of a descent may leave its programme, and no damping ratio is stated
@@ -46,56 +45,104 @@ class Cascade:
 
     Parameters
     ----------
-    sections : tuple of SectionKind
+    sections : tuple of Section
         In the order of the parameter vector and of the signal; without any the controller is 1.
     dt_s : float
         Sampling period in seconds, positive.
     scale_rad_s : float
         Frequency, positive, at which p = j, about that of the controller's corners: parameters are of size
-        one.
+        one. Parts hold what is fixed of them in its units.
 
     Notes
     -----
     Nothing is checked but the length of parameter vectors; a kind that is no `SectionKind` is a KeyError.
     """
 
-    sections: tuple[SectionKind, ...]
+    sections: tuple[Section, ...]
     dt_s: float
     scale_rad_s: float
 
     @property
     def order(self) -> int:
-        """Number of states: two for each section with a pair of poles, one for each other section."""
-        return sum(2 if kind in _PAIR_KINDS else 1 for kind in self.sections)
+        """Number of states: of a section of second order two, of a part its own, of each other section
+        one."""
+        order = 0
+        for section in self.sections:
+            if isinstance(section, Part):
+                order += section.order
+            else:
+                order += 2 if section == "second_order" else 1
+        return order
 
     @property
     def parameters(self) -> int:
         """Length of the parameter vector: section by section the numerator, then logarithms of the
-        denominator."""
-        return sum(_NUMERATORS[kind] + _DENOMINATORS[kind] for kind in self.sections)
+        denominator; of a part what is free."""
+        return sum(_parameters_of(section) for section in self.sections)
 
     @property
-    def pair_positions(self) -> tuple[int, ...]:
-        """Positions in the parameter vector at which (a, b) of each section with a pair of poles starts;
-        () without such a section."""
-        positions = []
-        section_start = 0
-        for kind in self.sections:
-            if kind in _PAIR_KINDS:
-                positions.append(section_start + _NUMERATORS[kind])
-            section_start += _NUMERATORS[kind] + _DENOMINATORS[kind]
-        return tuple(positions)
+    def has_parts(self) -> bool:
+        """Whether the controller is made of parts, whose zeros are not free."""
+        return any(isinstance(section, Part) for section in self.sections)
+
+    def starts(self) -> list[tuple[Section, int]]:
+        """Every section with the place in the parameter vector at which its own parameters start."""
+        places = []
+        start = 0
+        for section in self.sections:
+            places.append((section, start))
+            start += _parameters_of(section)
+        return places
+
+    def damping_rows(self) -> tuple[Real, Real]:
+        """Damping ratios of the pairs of poles that are free, as log zeta = rows x - log factor.
+
+        Returns
+        -------
+        rows : (L, P) array
+            One for each section of second order (a - b/2) and each part whose damping ratio is free.
+        factor : (L,) array
+            2 of a section of second order, zeta = e^a/(2 e^(b/2)), 1 of a part.
+        """
+        rows = []
+        factors = []
+        for section, start in self.starts():
+            row = np.zeros(self.parameters)
+            if isinstance(section, Part):
+                place = section.log_damping()
+                if place is None:
+                    continue
+                row[start + place] = 1.0
+                factors.append(1.0)
+            elif section == "second_order":
+                a = start + _NUMERATORS[section]
+                row[a] = 1.0
+                row[a + 1] = -0.5
+                factors.append(2.0)
+            else:
+                continue
+            rows.append(row)
+        return np.array(rows).reshape(len(rows), self.parameters), np.array(factors)
+
+    def pairs(self, x: Sequence[float] | Real) -> list[tuple[float, float]]:
+        """Damping ratio and corner (units of the scale) of each pair of poles in p, above 1 for two real
+        poles. x (P,): a longer one passes, a shorter one is an IndexError."""
+        values = np.asarray(x, dtype=np.float64)
+        pairs = []
+        for section, start in self.starts():
+            if isinstance(section, Part):
+                pair = section.pair(values[start : start + section.parameters])
+                if pair is not None:
+                    pairs.append(pair)
+            elif section == "second_order":
+                a = values[start + _NUMERATORS[section]]
+                b = values[start + _NUMERATORS[section] + 1]
+                pairs.append((float(0.5 * np.exp(a - 0.5 * b)), float(np.exp(0.5 * b))))
+        return pairs
 
     def least_damping(self, x: Sequence[float] | Real) -> float:
-        """Smallest damping ratio of the pairs of poles in p, e^a/(2 e^(b/2)), above 1 for two real poles;
-        infinite without any. x (P,): a longer one passes, a shorter one is an IndexError."""
-        values = np.asarray(x, dtype=np.float64)
-        ratios = []
-        for position in self.pair_positions:
-            a = values[position]
-            b = values[position + 1]
-            ratios.append(0.5 * np.exp(a - 0.5 * b))
-        return float(min(ratios, default=np.inf))
+        """Smallest damping ratio of `pairs`; infinite without any. x (P,) as there."""
+        return min((damping for damping, _ in self.pairs(x)), default=np.inf)
 
     def split(self, x: Sequence[float] | Real) -> list[tuple[Real, Real]]:
         """Numerator and denominator of every section: coefficients of p, highest power first, of one length.
@@ -116,21 +163,19 @@ class Cascade:
         exp : the exponential of such an element. Nothing is checked; see `split`.
         """
         sections = []
-        section_start = 0
-        for kind in self.sections:
-            logarithms_start = section_start + _NUMERATORS[kind]
-            section_end = logarithms_start + _DENOMINATORS[kind]
-            numerator = [x[i] for i in range(section_start, logarithms_start)]
+        for section, start in self.starts():
+            if isinstance(section, Part):
+                own = [x[i] for i in range(start, start + section.parameters)]
+                sections.append(section.coefficients(own, exp))
+                continue
+            logarithms_start = start + _NUMERATORS[section]
+            section_end = logarithms_start + _DENOMINATORS[section]
+            numerator = [x[i] for i in range(start, logarithms_start)]
             tail = [exp(x[i]) for i in range(logarithms_start, section_end)]
-            # A notch states the logarithm of its numerator's damping term; its frequency is the
-            # denominator's.
-            if kind == "notch":
-                numerator = [1.0, exp(x[section_start]), tail[1]]
             # An integrator has no parameter in its denominator p.
             if not tail:
                 tail = [0.0]
             sections.append((numerator, [1.0, *tail]))
-            section_start = section_end
         return sections
 
     def response(self, x: Sequence[float] | Real, omega_rad_s: Real) -> Complex:
@@ -189,6 +234,13 @@ class Cascade:
         return a, b, c, d
 
 
+def _parameters_of(section: Section) -> int:
+    """Number of parameters of a section; KeyError for a kind that is none."""
+    if isinstance(section, Part):
+        return section.parameters
+    return _NUMERATORS[section] + _DENOMINATORS[section]
+
+
 def tustin_frequency(omega_rad_s: Real, dt_s: float) -> Real:
     """v = (2/dt) tan(omega dt/2) in rad/s, (F,): where omega (F,) in rad/s lies on the imaginary axis of the
     Tustin plane. Some 1e16/dt at Nyquist, by rounding; beyond it the sign turns (not checked)."""
@@ -202,16 +254,18 @@ def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
 
 
 def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real, Real, Real, Real]:
-    """Discrete state space (A, B, C, D) of a section numerator/denominator in p, with one or two states.
+    """Discrete state space (A, B, C, D) of a section numerator/denominator in p, with up to two states.
 
-    numerator, denominator : (2,) or (3,) coefficients, highest power first, the denominator's first one is 1.
+    numerator, denominator : (1,), (2,) or (3,) coefficients, highest power first, the denominator's first one is 1.
     It is a balanced companion form, mapped by the trapezoidal rule with step 2 h. The rule needs (I - h
     F)^-1; for one or two states it is written out, since searches build many loops. The symmetric split
     sqrt(2 h) on input and output keeps both of one size. h : half a sample in units of 1/scale, dt scale/2,
     positive. Coefficients are those of `Cascade.split`: of a denominator of degree two the last one is
-    positive.
+    positive, or 0 of a PID, whose filter's corner then takes the place of w0.
     """
     direct = float(numerator[0])
+    if denominator.size == 1:
+        return np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[direct]])
     # Numerator of what is left beside the direct term.
     tail = [float(value) for value in numerator[1:] - direct * denominator[1:]]
     root = float(np.sqrt(2.0 * h))
@@ -226,8 +280,15 @@ def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real,
         )
     # States (w0 x, x') with w0 = sqrt(e^b): both of one size around the section's own frequency.
     # F = [[0, w0], [-w0, -d]], g = (0, 1)', row = (tail1/w0, tail0).
-    w0 = float(np.sqrt(denominator[2]))
     d = float(denominator[1])
+    if denominator[2] == 0.0:
+        # An integrator and a lag: F = [[0, d], [0, -d]], states (d x, x').
+        inverse_matrix = np.array([[1.0, h * d / (1.0 + h * d)], [0.0, 1.0 / (1.0 + h * d)]])
+        output_row = np.array([[tail[1] / d, tail[0]]]) @ inverse_matrix
+        a = 2.0 * inverse_matrix - np.eye(2)
+        feedthrough = np.array([[direct + h * float(output_row[0, 1])]])
+        return a, root * inverse_matrix[:, 1:], root * output_row, feedthrough
+    w0 = float(np.sqrt(denominator[2]))
     v = h * w0
     determinant_inverse = 1.0 / (1.0 + h * d + v * v)
     inverse_matrix = np.array(

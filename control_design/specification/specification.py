@@ -25,7 +25,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from control_design.controllers.biquads import SOLVER_SLACK, SectionKind
+from control_design.controllers.biquads import SOLVER_SLACK, Cascade, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import PlantChannel, UncertainPlant, count_integrators
@@ -42,6 +42,15 @@ from control_design.specification.requirement import (
     SpecificationItem,
     WeightedRequirement,
     constant_weight,
+)
+from control_design.specification.structure import (
+    PID_STRUCTURES,
+    LowPass,
+    Notch,
+    order_of_structure,
+    parts_of,
+    refuse_contradictions,
+    refuse_sampling,
 )
 from ident.data.settings import Settings
 
@@ -62,6 +71,8 @@ _ZERO_AT_ONE = 1e-6
 _OUTSIDE_CIRCLE = 1.0 + 1e-9
 # Halvings with which the largest possible bandwidth is told: more than a double has digits.
 _HALVINGS = 60
+# Largest order of a controller: room for seven notches beside a PID. Chosen.
+_LARGEST_ORDER = 16
 # Frequencies at which tracking and effort are compared, 0.4 % from one to the next. Chosen; a conflict that
 # is narrower is found later, by the certificate.
 _POINTS_OF_CONFLICT = 4000
@@ -141,16 +152,36 @@ class Specification(Settings):
     rate_limit: _Positive | None = Field(
         default=None, description="largest change of the command, input unit per second"
     )
-    # Chosen: 4 is an integrator, a lead and one notch; 16 leaves room for seven notches.
-    controller_order: Annotated[int, Field(ge=1, le=16)] | Literal["auto"] = Field(
+    # Chosen: 4 is an integrator, a lead and one notch.
+    controller_order: Annotated[int, Field(ge=0, le=_LARGEST_ORDER)] | Literal["auto"] = Field(
         default=4,
         description="number of controller states, with lowest_bandwidth_rad_s at most: fewer where the step "
         "then settles sooner with the identified friction; auto: the lowest within 2 % of what a controller "
-        "of any order reaches",
+        "of any order reaches; of structure p, pi, pd or pid: what their parts have",
     )
-    structure: Literal["biquads", "pi_d_notch"] = Field(
+    structure: Literal["biquads", "p", "pi", "pd", "pid"] = Field(
         default="biquads",
-        description="biquads: free cascade; pi_d_notch: integrator (if set), lead/lag and free notches",
+        description="biquads: free cascade of controller_order; p, pi, pd, pid: Kp (1 + 1/(Ti s) + Td s/(Tf s "
+        "+ 1)) or a part of it, with notches and low_pass; each number given below is fixed, what is left out "
+        "is chosen by the synthesis",
+    )
+    kp: float | None = Field(
+        default=None, allow_inf_nan=False, description="Kp of p, pi, pd, pid, input unit per measured unit"
+    )
+    ti_s: _Positive | None = Field(default=None, description="Ti of pi and pid, s")
+    td_s: _Positive | None = Field(default=None, description="Td of pd and pid, s")
+    tf_s: _Positive | None = Field(
+        default=None, description="Tf of pd and pid, s: filter of the derivative, half a period at least"
+    )
+    notches: tuple[Notch, ...] = Field(
+        default=(),
+        description="notches of p, pi, pd, pid, each with frequency_hz, depth_db and width_hz (or damping), as "
+        "far as they are fixed: [{frequency_hz = 22.9, depth_db = 10}, {}] has a second one that is free",
+    )
+    low_pass: LowPass | None = Field(
+        default=None,
+        description="low-pass of p, pi, pd, pid, with frequency_hz, order and damping, as far as they are "
+        "fixed: {frequency_hz = 200, damping = 0.7}; {}: of order 2, free; none without",
     )
     controller_damping: float | None = Field(
         default=None,
@@ -183,7 +214,11 @@ class Specification(Settings):
 
     @model_validator(mode="after")
     def _consistent(self) -> Specification:
-        """Return self; ValueError, with the keys, for settings that contradict each other."""
+        """Return self; ValueError, with the keys, for settings that contradict each other.
+
+        Integrator and order of a structure p, pi, pd or pid follow from it; they are set here, and stay
+        settings that nobody has stated.
+        """
         # Tracking and effort: in words or as a weight.
         if self.sensitivity_weight is not None and self.bandwidth_rad_s is not None:
             raise ValueError("give bandwidth_rad_s or sensitivity_weight, not both")
@@ -207,34 +242,58 @@ class Specification(Settings):
         if self.mode_damping is not None and self.mode_band_rad_s is None:
             raise ValueError("mode_damping needs mode_band_rad_s: the band whose modes are meant")
         # Orders that the structure can have.
+        refuse_contradictions(self)
         if self.controller_order == "auto":
             if self.structure != "biquads":
                 raise ValueError("controller_order = 'auto' needs structure 'biquads'; give a number")
             return self
-        # A cascade needs one state; lead/lag and notches one beside the integrator.
-        smallest = 1
-        if self.structure == "pi_d_notch" and self.integrator:
-            smallest = 2
-        if self.controller_order < smallest:
-            raise ValueError(
-                f"structure {self.structure!r} needs controller_order of at least {smallest}; got "
-                f"{self.controller_order}"
-            )
-        if self.structure == "pi_d_notch" and (self.controller_order - smallest) % 2:
-            raise ValueError(
-                f"pi_d_notch has order {smallest} plus two per notch; got controller_order "
-                f"{self.controller_order}"
-            )
+        if self.structure in PID_STRUCTURES:
+            self._take_from_structure()
+            return self
+        if self.controller_order < 1:
+            raise ValueError(f"controller_order must be at least 1; got {self.controller_order}")
         return self
 
-    def sections(self) -> tuple[SectionKind, ...]:
-        """Section kinds of the cascade: integrator, sections of first order, sections of second order.
+    def _take_from_structure(self) -> None:
+        """Set integrator and controller_order to those of the structure; ValueError where others are stated
+        or the order is too large."""
+        follows = {
+            "integrator": self.structure in ("pi", "pid"),
+            "controller_order": order_of_structure(self),
+        }
+        if follows["controller_order"] > _LARGEST_ORDER:
+            raise ValueError(
+                f"structure {self.structure!r} with {len(self.notches)} notches has order "
+                f"{follows['controller_order']}; at most {_LARGEST_ORDER}"
+            )
+        for key, value in follows.items():
+            stated = getattr(self, key)
+            if key in self.model_fields_set and stated != value:
+                raise ValueError(
+                    f"{key} = {str(stated).lower()}, but structure {self.structure!r} has "
+                    f"{str(value).lower()} by itself: leave {key} out"
+                )
+            # The class is frozen for its users; this is still its making.
+            self.__dict__[key] = value
+
+    def cascade(self, dt_s: float, scale_rad_s: float) -> Cascade:
+        """Structure of the controller: integrator, sections of first order, sections of second order; or the
+        parts of p, pi, pd and pid.
+
+        Parameters
+        ----------
+        dt_s : float
+            Period of the controller, s.
+        scale_rad_s : float
+            Frequency at which its parameters are of size one, rad/s.
 
         Raises
         ------
         SpecificationError
             controller_order is "auto".
         """
+        if self.structure in PID_STRUCTURES:
+            return Cascade(parts_of(self, dt_s, scale_rad_s), dt_s, scale_rad_s)
         if self.controller_order == "auto":
             raise SpecificationError(
                 "controller_order = 'auto': the synthesis chooses it; give a number here"
@@ -244,15 +303,22 @@ class Specification(Settings):
             kinds.append("integrator")
         n_left = self.controller_order - len(kinds)
         # What order is left goes to sections of second order, which have real or complex poles.
-        if self.structure == "pi_d_notch":
-            n_pairs = (n_left - 1) // 2
-            kinds.append("first_order")
-            kinds += ["notch"] * n_pairs
-        else:
-            n_pairs = n_left // 2
-            kinds += ["first_order"] * (n_left % 2)
-            kinds += ["second_order"] * n_pairs
-        return tuple(kinds)
+        kinds += ["first_order"] * (n_left % 2)
+        kinds += ["second_order"] * (n_left // 2)
+        return Cascade(tuple(kinds), dt_s, scale_rad_s)
+
+    def refuse_sampling(self, dt_s: float) -> None:
+        """Refuse fixed notches, low-pass and Tf that a controller of this period, s, cannot have.
+
+        Raises
+        ------
+        SpecificationError
+            One line with the key and what is possible.
+        """
+        try:
+            refuse_sampling(self, self.controller_dt_s or dt_s)
+        except ValueError as error:
+            raise SpecificationError(str(error)) from None
 
     def tracking_weight(self, plant: UncertainPlant | None = None) -> RationalWeight | None:
         """W1 without the modulus margin; None without a tracking requirement.
@@ -384,6 +450,7 @@ class Specification(Settings):
                 "with one period"
             )
         self.refuse_other_rate(plants)
+        self.refuse_sampling(plants[0].dt_s)
         for plant in plants:
             _refuse_frequencies(self, plant)
             _refuse_zeros(self, plant)

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from control_design.controllers.biquads import Cascade, SectionKind
+from control_design.controllers.parts import Part
 from control_design.plants.ellipses import Real
 from control_design.synthesis.minimax_step import (
     ACCEPTED_SHARE,
@@ -43,7 +44,7 @@ _FAR_BELOW = 2.5
 # A step that gains less than this share of what it promised is corrected to second order: the share below
 # which the box shrinks.
 _CORRECTED_BELOW = 0.25
-# Least logarithms of a section's denominator and a notch's numerator, in units of the scale: e^a is a
+# Least logarithms of a section's denominator, in units of the scale: e^a is a
 # corner or a damping term, e^b a corner squared. Their negatives are the largest. So corners stay within
 # e^12 or e^10 of the scale, four to five decades, and exp() never overflows in a wild step.
 _LEAST_LOG = -12.0
@@ -90,25 +91,28 @@ class MinimaxDescent:
             "integrator": [free, free],
             "first_order": [free, free, _LEAST_LOG],
             "second_order": [free, free, free, _LEAST_LOG, _LEAST_LOG_OF_SQUARE],
-            "notch": [_LEAST_LOG, _LEAST_LOG, _LEAST_LOG_OF_SQUARE],
         }
         low: list[float] = []
-        for kind in cascade.sections:
-            low += least[kind]
+        high: list[float] = []
+        for section in cascade.sections:
+            if isinstance(section, Part):
+                low += [least_value for least_value, _ in section.bounds()]
+                high += [largest_value for _, largest_value in section.bounds()]
+            else:
+                low += least[section]
+                high += [-value for value in least[section]]
         self._low = np.array(low)
-        self._high = -np.array(low)
+        self._high = np.array(high)
 
-        # zeta = exp(a - b / 2) / 2 >= zeta_0 is -a + b / 2 <= -log(2 zeta_0) in the logarithms a and b.
-        pairs: list[int] = []
-        damping_limit = 0.0
+        # log zeta >= log zeta_0 is -row x <= -log(factor zeta_0), linear in the parameters.
+        rows, factors = cascade.damping_rows()
+        if controller_damping is None:
+            rows = rows[:0]
+            factors = factors[:0]
+        self._damping_rows = -rows
+        self._damping_limit = np.zeros(0)
         if controller_damping is not None:
-            pairs = list(cascade.pair_positions)
-            damping_limit = -float(np.log(2 * controller_damping))
-        self._damping_rows = np.zeros((len(pairs), cascade.parameters))
-        for row, position in enumerate(pairs):
-            self._damping_rows[row, position] = -1.0
-            self._damping_rows[row, position + 1] = 0.5
-        self._damping_limit = np.full(len(pairs), damping_limit)
+            self._damping_limit = -np.log(factors * controller_damping)
 
     def value(self, parameters: Real) -> float:
         """Worst case on the grid of the rows.
@@ -269,9 +273,9 @@ def natural_units(cascade: Cascade, x: Real) -> Real:
         Another number of parameters, from `Cascade.split`.
     """
     units: list[float] = []
-    for kind, (numerator, denominator) in zip(cascade.sections, cascade.split(x), strict=True):
-        if kind == "notch":
-            units += [1.0, 1.0, 1.0]
+    for (kind, start), (numerator, denominator) in zip(cascade.starts(), cascade.split(x), strict=True):
+        if isinstance(kind, Part):
+            units += kind.units(np.asarray(x)[start : start + kind.parameters])
             continue
         degree = numerator.size - 1
         # An integrator has no corner of its own: the scale.

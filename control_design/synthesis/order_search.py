@@ -292,7 +292,7 @@ class OrderSearch:
         """Parameters (n,) of a stable fit of each free controller that has one, if with less gain.
 
         weighted: errors are weighted over frequency at random, else all relative errors alike. No fit for a
-        cascade with notches.
+        cascade of parts.
         """
         # Clear of the bound on the controller's damping by 1 %: a start on it has no room to move.
         asked_damping = self.spec.controller_damping or 0.0
@@ -474,7 +474,7 @@ class OrderSearch:
     def _retreat(self, parameters: Real) -> Real | None:
         """Parameters (n,) with as little less gain as makes them stable on the lean grids.
 
-        None where `_RETREATS` steps do not, as of unstable plants, and of a notch first, whose gain does not
+        None where `_RETREATS` steps do not, as of unstable plants, and of a Kp that is fixed, so that the gain does not
         change.
         """
         for number in range(1, _RETREATS + 1):

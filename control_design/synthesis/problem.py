@@ -92,6 +92,14 @@ class Problem(Grids):
         most_of_plants = max(plant.n_integrators for plant in self.plants)
         return most_of_plants + int(self.spec.integrator)
 
+    def cascade(self, order: int | None = None) -> Cascade:
+        """Structure of the controller that is asked for, or of another order of it; SpecificationError for an
+        order "auto" without a number."""
+        spec = self.spec
+        if order is not None:
+            spec = spec.model_copy(update={"controller_order": order})
+        return spec.cascade(self.dt_s, self.scale_rad_s)
+
     @property
     def asks_tracking(self) -> bool:
         """Whether the specification weighs S at low frequency, by a bandwidth or a weight of its own."""

@@ -26,7 +26,7 @@ import casadi as ca
 import numba
 import numpy as np
 
-from control_design.controllers.biquads import Cascade, SectionKind, tustin_frequency
+from control_design.controllers.biquads import Cascade, Section, tustin_frequency
 from control_design.plants.ellipses import Complex, Ellipses, Integer, Real
 from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import COMPILED, INSIDE
@@ -68,13 +68,13 @@ class Rows:
 
 
 @lru_cache(maxsize=64)
-def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
+def row_functions(sections: tuple[Section, ...]) -> tuple[Any, Any, Any]:
     """CasADi functions of one row for controllers of one structure.
 
     Parameters
     ----------
-    sections : tuple of SectionKind
-        At least one, else n = 0. Kept for the 64 structures used last, as building takes longer than a
+    sections : tuple of Section
+        With a free parameter, else n = 0. Kept for the 64 structures used last, as building takes longer than a
         descent step.
 
     Returns
@@ -154,8 +154,10 @@ def row_functions(sections: tuple[SectionKind, ...]) -> tuple[Any, Any, Any]:
 def _polynomial(coefficients: list[Any], far: Any, near: Any) -> tuple[Any, Any]:
     """Real and imaginary part of a section's polynomial in p = j far / near, times near^degree.
 
-    coefficients: two or three numbers or symbols, highest power first; another count is not a section's.
+    coefficients: one to three numbers or symbols, highest power first; another count is not a section's.
     """
+    if len(coefficients) == 1:
+        return coefficients[0], 0.0
     *highest, linear, constant = coefficients
     if not highest:
         return constant * near, linear * far

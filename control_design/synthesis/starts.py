@@ -1,9 +1,10 @@
 """Starts of the search for a controller of fixed structure: where a descent to a local minimum begins.
 
 A descent ends in the valley where it began, so the search needs several starts of different kinds, each
-already close to what is asked. `StartMaker` draws parameter vectors of one `Cascade` in three ways.
+already close to what is asked. `StartMaker` draws parameter vectors of one `Cascade` in four ways.
 
-`shaped` wishes for a loop gain L = G K where the specification speaks: large and positive real at the peak of
+`drawn` serves controllers made of parts (PID, notches, low-pass): corners around the crossover, notches at the
+plant's modes, of many draws the best. `shaped` wishes for a loop gain L = G K where the specification speaks: large and positive real at the peak of
 a mode that is to be damped (1 + L = peak over allowed peak, so that L points away from -1), falling like an
 integrator where tracking is asked, small elsewhere. Poles are drawn at random, and the numerator that comes
 nearest to the wishes is linear least squares. `low_gain` draws all sections at random and lowers the gain
@@ -23,7 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from control_design.analysis.worst_case import PlantData
-from control_design.controllers.biquads import Cascade, SectionKind, tustin_frequency
+from control_design.controllers.biquads import Cascade, Section, tustin_frequency
+from control_design.controllers.parts import LowPassPart, NotchPart, Part, PidPart
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.frequency_grid import local_maxima
 from control_design.specification.requirement import LoopFunction
@@ -114,9 +116,26 @@ _LEAD_JITTER = 0.1
 # Zero of the PI section over the crossover: it costs 3 degrees of phase there. Halved or doubled: 7.4 and
 # 8.0, 7.5 and 2.0.
 _PI_ZERO = 0.05
-# Damping term of the numerator of an idle notch over its corner; its denominator has 2: nearly no notch, but
-# not none, so that the slopes of a descent do not vanish. Chosen.
-_IDLE_NOTCH = 1.8
+# Starts of parts. All are ranges of draws, chosen wide, as the best of many draws is taken; what they are
+# worth is seen in the worst cases of `benchmarks.engineers_structures`.
+
+# Crossover of a draw over the highest frequency at which tracking is asked, else over the scale.
+_PART_CROSSOVER_DECADES = (-0.7, 0.3)
+# Ti, Td and Tf over 1/crossover, as powers of ten: textbook values are 3 to 10, .3 to 2 and .03 to .2.
+_TI_DECADES = (0.0, 1.5)
+_TD_DECADES = (-0.8, 0.5)
+_TF_DECADES = (-1.5, -0.3)
+# Frequency of a notch around the mode that it is drawn for, natural logarithm, standard deviation: the
+# shifted notch of phase stabilisation is tried as well.
+_NOTCH_OFFSET = 0.15
+# Share of free notches that are drawn anywhere, not at a mode.
+_NOTCH_ANYWHERE = 0.25
+# Damping ratio of a notch's poles, and its depth, as powers of ten.
+_NOTCH_DAMPING_DECADES = (-0.9, -0.05)
+_NOTCH_DEPTH_DECADES = (0.1, 1.5)
+# Corner of a low-pass over the crossover, as powers of ten: below three times the crossover its phase is
+# missing there.
+_LOW_PASS_DECADES = (0.5, 1.5)
 
 # Starts for unstable plants. Halved or doubled, the numbers up to `_UNSTABLE_GAIN_DECADES` move the best
 # worst case of three starts by at most 10 %, in either direction, on four plants of the tests; those behind
@@ -236,11 +255,13 @@ class StartMaker:
         Returns
         -------
         list of (parameters (n,), score)
-            Empty where no draw is stable or nothing is wished for; also for structures with notches, whose
-            zeros are not free, and for two integrators or more in the loop: least squares does not see
-            stability, and seldom finds the lead that they need.
+            Empty where no draw is stable or nothing is wished for, and for two integrators or more in the
+            loop: least squares does not see stability, and seldom finds the lead that they need. Of parts,
+            whose zeros are not free, the draws are those of `drawn`.
         """
-        if "notch" in self.cascade.sections or self.integrators >= 2:
+        if self.cascade.has_parts:
+            return self.drawn(draws, most)
+        if self.integrators >= 2:
             return []
         pool: list[tuple[Real, float]] = []
         for _ in range(draws):
@@ -400,6 +421,91 @@ class StartMaker:
         high = _HIGHEST_CORNER_RATIO * warped_highest / self.cascade.scale_rad_s
         return low, high
 
+    # Parts
+
+    def drawn(self, draws: int, most: int) -> list[tuple[Real, float]]:
+        """Stable loops of a cascade of parts that differ, the best first, each at the best of a few gains.
+
+        Parameters
+        ----------
+        draws : int
+            Vectors that are drawn.
+        most : int
+            Loops that are returned at most; at least 1 (not checked).
+
+        Returns
+        -------
+        list of (parameters (n,), score)
+            Empty where no draw is stable.
+        """
+        pool: list[tuple[Real, float]] = []
+        for _ in range(draws):
+            crossover = self._tracked_rad_s() * 10 ** self.rng.uniform(*_PART_CROSSOVER_DECADES)
+            parameters = self._parts(crossover / self.cascade.scale_rad_s)
+            gain = self._crossover_gain(parameters, crossover)
+            # Damping without tracking knows no sign: half of the draws turn it.
+            if not self.keeps_sign and self.rng.uniform() >= 0.5:
+                gain *= -1.0
+            parameters = with_gain(self.cascade, parameters, gain)
+            gamma = self.score(parameters)
+            if not np.isfinite(gamma):
+                parameters = with_gain(self.cascade, parameters, _RETRY_GAIN)
+                gamma = self.score(parameters)
+            if np.isfinite(gamma):
+                pool.append((parameters, gamma))
+        pool.sort(key=lambda entry: entry[1])
+        return self._different(pool, most)
+
+    def _tracked_rad_s(self) -> float:
+        """Highest frequency, rad/s, at which the first plant's weight asks |S| < 1; the scale without any."""
+        tracked = self.data[0].ellipses.omega_rad_s[self.data[0].sensitivity > 1.0]
+        if not tracked.size:
+            return self.cascade.scale_rad_s
+        return float(tracked[-1])
+
+    def _parts(self, crossover: float) -> Real:
+        """Parameters (n,) of parts around a crossover (units of the scale, positive), with a gain of 1.
+
+        Times and corners are drawn around it, notches at the lightly damped modes of the plants. All are
+        within the bounds of the parts.
+        """
+        modes = [mode.omega_rad_s for data in self.data for mode in data.plant.modes]
+        corners = tustin_frequency(np.array(modes), self.cascade.dt_s) / self.cascade.scale_rad_s
+        log_crossover = np.log(crossover)
+        x: list[float] = []
+        for part in self.cascade.sections:
+            assert isinstance(part, Part)
+            own: list[float] = []
+            if isinstance(part, PidPart):
+                if part.kp is None:
+                    own.append(1.0)
+                if part.has_integral and part.ti is None:
+                    own.append(np.log(10 ** self.rng.uniform(*_TI_DECADES)) - log_crossover)
+                if part.has_derivative and part.td is None:
+                    own.append(np.log(10 ** self.rng.uniform(*_TD_DECADES)) - log_crossover)
+                if part.has_derivative and part.tf is None:
+                    own.append(np.log(10 ** self.rng.uniform(*_TF_DECADES)) - log_crossover)
+            elif isinstance(part, NotchPart):
+                if part.corner is None:
+                    at_mode = corners.size > 0 and self.rng.uniform() >= _NOTCH_ANYWHERE
+                    middle = np.log(crossover * 10 ** self.rng.uniform(*_LOW_PASS_DECADES))
+                    if at_mode:
+                        middle = np.log(corners[self.rng.integers(corners.size)])
+                    own.append(middle + _NOTCH_OFFSET * self.rng.standard_normal())
+                if part.log_damping() is not None:
+                    drawn_damping = 10 ** self.rng.uniform(*_NOTCH_DAMPING_DECADES)
+                    own.append(np.log(max(drawn_damping, self.least_damping * _CLEAR_OF_BOUND)))
+                if part.depth is None:
+                    own.append(np.log(10 ** self.rng.uniform(*_NOTCH_DEPTH_DECADES)))
+            elif isinstance(part, LowPassPart):
+                if part.corner is None:
+                    own.append(log_crossover + np.log(10 ** self.rng.uniform(*_LOW_PASS_DECADES)))
+                if part.log_damping() is not None:
+                    own.append(np.log(max(np.sqrt(0.5), self.least_damping * _CLEAR_OF_BOUND)))
+            for value, (low, high) in zip(own, part.bounds(), strict=True):
+                x.append(float(np.clip(value, low, high)))
+        return np.array(x)
+
     # Random starts
 
     def low_gain(self) -> Real:
@@ -495,7 +601,7 @@ class StartMaker:
         """Parameters (n,) of one draw with its crossover near the unstable poles, and a gain of either sign.
 
         Kinds of draws: a slow lag (only where tracking is asked without an integrator), leads, and random
-        sections (not for notches). Only called where some plant is unstable: without an unstable pole the
+        sections; parts around that crossover. Only called where some plant is unstable: without an unstable pole the
         crossover would be 0 rad/s.
         """
         fastest_logs = []
@@ -509,10 +615,13 @@ class StartMaker:
         crossover = min(crossover, _UNSTABLE_CROSSOVER_OF_NYQUIST * self.data[0].plant.nyquist_rad_s)
 
         kind = self.rng.uniform()
-        lacks_integrator = self.tracks and "integrator" not in self.cascade.sections
+        has_free_poles = not (self.cascade.has_parts or "integrator" in self.cascade.sections)
+        lacks_integrator = self.tracks and has_free_poles
         if lacks_integrator and kind < _SLOW_LAG_SHARE:
             parameters = self._slow_lag_sections(crossover / self.cascade.scale_rad_s)
-        elif "notch" in self.cascade.sections or kind < _LEAD_SHARE:
+        elif self.cascade.has_parts:
+            parameters = self._parts(crossover / self.cascade.scale_rad_s)
+        elif kind < _LEAD_SHARE:
             parameters = self._lead_sections(crossover / self.cascade.scale_rad_s)
         else:
             parameters = self._random_sections()
@@ -524,8 +633,7 @@ class StartMaker:
         """Parameters (n,) of lead sections around a crossover, of which one is a slow lag instead.
 
         Its slow real pole stands in for an integrator, which tracking without one needs. crossover: in units
-        of the scale, positive. The lag is the first section of second order, else the first of first order; a
-        cascade of notches alone keeps its leads.
+        of the scale, positive. The lag is the first section of second order, else the first of first order.
         """
         x = self._lead_sections(crossover)
         slow_pole = crossover * 10 ** self.rng.uniform(*_SLOW_POLE_DECADES)
@@ -546,9 +654,11 @@ class StartMaker:
     def _random_sections(self) -> Real:
         """Parameters (n,) of sections with corners around the scale and numerators near their denominators.
 
-        Gains are about one. Parameters of a section: numerator coefficients (of a notch the logarithm of its
-        damping term), then logarithms of the denominator's, as `biquads` has them. No cascade is refused.
+        Gains are about one. Parameters of a section: numerator coefficients, then logarithms of the
+        denominator's, as `biquads` has them. Parts are drawn around a random crossover below the scale.
         """
+        if self.cascade.has_parts:
+            return self._parts(10 ** self.rng.uniform(*_LOW_CROSSOVER_DECADES))
         x: list[float] = []
         for kind in self.cascade.sections:
             corner = 10 ** self.rng.uniform(*_CORNER_DECADES)
@@ -560,11 +670,6 @@ class StartMaker:
                 x += [jitter[0], _INTEGRAL_SHARE * corner * abs(jitter[1])]
             elif kind == "first_order":
                 x += [jitter[0], corner * abs(jitter[1]), np.log(corner)]
-            elif kind == "notch":
-                # First the numerator's damping term, then the denominator's, of damping ratio 1: a wide
-                # notch.
-                damping_term = np.log(2 * damping * corner)
-                x += [damping_term, np.log(2 * corner), 2 * np.log(corner)]
             else:
                 numerator = np.array([1.0, 2 * damping * corner, corner**2]) * jitter
                 x += [*numerator, np.log(2 * damping * corner), 2 * np.log(corner)]
@@ -575,8 +680,10 @@ class StartMaker:
 
         crossover: in units of the scale, positive (its logarithm is taken). The first section that can be the
         lead is: zero at `_LEAD_ZERO` of the crossover, poles at `_LEAD_POLES` times it; of second order with
-        two poles and one zero. A cascade of notches alone gets none.
+        two poles and one zero. Parts are drawn around the crossover instead.
         """
+        if self.cascade.has_parts:
+            return self._parts(crossover)
         x: list[float] = []
         lead_is_missing = True
         zero = _LEAD_ZERO * crossover
@@ -591,8 +698,6 @@ class StartMaker:
                 lead_is_missing = False
             elif kind == "first_order":
                 x += [1.0, corner * jitter[0], np.log(corner)]
-            elif kind == "notch":
-                x += [np.log(_IDLE_NOTCH * corner), np.log(2 * corner), 2 * np.log(corner)]
             elif lead_is_missing:
                 numerator = [0.0, pole * jitter[0], pole * zero * jitter[1]]
                 x += [*numerator, np.log(2 * pole), 2 * np.log(pole)]
@@ -650,18 +755,22 @@ def with_gain(cascade: Cascade, parameters: Real, factor: float) -> Real:
     ----------
     cascade : Cascade
     parameters : ndarray, shape (n,)
-        The first section's numerator carries the gain.
+        The first section's numerator carries the gain, of parts Kp.
     factor : float
         Of either sign.
 
     Returns
     -------
     ndarray, shape (n,)
-        A copy; unchanged where the first section is a notch, which has no gain of its own. The length is not
-        checked; a cascade without sections is an IndexError.
+        A copy; unchanged where Kp is fixed. The length is not checked; a cascade without sections is an
+        IndexError.
     """
-    numerator_sizes = {"integrator": 2, "first_order": 2, "second_order": 3, "notch": 0}
-    numerator_size = numerator_sizes[cascade.sections[0]]
+    first = cascade.sections[0]
+    if isinstance(first, Part):
+        has_gain = isinstance(first, PidPart) and first.kp is None
+        numerator_size = int(has_gain)
+    else:
+        numerator_size = {"integrator": 2, "first_order": 2, "second_order": 3}[first]
     scaled = np.array(parameters)
     scaled[:numerator_size] *= factor
     return scaled
@@ -679,7 +788,7 @@ def with_cancelling_section(
     parameters : ndarray, shape (n,)
         Of the controller.
     higher : Cascade
-        The sections of `lower`, and one of kind "second_order" or "notch" at the end.
+        The sections of `lower`, and one of kind "second_order" or a free notch at the end.
     rng : numpy.random.Generator
         Draws the corner of the new section, within a factor 5 of the scale.
     damping : float
@@ -697,24 +806,26 @@ def with_cancelling_section(
     ValueError
         `higher` is not `lower` with one such section more.
     """
-    added_kind = higher.sections[-1]
-    if higher.sections[:-1] != lower.sections or added_kind not in ("second_order", "notch"):
+    added = higher.sections[-1]
+    is_free_notch = isinstance(added, NotchPart) and added.is_free
+    if higher.sections[:-1] != lower.sections or not (added == "second_order" or is_free_notch):
         raise ValueError(f"{higher.sections} is not {lower.sections} with one section of order two more")
     corner = 10 ** rng.uniform(*_CORNER_DECADES)
+    if is_free_notch:
+        # Logarithms of corner, damping ratio and depth, which is 1.
+        return np.concatenate([parameters, [np.log(corner), np.log(damping), 0.0]])
     poles = [np.log(2 * damping * corner), 2 * np.log(corner)]
-    zeros = [poles[0]] if added_kind == "notch" else [1.0, 2 * damping * corner, corner**2]
+    zeros = [1.0, 2 * damping * corner, corner**2]
     return np.concatenate([parameters, zeros, poles])
 
 
-def in_sections(
-    sections: Sequence[SectionKind], numerator: Real, denominators: Sequence[Real]
-) -> Real | None:
+def in_sections(sections: Sequence[Section], numerator: Real, denominators: Sequence[Real]) -> Real | None:
     """Parameters of a cascade with a given numerator over the product of given denominators.
 
     Parameters
     ----------
-    sections : sequence of SectionKind
-        No notch, whose numerator is not free (not checked).
+    sections : sequence of Section
+        No part, whose numerator is not free (not checked).
     numerator : ndarray, shape (order + 1,)
         Coefficients in p, highest power first.
     denominators : sequence of ndarray

@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from control_design.analysis.limited_loop import limited_loops, with_safe_limits
-from control_design.controllers.biquads import Cascade, SectionKind
+from control_design.controllers.biquads import Cascade, Section
 from control_design.controllers.controller import Controller
+from control_design.controllers.parts import NotchPart
 from control_design.convex.convex_options import YoulaOptions
 from control_design.plants.ellipses import Real, scale_to_minus_one
 from control_design.plants.frequency_grid import local_maxima
@@ -138,7 +139,11 @@ def synthesise(
         return replace(result, plants=problem.plants, specification=asked)
 
     # First search: fits of the Youla bound's controllers.
-    cascade = Cascade(specification.sections(), problem.dt_s, problem.scale_rad_s)
+    cascade = problem.cascade()
+    if not cascade.parameters:
+        order_result = _as_fixed(problem, cascade)
+        result = _result(problem, cascade, order_result, (), tell)
+        return replace(result, plants=problem.plants, specification=asked)
     first_grids = list(problem.grids)
     fits_rng = np.random.default_rng([seed, 0])
     search = OrderSearch(problem, cascade, fits_rng, part_of(tell, 0, 2))
@@ -150,7 +155,7 @@ def synthesise(
         # What the fits violated may be of no concern to other starts.
         problem.grids[:] = first_grids
         lowest = _LOWEST_TRACKING_ORDER if problem.asks_tracking else _LOWEST_ORDER
-        ladder = _ladder(specification.sections(), lowest)
+        ladder = _ladder(cascade.sections, lowest)
         climbed = _climbed(problem, ladder, seed, order_result.best, part_of(tell, 1, 2), reports)
         if _is_better(climbed.best, order_result.best):
             order_result = climbed
@@ -202,8 +207,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
 
     def gamma(order: int) -> float:
         """Worst case that fits of one order lead to, inf for nothing stable; the order joins those tried."""
-        sections = specification.model_copy(update={"controller_order": order}).sections()
-        cascade = Cascade(sections, problem.dt_s, problem.scale_rad_s)
+        cascade = problem.cascade(order)
         part = part_of(tell, len(tried_orders), _HIGHEST_AUTO_ORDER, f"order {order}: ")
         part(0.0, "fits of the bound")
         order_rng = np.random.default_rng([root, order])
@@ -211,7 +215,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
         if order - 2 in tried_orders:
             lower_best = tried_orders[order - 2].result.best
             if lower_best is not None:
-                lower = replace(cascade, sections=sections[:-1])
+                lower = replace(cascade, sections=cascade.sections[:-1])
                 known_starts = _embedded(problem, lower, lower_best, cascade, order_rng)
         search = OrderSearch(problem, cascade, order_rng, part, known_starts)
         result = search.fits_only(free)
@@ -287,7 +291,7 @@ def synthesise_near(
     -------
     SynthesisResult
         Without `plants` and `specification`. Not converged, without a blocking point, where the fit leads to
-        nothing stable, as of notches, which are not fitted.
+        nothing stable, as of parts, which are not fitted.
 
     Raises
     ------
@@ -299,13 +303,22 @@ def synthesise_near(
     specification.check_against(plants)
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), _seen_by_the_data(specification, plants), options or SynthesisOptions())
-    cascade = Cascade(problem.spec.sections(), problem.dt_s, problem.scale_rad_s)
+    cascade = problem.cascade()
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
     # No bound is known: nothing counts as near to it.
     free = FreeControllers((known,), np.inf)
     result = OrderSearch(problem, cascade, rng, tell).fits_only(free)
     return _result(problem, cascade, result, result.reports, tell)
+
+
+def _as_fixed(problem: Problem, cascade: Cascade) -> OrderResult:
+    """Result for a controller of which every parameter is fixed: it is checked, not searched for."""
+    x = np.zeros(0)
+    gamma = problem.gamma(cascade, x)
+    if not np.isfinite(gamma):
+        return OrderResult(None, (), (), x)
+    return OrderResult(TriedController(x, gamma, gamma), (), (gamma,))
 
 
 def _result(
@@ -337,7 +350,7 @@ def _result(
 
 def _climbed(
     problem: Problem,
-    ladder: Sequence[tuple[SectionKind, ...]],
+    ladder: Sequence[tuple[Section, ...]],
     root: int,
     fitted: TriedController | None,
     tell: Progress,
@@ -400,14 +413,18 @@ def _seen_by_the_data(specification: Specification, plants: Sequence[UncertainPl
     return specification.model_copy(update={"controller_damping": min(widest_spacing / 2, _MOST_DAMPING)})
 
 
-def _ladder(sections: tuple[SectionKind, ...], lowest: int) -> list[tuple[SectionKind, ...]]:
+def _ladder(sections: tuple[Section, ...], lowest: int) -> list[tuple[Section, ...]]:
     """Section lists from the lowest order (at least `lowest`) to the asked one, one section more each.
 
-    Sections of second order and notches stand last and are left out from the end; the asked list is always
-    among them, also where its order is below `lowest`.
+    Sections of second order and free notches stand last and are left out from the end; the asked list is
+    always among them, also where its order is below `lowest`.
     """
     rungs = [sections]
-    while rungs[0][-1] in ("second_order", "notch"):
+    while True:
+        last = rungs[0][-1]
+        is_free_notch = isinstance(last, NotchPart) and last.is_free
+        if not (last == "second_order" or is_free_notch):
+            break
         shorter = rungs[0][:-1]
         if Cascade(shorter, 1.0, 1.0).order < lowest:
             break
@@ -563,8 +580,6 @@ def _ringing(problem: Problem, cascade: Cascade, parameters: Real) -> list[Block
     least = cascade.least_damping(parameters)
     if asked is None or not least < asked:
         return []
-    # Logarithms of a pair's denominator p^2 + e^a p + e^b: damping ratio e^(a - b/2) / 2, corner e^(b/2).
-    dampings = [(parameters[at] - 0.5 * parameters[at + 1], at) for at in cascade.pair_positions]
-    _, least_damped = min(dampings)
-    corner = float(np.exp(0.5 * parameters[least_damped + 1])) * cascade.scale_rad_s
+    _, least_damped = min(cascade.pairs(parameters))
+    corner = least_damped * cascade.scale_rad_s
     return [BlockingPoint("controller", DAMPING, corner, asked / least)]

@@ -156,7 +156,7 @@ def fitted(
     Returns
     -------
     ndarray, shape (parameters,), or None
-        None for structures with notches, whose zeros are not free, or a fit that degenerates: a relocation
+        None for structures with parts, whose zeros are not free, or a fit that degenerates: a relocation
         that does not converge, or a numerator that vanishes. Poles are stable; the loop need not be.
 
     Raises
@@ -164,7 +164,7 @@ def fitted(
     numpy.linalg.LinAlgError
         The numerator's least squares do not converge; a response that is not finite gives this or None.
     """
-    if "notch" in cascade.sections:
+    if cascade.has_parts:
         return None
     weight = 1.0 / np.maximum(np.abs(free.k), _TINY)
     log_omega = np.log(free.omega_rad_s)

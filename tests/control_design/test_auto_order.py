@@ -96,9 +96,9 @@ def test_other_words_and_numbers_are_refused(order):
 
 def test_what_has_no_auto_says_so():
     with pytest.raises(ValueError, match="biquads"):
-        Specification(controller_order="auto", structure="pi_d_notch")
+        Specification(controller_order="auto", structure="pid")
     with pytest.raises(SpecificationError, match="give a number"):
-        auto(WISH).sections()
+        auto(WISH).cascade(0.01, 1.0)
 
 
 @cache

@@ -6,13 +6,24 @@ import pytest
 from scipy.signal import bilinear
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
+from control_design.controllers.parts import LowPassPart, NotchPart, PidPart
 from control_design.synthesis.rows import row_functions
 
 _SECTIONS = [
     ("second_order",),
     ("first_order", "second_order"),
     ("integrator", "first_order", "second_order"),
-    ("integrator", "first_order", "notch", "notch"),
+    *(
+        (PidPart(structure, None, None, None, None, 0.035), NotchPart(None, None, None, None, 0.035))
+        for structure in ("p", "pi", "pd", "pid")
+    ),
+    (
+        PidPart("pid", 2.0, 3.0, 0.2, None, 0.035),
+        LowPassPart(1, 5.0, None, 0.035),
+        LowPassPart(2, None, None, 0.035),
+        NotchPart(2.0, 0.4, None, 3.0, 0.035),
+        NotchPart(None, None, 0.1, None, 0.035),
+    ),
 ]
 
 
@@ -35,7 +46,9 @@ def test_cascade_is_the_bilinear_transform_of_its_sections(sections):
     np.testing.assert_allclose(control.evalfr(system, z[1]), expected[1], rtol=1e-8)
     radius = np.abs(system.poles())
     assert np.all(radius <= 1)
-    assert np.sum(radius == 1) == sections.count("integrator")
+    pids = [section for section in sections if isinstance(section, PidPart)]
+    integrators = sections.count("integrator") + sum(pid.has_integral for pid in pids)
+    assert np.sum(radius == 1) == integrators
 
 
 def test_response_at_nyquist_is_the_limit():

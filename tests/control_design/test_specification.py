@@ -91,7 +91,7 @@ def test_integrator_against_a_zero_at_one_and_damping_without_mode():
         {"effort_rolloff_rad_s": 10.0},
         {"mode_band_rad_s": (2.0, 1.0), "mode_peak_ratio": 0.5},
         {"mode_band_rad_s": (1.0, 2.0)},
-        {"structure": "pi_d_notch", "controller_order": 5, "integrator": True},
+        {"structure": "pid", "controller_order": 5},
         {"unknown": 1},
         {
             "bandwidth_rad_s": 1.0,

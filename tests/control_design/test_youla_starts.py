@@ -5,6 +5,7 @@ import pytest
 
 from control_design import synthesise
 from control_design.controllers.biquads import Cascade
+from control_design.controllers.parts import NotchPart
 from control_design.synthesis.youla_starts import FreeController, fitted, free_controllers
 from validation.example_plants import flexible_link, flexible_link_specification
 
@@ -40,7 +41,8 @@ def test_fits_are_damped_as_asked_and_not_made_of_notches():
     k = resonance.response([0.0, 0.0, 1.0, np.log(2 * 0.01), 0.0], _OMEGA)
     found = fitted(resonance, FreeController(_OMEGA, k), least_damping=0.3)
     assert resonance.least_damping(found) >= 0.3 * (1 - 1e-9)
-    assert fitted(Cascade(("notch",), 0.005, 15.0), FreeController(_OMEGA, k), least_damping=0.3) is None
+    parts = Cascade((NotchPart(None, None, None, None, 0.04),), 0.005, 15.0)
+    assert fitted(parts, FreeController(_OMEGA, k), least_damping=0.3) is None
 
 
 @pytest.mark.parametrize(

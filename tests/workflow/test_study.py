@@ -205,17 +205,20 @@ values = [60.0]
 key = "specification.effort_limit"
 values = [60.0, 1e-6]
 [[axes]]
+key = "specification.controller_order"
+values = [4]
+[[axes]]
 key = "specification.structure"
-values = ["biquads", "pi_d_notch"]
+values = ["biquads", "pid"]
 """
     )
     out = tmp_path / "out"
     summary = run_study(load_study(write_study(tmp_path, text)), out, jobs=2)
     states = [point["state"] for point in summary.numbers["points"]]
-    # pi_d_notch of order 2 does not exist; a limit of nothing cannot be met.
+    # The order is stated, and a PID has its own; a limit of nothing cannot be met.
     assert states[1] == states[3] == "impossible"
     assert states[2] in ("impossible", "not certified")
-    assert "pi_d_notch has order 1 plus two per notch" in summary.numbers["points"][1]["why"]
+    assert "leave controller_order out" in summary.numbers["points"][1]["why"]
 
 
 def test_points_that_fail_are_named_and_the_others_stand(flexlink, tmp_path):

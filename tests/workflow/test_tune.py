@@ -472,7 +472,7 @@ def test_controls_are_made_of_the_specification(session):
     assert known["controller_order"]["kind"] == "count"
     assert known["controller_order"]["le"] == 16
     assert known["effort_limit"]["optional"]
-    assert known["structure"]["choices"] == ["biquads", "pi_d_notch"]
+    assert known["structure"]["choices"] == ["biquads", "p", "pi", "pd", "pid"]
     assert known["integrator"]["kind"] == "switch"
     assert known["controller_order"]["unasked"] == "auto"
     assert not {"mode_band_rad_s", "confidence"} & known.keys()  # of pairs, and of stated discs
