@@ -20,7 +20,7 @@ import numpy as np
 from control_design.analysis.between_grid_points import AllFrequencies, Obstacle, bound_all_frequencies
 from control_design.analysis.joint_coverage import JointCoverage, at_level, joint_coverage as calibrate
 from control_design.analysis.limited_loop import ERROR_LEFT, LimitedLoop, limited_loops
-from control_design.analysis.margins import Margins, ellipse_margins, nominal_margins
+from control_design.analysis.margins import Crossovers, Margins, ellipse_margins, nominal_loop
 from control_design.analysis.stability import (
     ModeChange,
     NyquistCount,
@@ -102,6 +102,9 @@ class PlantVerdict:
         The damping requirement looks at a channel of its own, any pair of members allowed.
     all_frequencies : AllFrequencies
         What was proved between the grid points.
+    crossovers : Crossovers or None
+        Every gain and phase crossover of the centre; none where the loop is not stable, None in a file of an
+        earlier version.
     """
 
     plant: str
@@ -122,6 +125,7 @@ class PlantVerdict:
     stated: bool
     own_performance: bool
     all_frequencies: AllFrequencies
+    crossovers: Crossovers | None = field(default=None, metadata={"since": 10})
 
 
 @dataclass(frozen=True)
@@ -380,12 +384,14 @@ class LoopMargins(NamedTuple):
     """Margins of one uncertain loop.
 
     nominal: of the centres. worst: smallest over all members of the ellipses; both with gains as factors,
-    phase in rad, delay in s. bandwidth_rad_s: up to here every member has |S| below -3 dB, rad/s.
+    phase in rad, delay in s. bandwidth_rad_s: up to here every member has |S| below -3 dB, rad/s. crossovers: all of
+    the centres.
     """
 
     nominal: Margins
     worst: Margins
     bandwidth_rad_s: float
+    crossovers: Crossovers
 
 
 def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase) -> LoopMargins:
@@ -429,7 +435,9 @@ def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase
     at_zero = None
     if not integrators:
         at_zero = float(loop_gain(np.zeros(1))[0].real)
-    nominal = nominal_margins(loop_gain, worst.omega_rad_s, refinable=is_known_between, at_zero=at_zero)
+    nominal, crossovers = nominal_loop(
+        loop_gain, worst.omega_rad_s, refinable=is_known_between, at_zero=at_zero
+    )
     distance = worst.values["distance"]
     over_ellipses = ellipse_margins(
         worst.loop_factor,
@@ -444,7 +452,7 @@ def loop_margins(controller: Controller, plant: UncertainPlant, worst: WorstCase
     bandwidth_rad_s = 0.0
     if exceeds.size and exceeds[0] > 0:
         bandwidth_rad_s = float(worst.omega_rad_s[exceeds[0] - 1])
-    return LoopMargins(nominal, over_ellipses.worse(nominal), bandwidth_rad_s)
+    return LoopMargins(nominal, over_ellipses.worse(nominal), bandwidth_rad_s, crossovers)
 
 
 def _check_plant(
@@ -534,7 +542,7 @@ def _check_plant(
     # |1 + K G| says nothing of a loop that is not stable.
     if not is_stable:
         no_margins = Margins(*[np.nan] * len(fields(Margins)))
-        margins = LoopMargins(no_margins, no_margins, np.nan)
+        margins = LoopMargins(no_margins, no_margins, np.nan, Crossovers((), ()))
         peaks = dict.fromkeys(peaks, (np.nan, None))
     verdict = PlantVerdict(
         plant=plant.name,
@@ -555,6 +563,7 @@ def _check_plant(
         stated=plant.uncertainty is not None,
         own_performance=plant.performance is not None,
         all_frequencies=proof,
+        crossovers=margins.crossovers,
     )
 
     # Let every requirement decide.

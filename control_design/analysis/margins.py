@@ -110,6 +110,49 @@ class Margins:
         )
 
 
+@dataclass(frozen=True)
+class GainCrossover:
+    """The loop gain on the unit circle.
+
+    Attributes
+    ----------
+    omega_rad_s : float
+        Where, rad/s.
+    phase_margin_rad : float
+        arg(-L), above -pi and up to pi: so much lag (positive) or lead (negative) brings L to -1.
+    delay_margin_s : float
+        Extra delay that brings L to -1 there, s: a delay turns one way only, however long that is.
+    """
+
+    omega_rad_s: float
+    phase_margin_rad: float
+    delay_margin_s: float
+
+
+@dataclass(frozen=True)
+class PhaseCrossover:
+    """The loop gain on the negative real axis.
+
+    Attributes
+    ----------
+    omega_rad_s : float
+        Where, rad/s; 0 and Nyquist where the loop is real there.
+    gain_margin : float
+        -1/L: the factor on the gain that brings L to -1; above 1 the gain may rise by it, below 1 fall to it.
+    """
+
+    omega_rad_s: float
+    gain_margin: float
+
+
+@dataclass(frozen=True)
+class Crossovers:
+    """All crossovers of one loop, by frequency: on the unit circle and on the negative real axis."""
+
+    gain: tuple[GainCrossover, ...]
+    phase: tuple[PhaseCrossover, ...]
+
+
 class _Crossing(NamedTuple):
     """Loop gain on the real axis or on the unit circle, and its frequency, rad/s."""
 
@@ -201,6 +244,28 @@ def nominal_margins(
     -------
     Margins
     """
+    return nominal_loop(loop_gain, omega_rad_s, refinable=refinable, at_zero=at_zero)[0]
+
+
+def nominal_loop(
+    loop_gain: Callable[[Real], Complex],
+    omega_rad_s: Real,
+    *,
+    refinable: bool = True,
+    at_zero: float | None = None,
+) -> tuple[Margins, Crossovers]:
+    """Margins of one loop, and every crossover that they are the smallest of.
+
+    Parameters
+    ----------
+    loop_gain, omega_rad_s, refinable, at_zero
+        As of `nominal_margins`.
+
+    Returns
+    -------
+    Margins, Crossovers
+        A crossover that is touched stands there once for each point of the grid that touches it.
+    """
     crossings, modulus = _crossings(loop_gain, omega_rad_s, refinable, loop_gain(omega_rad_s))
     at_nyquist = loop_gain(omega_rad_s[-1:])[0]
     if at_nyquist.real < 0 and abs(at_nyquist.imag) <= _REAL_LOOP * abs(at_nyquist):
@@ -208,8 +273,20 @@ def nominal_margins(
     values = np.array([crossing.value for crossing in crossings], complex)
     places = np.array([crossing.omega_rad_s for crossing in crossings])
     margins = crossing_margins(values, places, modulus)
+    gain_crossovers: list[GainCrossover] = []
+    phase_crossovers: list[PhaseCrossover] = []
+    for place, value in sorted(crossings, key=lambda crossing: crossing.omega_rad_s):
+        # Crossings of the axis are real to the last digit.
+        if value.imag == 0.0 and value.real < 0:
+            phase_crossovers.append(PhaseCrossover(place, -1.0 / value.real))
+        elif value.imag != 0.0:
+            _, delay_s = _turns(np.array([value]), np.array([place]))
+            gain_crossovers.append(GainCrossover(place, float(np.angle(-value)), float(delay_s[0])))
+    if at_zero is not None and at_zero < 0:
+        phase_crossovers.insert(0, PhaseCrossover(0.0, -1.0 / at_zero))
+    crossovers = Crossovers(tuple(gain_crossovers), tuple(phase_crossovers))
     if at_zero is None:
-        return margins
+        return margins, crossovers
 
     # At zero frequency a negative loop gain limits the gain; no rotation or delay changes it.
     gain_up = np.inf
@@ -218,7 +295,8 @@ def nominal_margins(
         gain_up = -1 / at_zero
     elif at_zero < -1:
         gain_down = -1 / at_zero
-    return margins.worse(Margins(gain_up, gain_down, np.inf, np.inf, abs(1.0 + at_zero)))
+    limits_at_zero = Margins(gain_up, gain_down, np.inf, np.inf, abs(1.0 + at_zero))
+    return margins.worse(limits_at_zero), crossovers
 
 
 class _LoopValues(NamedTuple):

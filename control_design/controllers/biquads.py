@@ -256,8 +256,8 @@ def imaginary_axis(omega_rad_s: Real, dt_s: float) -> Complex:
 def _tustin_section(numerator: Real, denominator: Real, h: float) -> tuple[Real, Real, Real, Real]:
     """Discrete state space (A, B, C, D) of a section numerator/denominator in p, with up to two states.
 
-    numerator, denominator : (1,), (2,) or (3,) coefficients, highest power first, the denominator's first one is 1.
-    It is a balanced companion form, mapped by the trapezoidal rule with step 2 h. The rule needs (I - h
+    numerator, denominator : (1,), (2,) or (3,) coefficients, highest power first, the denominator's first one
+    is 1. It is a balanced companion form, mapped by the trapezoidal rule with step 2 h. The rule needs (I - h
     F)^-1; for one or two states it is written out, since searches build many loops. The symmetric split
     sqrt(2 h) on input and output keeps both of one size. h : half a sample in units of 1/scale, dt scale/2,
     positive. Coefficients are those of `Cascade.split`: of a denominator of degree two the last one is

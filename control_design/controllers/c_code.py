@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.controllers.law import in_sections
 
 if TYPE_CHECKING:
@@ -73,13 +74,26 @@ class Dialect:
 def c_header(controller: Controller, prefix: str = "controller", number: Number = "double") -> str:
     """Declarations to include, as C text: the state, `<prefix>_reset` and `<prefix>_step`.
 
-    The arguments are those of `c_source`. Raises ValueError for a prefix that is no C identifier, or another
+    Of one loop the law stands there in an engineer's numbers as well (`engineers_numbers`), as a comment and
+    as constants `<PREFIX>_KP`, `<PREFIX>_NOTCH_1_HZ` ... with all digits; the code does not use them. The
+    arguments are those of `c_source`. Raises ValueError for a prefix that is no C identifier, or another
     number.
     """
     Dialect(prefix, number)
+    comment = ""
+    constants = ""
+    numbers = engineers_numbers(controller)
+    if numbers is not None:
+        comment = "".join(f"     {name}: {values}\n" for name, values in numbers.rows()).rstrip()
+        lines = []
+        for name, value in numbers.constants().items():
+            lines.append(f"#define {prefix.upper()}_{name} {value!r}")
+        constants = "\n".join(lines)
     return _filled(
         "controller.h.in",
         controller,
+        comment=comment,
+        constants=constants,
         about=_ascii(controller.name),
         delay=controller.computational_delay_samples,
         dt_s=repr(controller.dt_s),
@@ -312,6 +326,7 @@ def _filled(template: str, controller: Controller, **values: object) -> str:
         "matrix": controller.D.size > 1,
         "signals": bool(controller.signals),
         "delay": controller.computational_delay_samples > 0,
+        "numbers": bool(values.get("constants")),
     }
     lines = []
     for line in _template(template):

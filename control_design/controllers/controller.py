@@ -261,6 +261,17 @@ class Controller(Law):
             described[name]["dt_s"] = self.dt_s
         return described
 
+    def to_dict(self) -> dict[str, Any]:
+        """As of `Law`, with the law of one loop in an engineer's numbers beside it, under `engineers_numbers`
+        (without the computational delay; null where it has no such factors). Reading ignores them."""
+        from control_design.controllers.engineers_numbers import engineers_numbers
+
+        plain = super().to_dict()
+        if self.D.size == 1:
+            numbers = engineers_numbers(self)
+            plain["engineers_numbers"] = None if numbers is None else numbers.to_dict()
+        return plain
+
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
         """Controller that `to_dict` wrote; a file may lack feed-forward, signals and `named_systems`. Raises

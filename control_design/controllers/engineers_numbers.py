@@ -18,9 +18,10 @@ is a PID if it has no more than its zeros and poles; poles without zeros are low
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -231,7 +232,8 @@ class ControllerNumbers:
         return np.asarray(1.0 + 2.0 * corner.damping * ratio + ratio**2)
 
     def constants(self) -> dict[str, float]:
-        """Every number by a name in capitals, `KP`, `TI_S`, `NOTCH_1_HZ` ..., as the C header has them."""
+        """Every number by a name in capitals, `KP`, `TI_S`, `NOTCH_1_HZ` ..., as the C header has them: to
+        thirteen digits, behind which there is rounding."""
         constants: dict[str, float] = {}
         if self.pid is not None:
             constants["KP"] = self.pid.kp
@@ -241,7 +243,7 @@ class ControllerNumbers:
                     constants[name.upper()] = value
         else:
             constants["GAIN"] = self.gain
-            constants["INTEGRATORS"] = self.integrators
+            constants["INTEGRATORS"] = float(self.integrators)
         for number, notch in enumerate(self.notches, 1):
             constants[f"NOTCH_{number}_HZ"] = notch.frequency_hz
             constants[f"NOTCH_{number}_DEPTH_DB"] = notch.depth_db
@@ -258,7 +260,12 @@ class ControllerNumbers:
                     constants[f"{name}_HZ"] = corner.frequency_hz
                     if corner.damping is not None:
                         constants[f"{name}_DAMPING"] = corner.damping
-        return constants
+        return {name: float(f"{value:.13g}") for name, value in constants.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """All fields with the words of `structure`, as numbers, words and lists for JSON."""
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
+        return {"structure": self.structure, **plain}
 
     def rows(self) -> list[tuple[str, str]]:
         """Name and values of each factor in plain ASCII, for a terminal, a table or a comment."""
@@ -273,13 +280,9 @@ class ControllerNumbers:
             integral = {0: "", 1: " over s"}.get(self.integrators, f" over s^{self.integrators}")
             rows.append(("gain", f"{self.gain:.5g}{integral}"))
         for notch in self.notches:
-            rows.append(
-                (
-                    "notch",
-                    f"{notch.frequency_hz:.5g} Hz, {notch.depth_db:.4g} dB deep, {notch.width_hz:.4g} Hz wide "
-                    f"(damping {notch.damping:.4g})",
-                )
-            )
+            middle = f"{notch.frequency_hz:.5g} Hz, {notch.depth_db:.4g} dB deep"
+            width = f"{notch.width_hz:.4g} Hz wide (damping {notch.damping:.4g})"
+            rows.append(("notch", f"{middle}, {width}"))
         for low_pass in self.low_passes:
             words = f"{low_pass.frequency_hz:.5g} Hz, order {low_pass.order}"
             if low_pass.damping is not None:
@@ -441,7 +444,7 @@ def _sharpened(
             if not (np.all(np.isfinite(rows)) and np.all(np.isfinite(right))):
                 break
             step = np.linalg.lstsq(rows, right, rcond=1e-13)[0] * np.array(scales)
-            new_gain = gain * (1.0 + step[0])
+            new_gain = gain * (1.0 + float(step[0]))
             new_zeros = _moved(zeros, step[1 : 1 + zeros.count])
             new_poles = _moved(poles, step[1 + zeros.count :])
             mismatch = _mismatch(t, wanted, new_gain, new_zeros, new_poles, integrators)

@@ -86,7 +86,8 @@ def width_of_damping(damping: float, corner: float, dt_s: float) -> float:
 
 
 class Part:
-    """What `Cascade` asks of a part. A part is frozen and hashable: functions of a structure are cached by it.
+    """What `Cascade` asks of a part. A part is frozen and hashable: functions of a structure are cached by
+    it.
 
     Nothing is checked here; `Specification` has refused what no part can be.
     """

@@ -161,9 +161,9 @@ class Specification(Settings):
     )
     structure: Literal["biquads", "p", "pi", "pd", "pid"] = Field(
         default="biquads",
-        description="biquads: free cascade of controller_order; p, pi, pd, pid: Kp (1 + 1/(Ti s) + Td s/(Tf s "
-        "+ 1)) or a part of it, with notches and low_pass; each number given below is fixed, what is left out "
-        "is chosen by the synthesis",
+        description="biquads: free cascade of controller_order; p, pi, pd, pid: Kp (1 + 1/(Ti s) + Td s/(Tf "
+        "s + 1)) or a part of it, with notches and low_pass; each number given below is fixed, what is left "
+        "out is chosen by the synthesis",
     )
     kp: float | None = Field(
         default=None, allow_inf_nan=False, description="Kp of p, pi, pd, pid, input unit per measured unit"
@@ -175,8 +175,8 @@ class Specification(Settings):
     )
     notches: tuple[Notch, ...] = Field(
         default=(),
-        description="notches of p, pi, pd, pid, each with frequency_hz, depth_db and width_hz (or damping), as "
-        "far as they are fixed: [{frequency_hz = 22.9, depth_db = 10}, {}] has a second one that is free",
+        description="notches of p, pi, pd, pid, each with frequency_hz, depth_db and width_hz (or damping), "
+        "as far as they are fixed: [{frequency_hz = 22.9, depth_db = 10}, {}] has a second one that is free",
     )
     low_pass: LowPass | None = Field(
         default=None,

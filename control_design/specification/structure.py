@@ -8,6 +8,7 @@ controller itself (`controllers.parts`).
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, model_validator
@@ -52,7 +53,7 @@ class Notch(Settings):
         default=None,
         gt=0,
         lt=1,
-        description="in place of width_hz: damping ratio of its poles; that of its zeros is damping over depth",
+        description="in place of width_hz: damping ratio of its poles; its zeros have it over the depth",
     )
 
     @model_validator(mode="after")
@@ -105,8 +106,8 @@ def refuse_contradictions(spec: Specification) -> None:
         value = getattr(spec, key)
         if value is not None and value != () and not is_part:
             raise ValueError(
-                f"{key} is given, but a controller of structure {spec.structure!r} has none: leave {key} out, "
-                f"or take structure = {'pi' if key == 'ti_s' else 'pid'!r}"
+                f"{key} is given, but a controller of structure {spec.structure!r} has none: leave it out, or "
+                f"take structure = {'pi' if key == 'ti_s' else 'pid'!r}"
             )
     if spec.kp == 0:
         raise ValueError("kp must not be 0")
@@ -116,10 +117,10 @@ def refuse_contradictions(spec: Specification) -> None:
             "take order = 2"
         )
     stated = sorted(notch.frequency_hz for notch in spec.notches if notch.frequency_hz is not None)
-    for lower, upper in zip(stated, stated[1:], strict=False):
+    for lower, upper in pairwise(stated):
         if upper - lower <= _SAME_FREQUENCY * upper:
             raise ValueError(
-                f"two notches at one frequency, {lower:.6g} Hz: state one, with the sum of depths"
+                f"two notches at one frequency, {lower:.6g} Hz: state one, as deep as both together"
             )
 
 
@@ -168,11 +169,9 @@ def refuse_sampling(spec: Specification, dt_s: float) -> None:
                 f"notch {number}: width_hz = {notch.width_hz:.6g} is too wide for a notch at "
                 f"{frequency_hz:.6g} Hz: less than {widest_hz:.6g}"
             )
-    if spec.low_pass is not None and spec.low_pass.frequency_hz is not None:
-        if not spec.low_pass.frequency_hz < nyquist_hz:
-            raise ValueError(
-                f"low_pass: frequency_hz = {spec.low_pass.frequency_hz:.6g} must be below {at_rate}"
-            )
+    corner_hz = None if spec.low_pass is None else spec.low_pass.frequency_hz
+    if corner_hz is not None and not corner_hz < nyquist_hz:
+        raise ValueError(f"low_pass: frequency_hz = {corner_hz:.6g} must be below {at_rate}")
     if spec.tf_s is not None and not spec.tf_s >= dt_s / 2:
         raise ValueError(
             f"tf_s = {spec.tf_s:.6g} s is faster than the sample: at least {dt_s / 2:.6g} s, half of the "

@@ -474,8 +474,8 @@ class OrderSearch:
     def _retreat(self, parameters: Real) -> Real | None:
         """Parameters (n,) with as little less gain as makes them stable on the lean grids.
 
-        None where `_RETREATS` steps do not, as of unstable plants, and of a Kp that is fixed, so that the gain does not
-        change.
+        None where `_RETREATS` steps do not, as of unstable plants, and of a Kp that is fixed, so that the
+        gain does not change.
         """
         for number in range(1, _RETREATS + 1):
             trial = with_gain(self.cascade, parameters, _RETREAT**number)

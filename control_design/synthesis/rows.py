@@ -74,8 +74,8 @@ def row_functions(sections: tuple[Section, ...]) -> tuple[Any, Any, Any]:
     Parameters
     ----------
     sections : tuple of Section
-        With a free parameter, else n = 0. Kept for the 64 structures used last, as building takes longer than a
-        descent step.
+        With a free parameter, else n = 0. Kept for the 64 structures used last, as building takes longer than
+        a descent step.
 
     Returns
     -------

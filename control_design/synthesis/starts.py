@@ -3,13 +3,14 @@
 A descent ends in the valley where it began, so the search needs several starts of different kinds, each
 already close to what is asked. `StartMaker` draws parameter vectors of one `Cascade` in four ways.
 
-`drawn` serves controllers made of parts (PID, notches, low-pass): corners around the crossover, notches at the
-plant's modes, of many draws the best. `shaped` wishes for a loop gain L = G K where the specification speaks: large and positive real at the peak of
-a mode that is to be damped (1 + L = peak over allowed peak, so that L points away from -1), falling like an
-integrator where tracking is asked, small elsewhere. Poles are drawn at random, and the numerator that comes
-nearest to the wishes is linear least squares. `low_gain` draws all sections at random and lowers the gain
-until the nominal loops are stable. `stabilising` serves plants that are unstable in open loop: it draws leads
-around the unstable poles and minimises the largest closed-loop pole modulus.
+`drawn` serves controllers made of parts (PID, notches, low-pass): corners around the crossover, notches at
+the plant's modes, of many draws the best. `shaped` wishes for a loop gain L = G K where the specification
+speaks: large and positive real at the peak of a mode that is to be damped (1 + L = peak over allowed peak, so
+that L points away from -1), falling like an integrator where tracking is asked, small elsewhere. Poles are
+drawn at random, and the numerator that comes nearest to the wishes is linear least squares. `low_gain` draws
+all sections at random and lowers the gain until the nominal loops are stable. `stabilising` serves plants
+that are unstable in open loop: it draws leads around the unstable poles and minimises the largest closed-loop
+pole modulus.
 
 Corners and gains are in the Tustin plane p of the cascade, s over `cascade.scale_rad_s`. The functions at the
 end work on parameter vectors: a factor on the gain, one section more that cancels itself, and sections from
@@ -601,8 +602,8 @@ class StartMaker:
         """Parameters (n,) of one draw with its crossover near the unstable poles, and a gain of either sign.
 
         Kinds of draws: a slow lag (only where tracking is asked without an integrator), leads, and random
-        sections; parts around that crossover. Only called where some plant is unstable: without an unstable pole the
-        crossover would be 0 rad/s.
+        sections; parts around that crossover. Only called where some plant is unstable: without an unstable
+        pole the crossover would be 0 rad/s.
         """
         fastest_logs = []
         for data in self.data:

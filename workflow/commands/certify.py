@@ -114,6 +114,7 @@ def certify_controller(
 
     # What is refused does not wait for what certifies: that takes seconds to load.
     from workflow.commands.design import at_one_bandwidth, load_asked, of_run
+    from control_design.controllers.engineers_numbers import engineers_numbers
     from workflow.tasks.design import certify_asked
     from workflow.tasks.system_files import read_law
 
@@ -150,12 +151,14 @@ def certify_controller(
         for name in _TOLERANCES
     }
     doubts = [words(doubt) for doubt in done.certificate.warnings]
+    numbers = engineers_numbers(law)
     return RunSummary(
         title=f"certificate of {controller}",
         sections=rows_of(
             "summary/certify.j2",
             sources=sources,
             law=law,
+            numbers=numbers,
             worst=worst,
             found=found,
             held=held,
@@ -164,6 +167,7 @@ def certify_controller(
         numbers={
             "plants": [{"plant": source.plant.name, "origin": source.origin} for source in sources],
             "controller": str(controller),
+            "engineers_numbers": None if numbers is None else numbers.to_dict(),
             "certificate": codec.plain(done.certificate),
             "certificate_conditions": doubts,
             "certified": done.certified,

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from control_design.controllers.c_code import Dialect
+from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from workflow.config.design_file import DesignFile
@@ -138,8 +139,12 @@ def design_controller(
     controller, gamma = design.controller, design.gamma
     order = (design.specification or specification).controller_order
     files: list[Path] = []
-    if out is not None and controller is not None:
-        law = logged[0].law(controller) if logged else controller
+    # As the files have it.
+    law = controller
+    if controller is not None and logged:
+        law = logged[0].law(controller)
+    numbers = None if law is None else engineers_numbers(law)
+    if out is not None and law is not None:
         known = "; ".join(dict.fromkeys(source.certified_for for source in sources_found))
         files = write_controller(
             out, law, prefilter.filter, certified=certify.certified, about=known, dialect=dialect
@@ -160,6 +165,8 @@ def design_controller(
             sources=sources_found,
             done={"design": design, "achievable": achievable, "reference_filter": prefilter},
             order=order,
+            numbers=numbers,
+            delay=specification.computational_delay_samples,
             advice=advice,
             verdict=certify,
             shares=shares,
@@ -169,6 +176,7 @@ def design_controller(
         numbers={
             "plants": about,
             "design": {**codec.plain(design), "order_advice": advice},
+            "engineers_numbers": None if numbers is None else numbers.to_dict(),
             "achievable_performance": bracket_numbers(achievable, gamma),
             "certificate": codec.plain(certify.certificate),
             "certified": certify.certified,

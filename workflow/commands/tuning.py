@@ -143,7 +143,7 @@ class TuningSession:
         for gamma, _, gain, worst in sorted(ranked, key=itemgetter(0, 1)):
             law = replace(last, C=gain * last.C, D=gain * last.D, anti_windup_gain=None)
             if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
-                margins = [loop_margins(law, p, one)[1:] for p, one in zip(plants, worst, strict=True)]
+                margins = [loop_margins(law, p, one)[1:3] for p, one in zip(plants, worst, strict=True)]
                 numbers = {"gain": gain, "gamma": gamma, "certified": None}
                 seen = self._seen(law, plants, specification, gamma, margins, said("limits_not_looked_at"))
                 return {**_finite(numbers), **seen}

@@ -17,6 +17,7 @@ from scipy import signal
 from control_design.analysis.margins import nominal_margins
 from control_design.analysis.stability import closed_loop_poles, loop_integrators
 from control_design.controllers.controller import Controller
+from control_design.controllers.engineers_numbers import ControllerNumbers, engineers_numbers
 from control_design.controllers.law import Law
 from control_design.plants.frequency_grid import checked_grid, frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
@@ -265,6 +266,11 @@ class RunView(AnyRunView):
     def logged_controller(self) -> Controller:
         """As the run's files have it."""
         return Logged.of(self.config, self.results.records).law(self.controller)
+
+    @property
+    def engineers_numbers(self) -> ControllerNumbers | None:
+        """The controller in an engineer's numbers, as the run's files have it; None without such factors."""
+        return engineers_numbers(self.logged_controller)
 
     @property
     def loop_factor(self) -> float:

@@ -41,6 +41,12 @@ from workflow.text.templates import said
 UNKNOWN_TO_BRACKET = (
     "controller_order",
     "structure",
+    "kp",
+    "ti_s",
+    "td_s",
+    "tf_s",
+    "notches",
+    "low_pass",
     "controller_damping",
     "delay_margin_s",
     "mode_damping",
@@ -76,6 +82,9 @@ def find_design(
         specification.model_dump(include=set(Specification.model_fields))
     )
     stated = specification
+    if plants:
+        # What the user has to change, not what a search has found.
+        specification.refuse_sampling(plants[0].dt_s)
     at_start = copy.deepcopy(rng)
     try:
         if options.calibrate and undrawable(plants) is None:

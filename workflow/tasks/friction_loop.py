@@ -402,6 +402,9 @@ def soonest(
     law = first.controller
     if not first.met or friction is None or law is None or asked.lowest_bandwidth_rad_s is None:
         return first
+    # A structure that was asked for has the order that it has.
+    if asked.structure != "biquads":
+        return first
     # The arm at the rate of the controller.
     friction = resampled_friction(friction, law.dt_s)
 

@@ -57,6 +57,9 @@ def make_records(stage: StageInput) -> RecordsResult:
     if isinstance(stage.config, RunConfig) and stage.config.specification.controller_dt_s is not None:
         with naming("specification"):
             ratio_of(timed[0].dt_s, stage.config.specification.controller_dt_s)
+    if isinstance(stage.config, RunConfig):
+        with naming("specification"):
+            stage.config.specification.refuse_sampling(timed[0].dt_s)
     records = list[RunRecord]()
     for about, record in zip(entries, timed, strict=True):
         of: Any = getattr(about, "excitation", about)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from control_design.controllers.engineers_numbers import ControllerNumbers, engineers_numbers
 from control_design.specification import Specification
 from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
@@ -35,6 +36,7 @@ def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
         _of_one_loop(results, config) if isinstance(config, RunConfig) else _of_joints(results)
     )
     shown: dict[str, Any] = {"config": config, "results": results}
+    shown["numbers_of_controller"] = numbers_of_controller(results, config)
     shares, signals = numbers.get("sampled_responses"), Logged.of(config, results.records).signals
     return RunSummary(
         title=title_of(config, results.run),
@@ -53,6 +55,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
     achievable, loop = results.achievable_performance, results.closed_loop
     pairs = list(zip(results.identify.channels, results.uncertainty.channels, strict=True))
     conditions = results.uncertainty.conditions(config)
+    numbers = numbers_of_controller(results, config)
     return (
         {
             "command_timing": timing_numbers(results.records.timing),
@@ -66,6 +69,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
                 "controller_dt_s": None if design.controller is None else design.controller.dt_s,
             },
+            "engineers_numbers": None if numbers is None else numbers.to_dict(),
             "signals": Logged.of(config, results.records).signals,
             "certificate": codec.plain(certify.certificate),
             "certificate_conditions": [words(doubt) for doubt in conditions],
@@ -86,6 +90,14 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
             config.specification,
         ),
     )
+
+
+def numbers_of_controller(results: RunResults, config: AnyConfig) -> ControllerNumbers | None:
+    """The controller in an engineer's numbers, as the run's files have it; None without one, for several
+    joints, and where it has no such factors."""
+    if not isinstance(config, RunConfig) or results.design.controller is None:
+        return None
+    return engineers_numbers(Logged.of(config, results.records).law(results.design.controller))
 
 
 def _of_joints(results: Any) -> tuple[dict[str, Any], bool, str]:
