@@ -384,8 +384,8 @@ class LoopMargins(NamedTuple):
     """Margins of one uncertain loop.
 
     nominal: of the centres. worst: smallest over all members of the ellipses; both with gains as factors,
-    phase in rad, delay in s. bandwidth_rad_s: up to here every member has |S| below -3 dB, rad/s. crossovers: all of
-    the centres.
+    phase in rad, delay in s. bandwidth_rad_s: up to here every member has |S| below -3 dB, rad/s. crossovers:
+    all of the centres.
     """
 
     nominal: Margins

@@ -106,8 +106,8 @@ def refuse_contradictions(spec: Specification) -> None:
         value = getattr(spec, key)
         if value is not None and value != () and not is_part:
             raise ValueError(
-                f"{key} is given, but a controller of structure {spec.structure!r} has none: leave it out, or "
-                f"take structure = {'pi' if key == 'ti_s' else 'pid'!r}"
+                f"{key} is given, but a controller of structure {spec.structure!r} has none: leave it out "
+                f"or take structure = {'pi' if key == 'ti_s' else 'pid'!r}"
             )
     if spec.kp == 0:
         raise ValueError("kp must not be 0")

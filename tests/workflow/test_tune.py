@@ -426,7 +426,7 @@ def test_the_page_by_keyboard(server, browser):
     browser.go(server.url)
     designed(browser, 1)
     assert text(browser, "headline") == "Certified"
-    assert browser.ask("document.querySelectorAll('.panels svg').length") == 6
+    assert browser.ask("document.querySelectorAll('.panels svg').length") == 9
     first = browser.ask("document.querySelector('.panels .nominal').getAttribute('d')")
     stated = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
     browser.ask("document.getElementById('c-effort_limit').focus()")

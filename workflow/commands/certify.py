@@ -113,8 +113,8 @@ def certify_controller(
     refuse_broken_files(paths, controller)
 
     # What is refused does not wait for what certifies: that takes seconds to load.
-    from workflow.commands.design import at_one_bandwidth, load_asked, of_run
     from control_design.controllers.engineers_numbers import engineers_numbers
+    from workflow.commands.design import at_one_bandwidth, load_asked, of_run
     from workflow.tasks.design import certify_asked
     from workflow.tasks.system_files import read_law
 

@@ -23,6 +23,7 @@ from control_design.analysis.margins import Margins
 from control_design.analysis.stability import closed_loop_poles
 from control_design.analysis.worst_case import PlantData, WorstCase, worst_of
 from control_design.controllers.controller import Controller
+from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
@@ -30,12 +31,13 @@ from control_design.specification import Specification, SpecificationError
 from control_design.synthesis.synthesis import synthesise_near
 from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
+from workflow.commands.tuning_views import FrictionStep, bode, line, roots, short
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
-from workflow.figures.bands import outline, smooth_grid
+from workflow.figures.bands import smooth_grid
 from workflow.figures.sensitivity import sensitivity_curves
 from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
@@ -84,9 +86,13 @@ class TuningSession:
         self._last = None if found is None else found.design.controller
         # Overshoot, settling time and command are those of the run's reference step, through its filter.
         self._step_size, self.filter = 1.0, None
+        self._friction: FrictionStep | None = None
         if found is not None and found.run.stage_file("closed_loop") and found.closed_loop.check is not None:
             self._step_size = found.closed_loop.check.reference_step
             self.filter = found.reference_filter.filter
+            friction = found.identify.friction
+            if friction is not None:
+                self._friction = FrictionStep(friction, self._step_size)
         self.step_words = si(self._step_size, self._units[1] or "in the unit of the output", 4)
         self._newest, self._designing = 0, threading.Lock()
 
@@ -109,6 +115,10 @@ class TuningSession:
         if level is not None:
             level = check(PlantSection, {"level": level}, source=CONFIDENCE).level
         document = self.specification.model_dump(mode="json", exclude_unset=True) | stated
+        if document.get("structure", "biquads") != "biquads":
+            # The page has a slider and a switch for what follows from such a structure.
+            for key in ("controller_order", "integrator"):
+                document.pop(key, None)
         specification = check(Specification, document, source="settings")
         plants = self._plants if level is None else [at_level(plant, level) for plant in self._plants]
         return specification, plants, level
@@ -145,7 +155,8 @@ class TuningSession:
             if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
                 margins = [loop_margins(law, p, one)[1:3] for p, one in zip(plants, worst, strict=True)]
                 numbers = {"gain": gain, "gamma": gamma, "certified": None}
-                seen = self._seen(law, plants, specification, gamma, margins, said("limits_not_looked_at"))
+                at_limits = said("limits_not_looked_at")
+                seen = self._seen(law, plants, specification, gamma, margins, at_limits, settles=False)
                 return {**_finite(numbers), **seen}
         raise InputError("no gain keeps the last controller stable with these settings")
 
@@ -248,10 +259,16 @@ class TuningSession:
         gamma: float,
         margins: Sequence[tuple[Margins, float]],
         at_limits: str,
+        *,
+        settles: bool = True,
     ) -> dict[str, Any]:
         """Numbers (words, value) and curves of a loop. margins: over the ellipses of each plant, with its
-        bandwidth [rad/s]. at_limits: what is said of the loop at the controller's limits."""
+        bandwidth [rad/s]. at_limits: what is said of the loop at the controller's limits. settles: settling
+        times with friction are wanted, too, which take a dozen simulations."""
         runs = [self._steps(law, plant) for plant in plants]
+        friction = ""
+        if self._friction is not None and settles:
+            friction = self._friction.settling(law, self._given(law, plants[0]))
         table = rows_of(
             "summary/tune.j2",
             gamma=gamma,
@@ -261,6 +278,8 @@ class TuningSession:
             unit=self._units[0],
             order=law.order,
             limits=at_limits,
+            friction=friction,
+            numbers=engineers_numbers(law),
         )
         curves = []
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
@@ -273,21 +292,32 @@ class TuningSession:
                     "name": plant.name,
                     "gains": _gains(law, plant, specification),
                     "nyquist": _nyquist(law, plant),
+                    "bode": bode(law, plant, _grid(plant, law, 150, 12)),
+                    "roots": roots(law, plant),
                     "step": {
                         "end": float(nominal.time_s[shown - 1]),
-                        "nominal": _line(nominal, shown),
-                        "samples": [_line(run, shown) for run in drawn],
+                        "nominal": line(nominal, shown),
+                        "samples": [line(run, shown) for run in drawn],
+                        "friction": []
+                        if self._friction is None
+                        else self._friction.curves(law, shown, self._given(law, plant)),
                     },
                 }
             )
         return {"numbers": table[0].rows, "plants": curves}
 
+    def _given(self, law: Controller, plant: UncertainPlant) -> Real:
+        """The reference step (T,) as long as the loop on the nominal model needs, through the run's filter if
+        it has one."""
+        radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
+        step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self._step_size)
+        return step if self.filter is None else self.filter.filtered(step)
+
     def _steps(self, law: Controller, plant: UncertainPlant) -> list[ClosedLoopTrajectory]:
         """The reference step on the nominal model, and on models drawn from the posterior where there is one;
         as a run predicts it (`workflow.tasks.closed_loop`)."""
-        radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
-        step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self._step_size)
-        given = step if self.filter is None else self.filter.filtered(step)
+        given = self._given(law, plant)
+        step = np.full(given.size, self._step_size)
         models = [plant.nominal]
         if isinstance(plant.uncertainty, ResponsePosterior):
             models = _models(plant.uncertainty, self.seed)
@@ -319,10 +349,10 @@ def _gains(law: Controller, plant: UncertainPlant, specification: Specification)
         {
             "symbol": one.symbol,
             "meaning": one.meaning,
-            "x": _short(one.omega_rad_s),
-            "nominal": _short(one.nominal),
-            "worst": _short(np.where(one.worst < 1e200, one.worst, np.nan)),
-            "limit": _short(one.limit),
+            "x": short(one.omega_rad_s),
+            "nominal": short(one.nominal),
+            "worst": short(np.where(one.worst < 1e200, one.worst, np.nan)),
+            "limit": short(one.limit),
         }
         for one in curves
     ]
@@ -344,16 +374,10 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
     outline = k[at, None] * (part.centre[:, None] + part.direction[:, None] * (major + 1j * minor))
     line = np.where(np.abs(loop) < 2 * _NEAR, loop, np.nan)
     return {
-        "re": _short(line.real),
-        "im": _short(line.imag),
-        "ellipses": [[_short(one.real), _short(one.imag)] for one in outline],
+        "re": short(line.real),
+        "im": short(line.imag),
+        "ellipses": [[short(one.real), short(one.imag)] for one in outline],
     }
-
-
-def _line(run: ClosedLoopTrajectory, shown: int) -> dict[str, Any]:
-    """The first samples of a run's output, as many of them as draw the same curve."""
-    time_s, output = outline(run.time_s[:shown], run.measured[:shown])
-    return {"x": _short(time_s), "y": _short(output)}
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:
@@ -386,11 +410,6 @@ def toml_of(file: DesignFile) -> str:
             # one that is not stated is that of the plant's file or sought in the data.
             document[name] = section.model_dump(mode="json", exclude_unset=True, exclude_none=True)
     return tomlkit.dumps(document)
-
-
-def _short(values: Real) -> list[float | None]:
-    """Five digits; None where a value is not finite."""
-    return [float(f"{v:.5g}") if math.isfinite(v) else None for v in np.asarray(values, dtype=float).tolist()]
 
 
 def _finite(numbers: Mapping[str, Any]) -> dict[str, Any]:

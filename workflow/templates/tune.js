@@ -244,6 +244,35 @@ const path = (xs, ys, x, y) => {
   });
   return d;
 };
+// Bode of loop and plant, and poles and zeros.
+const views = (plant, other) => {
+  const bode = plant.bode, ends = [bode.x[0], bode.x.at(-1), true], span = curves => {
+    const seen = curves.flat().filter(v => v != null);
+    return [Math.min(...seen), Math.max(...seen)];
+  };
+  const [least, most] = span([bode.loop, bode.plant]);
+  for (const [title, suffix, ys, words] of [
+    ["Bode: gain of K G (solid) and G (dotted)", "", [Math.max(least / 1.5, most * 1e-6), most * 1.5, true], 1],
+    ["Bode: phase of K G (solid) and G (dotted) [deg]", "_deg", span([bode.loop_deg, bode.plant_deg]).map((v, k) => v + (k ? 10 : -10)).concat(false), -180],
+  ]) {
+    const [x, y, group] = panel(title, ends, ys, "frequency [rad/s]");
+    draw("path", group, {class: "curve limit", d: `M${x(ends[0])} ${y(words)}H${x(ends[1])}`});
+    draw("path", group, {class: "curve dotted", d: path(bode.x, bode["plant" + suffix], x, y)});
+    if (other) draw("path", group, {class: "curve pinned", d: path(other.bode.x, other.bode["loop" + suffix], x, y)});
+    draw("path", group, {class: "curve nominal", d: path(bode.x, bode["loop" + suffix], x, y)});
+  }
+  const [x, y, group] = panel("Poles (×) and zeros (○) in z: loop, controller, plant", [-1.2, 1.2, false], [-1.15, 1.15, false], "real part", true);
+  const turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
+  draw("path", group, {class: "curve pinned", d: path(turn.map(Math.cos), turn.map(Math.sin), x, y)});
+  for (const [name, [re, im]] of Object.entries(plant.roots)) {
+    const look = {loop: "worst", controller: "nominal", plant: "dotted"}[name.split(" ")[0]];
+    re.forEach((v, k) => {
+      const [cx, cy] = [x(v), y(im[k])], cross = `M${cx - 4} ${cy - 4}l8 8m0 -8l-8 8`;
+      const mark = name.endsWith("zeros") ? draw("circle", group, {class: "curve " + look, cx, cy, r: 4}) : draw("path", group, {class: "curve " + look, d: cross});
+      draw("title", mark, {}, `${name.slice(0, -1)}: ${digits(v, 5)} ± ${digits(Math.abs(im[k]), 4)} j`);
+    });
+  }
+};
 const panels = () => {
   const at = Math.max(0, $("plant").selectedIndex), plant = shown.plants?.[at], other = pinned?.plants?.[at];
   const top = scrollY;
@@ -258,6 +287,7 @@ const panels = () => {
     if (other) draw("path", group, {class: "curve pinned", d: path(other.gains[k].x, other.gains[k].worst, x, y)});
     for (const kind of ["worst", "nominal", "limit"]) draw("path", group, {class: "curve " + kind, d: path(one.x, one[kind], x, y)});
   });
+  views(plant, other);
   const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses", [-2.6, 1.8, false], [-size, size / 2, false], "real part", true);
   const radius = controls.modulus_margin?.get() ?? 0, turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
   draw("path", group, {class: "curve limit", d: path(turn.map(v => radius * Math.cos(v) - 1), turn.map(v => radius * Math.sin(v)), nx, ny)});
@@ -272,6 +302,12 @@ const panels = () => {
     for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(one.x, one.y, x, y)});
     if (other?.step.end) draw("path", inside, {class: "curve pinned", d: path(other.step.nominal.x, other.step.nominal.y, x, y)});
     draw("path", inside, {class: "curve nominal", d: path(step.nominal.x, step.nominal.y, x, y)});
+  }
+  if (step.friction.length) {
+    const all = [...step.nominal.y, ...step.friction.flatMap(one => one.y), 0];
+    const [x, y, inside] = panel("Step with dry friction: dashed without, solid with feed-forward", [0, step.end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
+    draw("path", inside, {class: "curve thin", d: path(step.nominal.x, step.nominal.y, x, y)});
+    step.friction.forEach((one, k) => draw("path", inside, {class: k ? "curve nominal" : "curve limit", d: path(one.x, one.y, x, y)}));
   }
   scrollTo(scrollX, top);
 };

@@ -1,0 +1,115 @@
+"""What `flexlink tune` draws of a loop beside its margins: Bode, poles and zeros, the step with friction.
+
+Everything returned is JSON-able: curves of few digits, for the page's own drawing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from control_design.analysis.closed_loop import ClosedLoopTrajectory
+from control_design.analysis.stability import closed_loop_poles
+from control_design.controllers.controller import Controller
+from control_design.plants.ellipses import Complex, Real
+from control_design.plants.plant_set import UncertainPlant
+from ident.friction import FrictionFit
+from ident.resampling import resampled_friction
+from workflow.figures.bands import outline
+from workflow.tasks.friction_loop import FrictionLoop, friction_feedforward
+from workflow.text.templates import said
+
+# Largest modulus of a root that is drawn: the circle and what is near it; a zero far outside would make the
+# circle a point. Chosen.
+_LARGEST_ROOT = 3.0
+
+
+def short(values: Real | Sequence[float]) -> list[float | None]:
+    """Five digits of each value; None where it is not finite."""
+    numbers = np.asarray(values, dtype=float).tolist()
+    return [float(f"{value:.5g}") if math.isfinite(value) else None for value in numbers]
+
+
+def bode(law: Controller, plant: UncertainPlant, omega_rad_s: Real) -> dict[str, Any]:
+    """Gain and phase in degrees of the loop K G, with its delay, and of the plant's centres G.
+
+    omega_rad_s: (F,), ascending, where the plant is known. Phases run on without jumps of a turn.
+    """
+    centre = plant.at(omega_rad_s).centre
+    loop = law.response(omega_rad_s) * centre
+    found: dict[str, Any] = {"x": short(omega_rad_s)}
+    for name, values in (("loop", loop), ("plant", centre)):
+        found[name] = short(np.abs(values))
+        found[f"{name}_deg"] = short(np.degrees(np.unwrap(np.angle(values))))
+    return found
+
+
+def roots(law: Controller, plant: UncertainPlant) -> dict[str, list[list[float | None]]]:
+    """Poles of the nominal loop, poles and zeros of controller and nominal plant, in z: [real parts,
+    imaginary parts] each, those of a modulus below `_LARGEST_ROOT`."""
+    without_delay = law.to_control()
+    of = {
+        "loop poles": closed_loop_poles(law, plant),
+        "controller poles": law.poles,
+        "controller zeros": without_delay.zeros(),
+        "plant poles": plant.poles,
+        "plant zeros": plant.zeros,
+    }
+    found = {}
+    for name, values in of.items():
+        z: Complex = np.asarray(values, dtype=np.complex128)
+        near = z[np.abs(z) < _LARGEST_ROOT]
+        found[name] = [short(near.real), short(near.imag)]
+    return found
+
+
+@dataclass(frozen=True)
+class FrictionStep:
+    """The reference step on the identified arm with its dry friction.
+
+    Attributes
+    ----------
+    friction : FrictionFit
+        As identified, at the step of the logs.
+    size : float
+        Of the step, in units of the output.
+    """
+
+    friction: FrictionFit
+    size: float
+
+    def curves(self, law: Controller, samples: int, given: Real) -> list[dict[str, Any]]:
+        """The step without and with friction feed-forward: words, x [s] and y each.
+
+        law: without feed-forward; samples: that are shown; given (T,): what a reference filter makes of the
+        step, held to its end.
+        """
+        friction = resampled_friction(self.friction, law.dt_s)
+        reference = np.pad(given, (0, max(samples - given.size, 0)), mode="edge")[:samples]
+        found = []
+        for words, feedforward in (
+            ("with friction", None),
+            ("with friction and its feed-forward", friction_feedforward(law, friction)),
+        ):
+            run = FrictionLoop.of(replace(law, feedforward=feedforward), friction).run(reference)
+            found.append({"words": words, **line(run, samples)})
+        return found
+
+    def settling(self, law: Controller, given: Real) -> str:
+        """Settling times of steps of half to twice the size, in words: with friction one size says little.
+
+        given: as of `curves`.
+        """
+        friction = resampled_friction(self.friction, law.dt_s)
+        step = np.append(0.0, np.full(given.size - 1, self.size))
+        return said("settling_range", FrictionLoop.of(law, friction).settling(step, given))
+
+
+def line(run: ClosedLoopTrajectory, shown: int) -> dict[str, Any]:
+    """The first samples of a run's output, as many of them as draw the same curve."""
+    time_s, output = outline(run.time_s[:shown], run.measured[:shown])
+    return {"x": short(time_s), "y": short(output)}
