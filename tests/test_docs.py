@@ -33,7 +33,7 @@ ELSEWHERE = {
     "own_plant.md": "workflow/test_plant_page.py",
     "simulators.md": "workflow/test_simulators.py",
 }
-CONSOLE = ["c_code.md", "margins_in_ci.md", "which_data.md"]
+CONSOLE = ["c_code.md", "controllers.md", "margins_in_ci.md", "which_data.md"]
 # Run as notebooks: what their pages must say, in this order.
 NOTEBOOKS = {
     "closed_loop": r"reference_rad|first mode *│ 4|without friction|0.18\d*|certified: e|!\[|controller_step",

@@ -33,6 +33,7 @@ from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
 from workflow.commands.tuning_views import FrictionStep, bode, line, roots, short
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
+from workflow.config.run_config import RunConfig
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
@@ -45,6 +46,7 @@ from workflow.tasks.design_source import level_can_change
 from workflow.tasks.loop_sensitivity import settling_samples
 from workflow.tasks.results import DesignResult
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
+from workflow.tasks.simulated_rig import converter_steps
 from workflow.text.formats import bound, si, unit
 from workflow.text.templates import rows_of, said
 
@@ -91,8 +93,9 @@ class TuningSession:
             self._step_size = found.closed_loop.check.reference_step
             self.filter = found.reference_filter.filter
             friction = found.identify.friction
-            if friction is not None:
-                self._friction = FrictionStep(friction, self._step_size)
+            if friction is not None and isinstance(sources[0].config, RunConfig):
+                steps = converter_steps(sources[0].config.closed_loop)
+                self._friction = FrictionStep(friction, self._step_size, steps)
         self.step_words = si(self._step_size, self._units[1] or "in the unit of the output", 4)
         self._newest, self._designing = 0, threading.Lock()
 
@@ -292,7 +295,7 @@ class TuningSession:
                     "name": plant.name,
                     "gains": _gains(law, plant, specification),
                     "nyquist": _nyquist(law, plant),
-                    "bode": bode(law, plant, _grid(plant, law, 150, 12)),
+                    "bode": bode(law, plant, _shown_grid(law, plant, specification)),
                     "roots": roots(law, plant),
                     "step": {
                         "end": float(nominal.time_s[shown - 1]),
@@ -341,10 +344,15 @@ def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> 
     return checked_grid(plant, [m for m in light if m.omega_rad_s < plant.nyquist_rad_s], n_log, per_mode)
 
 
-def _gains(law: Controller, plant: UncertainPlant, specification: Specification) -> list[dict[str, Any]]:
+def _shown_grid(law: Controller, plant: UncertainPlant, specification: Specification) -> Real:
+    """Frequencies of pictures, rad/s: from a thirtieth of the bandwidth on, or lower."""
     omega = _grid(plant, law, 150, 12)
     lowest = min(_SHOWN * plant.nyquist_rad_s, (specification.bandwidth_rad_s or math.inf) / 30)
-    curves = sensitivity_curves(plant, law, specification, omega[omega >= lowest])
+    return omega[omega >= lowest]
+
+
+def _gains(law: Controller, plant: UncertainPlant, specification: Specification) -> list[dict[str, Any]]:
+    curves = sensitivity_curves(plant, law, specification, _shown_grid(law, plant, specification))
     return [
         {
             "symbol": one.symbol,

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -77,10 +77,13 @@ class FrictionStep:
         As identified, at the step of the logs.
     size : float
         Of the step, in units of the output.
+    steps : dict of float
+        Steps of the loop's converters, by the names of `FrictionLoop`.
     """
 
     friction: FrictionFit
     size: float
+    steps: dict[str, float] = field(default_factory=dict)
 
     def curves(self, law: Controller, samples: int, given: Real) -> list[dict[str, Any]]:
         """The step without and with friction feed-forward: words, x [s] and y each.
@@ -95,7 +98,8 @@ class FrictionStep:
             ("with friction", None),
             ("with friction and its feed-forward", friction_feedforward(law, friction)),
         ):
-            run = FrictionLoop.of(replace(law, feedforward=feedforward), friction).run(reference)
+            loop = FrictionLoop.of(replace(law, feedforward=feedforward), friction, **self.steps)
+            run = loop.run(reference)
             found.append({"words": words, **line(run, samples)})
         return found
 
@@ -105,8 +109,10 @@ class FrictionStep:
         given: as of `curves`.
         """
         friction = resampled_friction(self.friction, law.dt_s)
-        step = np.append(0.0, np.full(given.size - 1, self.size))
-        return said("settling_range", FrictionLoop.of(law, friction).settling(step, given))
+        # From rest, as a run has it.
+        step = np.append(0.0, np.full(given.size, self.size))
+        loop = FrictionLoop.of(law, friction, **self.steps)
+        return said("settling_range", loop.settling(step, np.append(0.0, given)))
 
 
 def line(run: ClosedLoopTrajectory, shown: int) -> dict[str, Any]:
