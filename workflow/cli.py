@@ -508,6 +508,7 @@ def certify(
     source: Source,
     specification: DesignFile = None,
     time_limit: TimeLimit = None,
+    verbose: Verbose = False,
     quiet: Quiet = False,
     as_json: Json = False,
     **of_fields: Any,
@@ -523,7 +524,7 @@ def certify(
         from workflow.commands.certify import certify_controller
 
         summary = certify_controller(source, file, _settings(CommandFiles, of_fields), progress=progress)
-    _show(summary, as_json)
+    _show(summary, as_json, verbose=verbose)
     _leave(summary, EXIT_CHECK_FAILED)
 
 

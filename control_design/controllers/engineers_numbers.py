@@ -21,16 +21,14 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from control_design.controllers.law import Law
 from control_design.controllers.parts import Structure, frequency_of_corner, width_of_damping
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import count_integrators
-
-if TYPE_CHECKING:
-    from control_design.controllers.controller import Controller
 
 # Largest relative difference of the responses of record and controller: far below what any number is shown
 # with, far above the rounding of a state space of sixteen states.
@@ -336,13 +334,13 @@ class _Roots(NamedTuple):
         return self.real.size + 2 * len(self.pairs)
 
 
-def engineers_numbers(controller: Controller) -> ControllerNumbers | None:
+def engineers_numbers(controller: Law) -> ControllerNumbers | None:
     """Engineer's numbers of a controller of one error and one command.
 
     Parameters
     ----------
-    controller : Controller
-        Any order; limits, delay and feed-forward do not count.
+    controller : Law
+        A controller of any order; its limits, delay and feed-forward do not count.
 
     Returns
     -------
@@ -372,7 +370,8 @@ def engineers_numbers(controller: Controller) -> ControllerNumbers | None:
     v = np.geomspace(min(lowest, highest / _BEYOND), highest, _POINTS)
     omega = 2.0 / controller.dt_s * np.arctan(v)
     try:
-        wanted = controller.response(omega, with_delay=False)
+        # As a law: without the delay that a controller adds to its response.
+        wanted = Law.response(controller, omega)
     except np.linalg.LinAlgError:
         return None
     if not np.all(np.isfinite(wanted)) or not np.all(np.abs(wanted) > 0):
@@ -389,7 +388,7 @@ def engineers_numbers(controller: Controller) -> ControllerNumbers | None:
     )
 
 
-def _roots_of(controller: Controller) -> tuple[_Roots, _Roots, int] | None:
+def _roots_of(controller: Law) -> tuple[_Roots, _Roots, int] | None:
     """Zeros, poles but for the integrators, and number of integrators, in t; None where there is no such
     factorisation (see `engineers_numbers`)."""
     from scipy.linalg import eigvals

@@ -7,7 +7,7 @@ With p = (2/dt)(z - 1)/(z + 1)/scale, the Tustin plane of `biquads`, these are
     low-pass   w/(p + w), or w^2/(p^2 + 2 zeta w p + w^2)
 
 A part holds what is fixed, in units of the scale; what is free stands in the parameter vector of its cascade,
-in the order of the part's fields: Kp as it is, everything else as its logarithm. So a controller of free
+in the order of the part's `bounds`: Kp as it is, everything else as its logarithm, Td as its ratio to Tf. So a controller of free
 parameters only is stable but for its integrator, and has positive times. Frequencies w are those of the
 Tustin plane: w = tan(pi f dt)/h with h = dt scale/2 (`tustin_corner`), so that a notch at f has its depth at
 f, and a low-pass its corner, in discrete time exactly.
@@ -29,6 +29,12 @@ Structure = Literal["p", "pi", "pd", "pid"]
 # which every corner of a controller lies; exp() does not overflow in a wild step. The same as of the free
 # cascade.
 _LARGEST_LOG = 12.0
+# Td over Tf where Td is free, or Tf beside a fixed Td: below a tenth the derivative adds less than 10 % to the
+# gain, and its pole and zero are told apart no longer; ten thousand is no filter. Chosen.
+_DERIVATIVE_RATIOS = (0.1, 1e4)
+# Largest logarithm of a free Tf, in units of 1/scale: a filter twenty times slower than the loop leaves no
+# derivative. Chosen.
+_SLOWEST_FILTER_LOG = 3.0
 # Damping ratios that a free notch may have. Below .02 it is narrower than its mode is known; at 1 its poles
 # meet on the real axis, where a pair is told from two lags no longer.
 _NOTCH_DAMPING = (0.02, 0.99)
@@ -163,12 +169,14 @@ class PidPart(Part):
         """Kp, Ti, Td, Tf of free parameters x, in units of the scale; None where the structure has none."""
         free = iter([x[i] for i in range(self.parameters)])
         kp = next(free) if self.kp is None else self.kp
-        ti = td = tf = None
+        ti = None
+        td = None
+        tf = None
         if self.has_integral:
             ti = exp(next(free)) if self.ti is None else self.ti
         if self.has_derivative:
-            td = exp(next(free)) if self.td is None else self.td
             tf = exp(next(free)) if self.tf is None else self.tf
+            td = exp(next(free)) * tf if self.td is None else self.td
         return kp, ti, td, tf
 
     def coefficients(self, x: Any, exp: Callable[[Any], Any]) -> tuple[list[Any], list[Any]]:
@@ -183,16 +191,20 @@ class PidPart(Part):
         return [kp * (1.0 + td / tf), kp * (1.0 / tf + 1.0 / ti), kp / (ti * tf)], [1.0, 1.0 / tf, 0.0]
 
     def bounds(self) -> list[tuple[float, float]]:
-        """As `Part.bounds`: Kp has none, Tf the half sample."""
+        """As `Part.bounds`, of Kp, Ti, Tf and Td/Tf: Kp has none, Tf at least the half sample."""
         bounds = []
         if self.kp is None:
             bounds.append((-np.inf, np.inf))
         if self.has_integral and self.ti is None:
             bounds.append((-_LARGEST_LOG, _LARGEST_LOG))
-        if self.has_derivative and self.td is None:
-            bounds.append((-_LARGEST_LOG, _LARGEST_LOG))
         if self.has_derivative and self.tf is None:
-            bounds.append((float(np.log(self.shortest_filter)), _LARGEST_LOG))
+            shortest = float(np.log(self.shortest_filter))
+            longest = _SLOWEST_FILTER_LOG
+            if self.td is not None:
+                longest = float(np.log(self.td / _DERIVATIVE_RATIOS[0]))
+            bounds.append((shortest, max(shortest, longest)))
+        if self.has_derivative and self.td is None:
+            bounds.append((float(np.log(_DERIVATIVE_RATIOS[0])), float(np.log(_DERIVATIVE_RATIOS[1]))))
         return bounds
 
     def units(self, x: Real) -> list[float]:

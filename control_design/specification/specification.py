@@ -45,6 +45,7 @@ from control_design.specification.requirement import (
 )
 from control_design.specification.structure import (
     PID_STRUCTURES,
+    Fixed,
     LowPass,
     Notch,
     order_of_structure,
@@ -162,16 +163,12 @@ class Specification(Settings):
     structure: Literal["biquads", "p", "pi", "pd", "pid"] = Field(
         default="biquads",
         description="biquads: free cascade of controller_order; p, pi, pd, pid: Kp (1 + 1/(Ti s) + Td s/(Tf "
-        "s + 1)) or a part of it, with notches and low_pass; each number given below is fixed, what is left "
-        "out is chosen by the synthesis",
+        "s + 1)) or a part of it, with notches and low_pass; numbers that are given are fixed, the others "
+        "are chosen by the synthesis",
     )
-    kp: float | None = Field(
-        default=None, allow_inf_nan=False, description="Kp of p, pi, pd, pid, input unit per measured unit"
-    )
-    ti_s: _Positive | None = Field(default=None, description="Ti of pi and pid, s")
-    td_s: _Positive | None = Field(default=None, description="Td of pd and pid, s")
-    tf_s: _Positive | None = Field(
-        default=None, description="Tf of pd and pid, s: filter of the derivative, half a period at least"
+    fixed: Fixed = Field(
+        default=Fixed(),
+        description="numbers of p, pi, pd, pid that are fixed: kp, ti_s, td_s, tf_s, e.g. {ti_s = 0.5}",
     )
     notches: tuple[Notch, ...] = Field(
         default=(),

@@ -9,7 +9,7 @@ controller itself (`controllers.parts`).
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, Literal, Protocol
 
 from pydantic import Field, model_validator
 
@@ -24,9 +24,6 @@ from control_design.controllers.parts import (
 )
 from ident.data.settings import Settings
 
-if TYPE_CHECKING:
-    from control_design.specification.specification import Specification
-
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 PID_STRUCTURES = ("p", "pi", "pd", "pid")
@@ -35,6 +32,19 @@ PID_STRUCTURES = ("p", "pi", "pd", "pid")
 _SAME_FREQUENCY = 1e-6
 # Decibels of a factor of ten in amplitude.
 _DECIBELS = 20.0
+
+
+class Fixed(Settings):
+    """Numbers of the PID that are fixed; what is left out is chosen by the synthesis."""
+
+    kp: float | None = Field(
+        default=None, allow_inf_nan=False, description="Kp of p, pi, pd, pid, input unit per measured unit"
+    )
+    ti_s: _Positive | None = Field(default=None, description="Ti of pi and pid, s")
+    td_s: _Positive | None = Field(default=None, description="Td of pd and pid, s")
+    tf_s: _Positive | None = Field(
+        default=None, description="Tf of pd and pid, s: filter of the derivative, half a period at least"
+    )
 
 
 class Notch(Settings):
@@ -81,39 +91,59 @@ class LowPass(Settings):
         return self
 
 
-def refuse_contradictions(spec: Specification) -> None:
+class Structured(Protocol):
+    """What these functions read of a specification."""
+
+    @property
+    def structure(self) -> Literal["biquads", "p", "pi", "pd", "pid"]:
+        """The structure that is asked for."""
+
+    @property
+    def fixed(self) -> Fixed:
+        """Numbers of the PID that are fixed."""
+
+    @property
+    def notches(self) -> tuple[Notch, ...]:
+        """In any order."""
+
+    @property
+    def low_pass(self) -> LowPass | None:
+        """None without one."""
+
+
+def refuse_contradictions(spec: Structured) -> None:
     """Refuse parameters of a structure that the specification has not, and contradictions between them.
 
     Parameters
     ----------
-    spec : Specification
-        Its fields structure, kp, ti_s, td_s, tf_s, notches and low_pass.
+    spec : Structured
 
     Raises
     ------
     ValueError
         One line that names the key.
     """
-    has = {
-        "kp": spec.structure in PID_STRUCTURES,
-        "ti_s": spec.structure in ("pi", "pid"),
-        "td_s": spec.structure in ("pd", "pid"),
-        "tf_s": spec.structure in ("pd", "pid"),
-        "notches": spec.structure in PID_STRUCTURES,
-        "low_pass": spec.structure in PID_STRUCTURES,
+    is_pid = spec.structure in PID_STRUCTURES
+    has_derivative = spec.structure in ("pd", "pid")
+    given = {
+        "fixed.kp": (spec.fixed.kp is not None, is_pid),
+        "fixed.ti_s": (spec.fixed.ti_s is not None, spec.structure in ("pi", "pid")),
+        "fixed.td_s": (spec.fixed.td_s is not None, has_derivative),
+        "fixed.tf_s": (spec.fixed.tf_s is not None, has_derivative),
+        "notches": (bool(spec.notches), is_pid),
+        "low_pass": (spec.low_pass is not None, is_pid),
     }
-    for key, is_part in has.items():
-        value = getattr(spec, key)
-        if value is not None and value != () and not is_part:
+    for key, (is_given, is_part) in given.items():
+        if is_given and not is_part:
             raise ValueError(
                 f"{key} is given, but a controller of structure {spec.structure!r} has none: leave it out "
-                f"or take structure = {'pi' if key == 'ti_s' else 'pid'!r}"
+                f"or take structure = {'pi' if key == 'fixed.ti_s' else 'pid'!r}"
             )
-    if spec.kp == 0:
-        raise ValueError("kp must not be 0")
-    if spec.low_pass is not None and spec.low_pass.order == 1 and has["tf_s"]:
+    if spec.fixed.kp == 0:
+        raise ValueError("fixed.kp must not be 0")
+    if spec.low_pass is not None and spec.low_pass.order == 1 and has_derivative:
         raise ValueError(
-            f"low_pass of order 1 beside tf_s: structure {spec.structure!r} has a filter of first order, Tf; "
+            f"low_pass of order 1 beside Tf: structure {spec.structure!r} has a filter of first order, Tf; "
             "take order = 2"
         )
     stated = sorted(notch.frequency_hz for notch in spec.notches if notch.frequency_hz is not None)
@@ -124,7 +154,7 @@ def refuse_contradictions(spec: Specification) -> None:
             )
 
 
-def order_of_structure(spec: Specification) -> int:
+def order_of_structure(spec: Structured) -> int:
     """Number of states of a structure p, pi, pd or pid with its notches and low-pass."""
     order = {"p": 0, "pi": 1, "pd": 1, "pid": 2}[spec.structure] + 2 * len(spec.notches)
     if spec.low_pass is not None:
@@ -132,12 +162,12 @@ def order_of_structure(spec: Specification) -> int:
     return order
 
 
-def refuse_sampling(spec: Specification, dt_s: float) -> None:
+def refuse_sampling(spec: Structured, dt_s: float) -> None:
     """Refuse fixed parameters that a controller of this period cannot have.
 
     Parameters
     ----------
-    spec : Specification
+    spec : Structured
     dt_s : float
         Period of the controller, s, positive.
 
@@ -172,19 +202,20 @@ def refuse_sampling(spec: Specification, dt_s: float) -> None:
     corner_hz = None if spec.low_pass is None else spec.low_pass.frequency_hz
     if corner_hz is not None and not corner_hz < nyquist_hz:
         raise ValueError(f"low_pass: frequency_hz = {corner_hz:.6g} must be below {at_rate}")
-    if spec.tf_s is not None and not spec.tf_s >= dt_s / 2:
+    tf_s = spec.fixed.tf_s
+    if tf_s is not None and not tf_s >= dt_s / 2:
         raise ValueError(
-            f"tf_s = {spec.tf_s:.6g} s is faster than the sample: at least {dt_s / 2:.6g} s, half of the "
+            f"fixed.tf_s = {tf_s:.6g} s is faster than the sample: at least {dt_s / 2:.6g} s, half of the "
             f"controller's period, below which the command alternates"
         )
 
 
-def parts_of(spec: Specification, dt_s: float, scale_rad_s: float) -> tuple[Part, ...]:
+def parts_of(spec: Structured, dt_s: float, scale_rad_s: float) -> tuple[Part, ...]:
     """Parts of a cascade: the PID, the low-pass, and the notches, those of which nothing is fixed last.
 
     Parameters
     ----------
-    spec : Specification
+    spec : Structured
         Of a structure p, pi, pd or pid, that `refuse_sampling` has passed.
     dt_s : float
         Period of the controller, s.
@@ -205,10 +236,10 @@ def parts_of(spec: Specification, dt_s: float, scale_rad_s: float) -> tuple[Part
     assert structure != "biquads"
     pid = PidPart(
         structure=structure,
-        kp=spec.kp,
-        ti=scaled(spec.ti_s),
-        td=scaled(spec.td_s),
-        tf=scaled(spec.tf_s),
+        kp=spec.fixed.kp,
+        ti=scaled(spec.fixed.ti_s),
+        td=scaled(spec.fixed.td_s),
+        tf=scaled(spec.fixed.tf_s),
         shortest_filter=half_sample,
     )
     parts: list[Part] = [pid]

@@ -482,10 +482,13 @@ class StartMaker:
                     own.append(1.0)
                 if part.has_integral and part.ti is None:
                     own.append(np.log(10 ** self.rng.uniform(*_TI_DECADES)) - log_crossover)
-                if part.has_derivative and part.td is None:
-                    own.append(np.log(10 ** self.rng.uniform(*_TD_DECADES)) - log_crossover)
+                log_tf = np.log(10 ** self.rng.uniform(*_TF_DECADES)) - log_crossover
+                if part.tf is not None:
+                    log_tf = np.log(part.tf)
                 if part.has_derivative and part.tf is None:
-                    own.append(np.log(10 ** self.rng.uniform(*_TF_DECADES)) - log_crossover)
+                    own.append(log_tf)
+                if part.has_derivative and part.td is None:
+                    own.append(np.log(10 ** self.rng.uniform(*_TD_DECADES)) - log_crossover - log_tf)
             elif isinstance(part, NotchPart):
                 if part.corner is None:
                     at_mode = corners.size > 0 and self.rng.uniform() >= _NOTCH_ANYWHERE

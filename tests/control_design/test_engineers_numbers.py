@@ -61,7 +61,7 @@ def test_a_pid_is_the_textbook_formula_by_the_trapezoidal_rule():
     """Kp (1 + 1/(Ti s) + Td s/(Tf s + 1)) with s = (2/dt)(z - 1)/(z + 1), term by term."""
     dt_s, kp, ti_s, td_s, tf_s = 0.002, -3.0, 0.4, 0.05, 0.004
     fixed = {"kp": kp, "ti_s": ti_s, "td_s": td_s, "tf_s": tf_s}
-    law = _controller(Specification(structure="pid", **fixed), np.zeros(0), dt_s, 50.0)
+    law = _controller(Specification(structure="pid", fixed=fixed), np.zeros(0), dt_s, 50.0)
     omega = np.geomspace(0.1, 1500.0, 100)
     z = np.exp(1j * omega * dt_s)
     s = 2 / dt_s * (z - 1) / (z + 1)
@@ -77,7 +77,9 @@ def test_a_notch_has_its_depth_at_its_frequency_and_its_width_in_discrete_time(f
     """Also at 90 of 100 Hz, where a notch that were not warped would sit at 57 Hz."""
     dt_s, depth_db, width_hz = 0.005, 14.0, 2.0
     notch = {"frequency_hz": frequency_hz, "depth_db": depth_db, "width_hz": width_hz}
-    law = _controller(Specification(structure="p", kp=1.0, notches=[notch]), np.zeros(0), dt_s, 40.0)
+    law = _controller(
+        Specification(structure="p", fixed={"kp": 1.0}, notches=[notch]), np.zeros(0), dt_s, 40.0
+    )
 
     def gain(hertz):
         return np.abs(law.response(2 * np.pi * np.atleast_1d(hertz), with_delay=False))
@@ -94,7 +96,9 @@ def test_a_notch_has_its_depth_at_its_frequency_and_its_width_in_discrete_time(f
 
 def test_a_low_pass_has_its_corner_in_discrete_time():
     low_pass = {"frequency_hz": 60.0, "damping": 0.6}
-    law = _controller(Specification(structure="p", kp=1.0, low_pass=low_pass), np.zeros(0), 0.005, 40.0)
+    law = _controller(
+        Specification(structure="p", fixed={"kp": 1.0}, low_pass=low_pass), np.zeros(0), 0.005, 40.0
+    )
     at_corner = law.response(np.array([2 * np.pi * 60.0]), with_delay=False)[0]
     assert abs(at_corner) == pytest.approx(1 / (2 * 0.6), rel=1e-9)
     assert np.angle(at_corner) == pytest.approx(-np.pi / 2, rel=1e-9)
@@ -171,7 +175,11 @@ def test_the_constants_of_the_c_header_are_the_controller():
 def test_a_design_keeps_what_is_fixed_and_is_certified():
     plant = uncertain_hub(0.03)
     specification = Specification(
-        **_WISH, structure="pid", ti_s=2.0, notches=[{"frequency_hz": 2.4, "depth_db": 10.0}], low_pass={}
+        **_WISH,
+        structure="pid",
+        fixed={"ti_s": 2.0},
+        notches=[{"frequency_hz": 2.4, "depth_db": 10.0}],
+        low_pass={},
     )
     result = synthesise([plant], specification, _QUICK, rng=np.random.default_rng(1))
     assert certify(result.controller, [plant], specification).certified
@@ -189,13 +197,13 @@ def test_a_controller_of_which_all_is_fixed_is_checked_as_it_is():
     pid = engineers_numbers(found.controller).pid
     typed = {"kp": pid.kp, "td_s": pid.td_s, "tf_s": pid.tf_s}
     again = synthesise(
-        [plant], Specification(**_WISH, structure="pd", **typed), _QUICK, rng=np.random.default_rng(1)
+        [plant], Specification(**_WISH, structure="pd", fixed=typed), _QUICK, rng=np.random.default_rng(1)
     )
     assert again.outcome is Outcome.MET_ON_GRID
     assert again.gamma == pytest.approx(found.gamma, rel=1e-6)
     turned = typed | {"kp": -pid.kp}
     unstable = synthesise(
-        [plant], Specification(**_WISH, structure="pd", **turned), _QUICK, rng=np.random.default_rng(1)
+        [plant], Specification(**_WISH, structure="pd", fixed=turned), _QUICK, rng=np.random.default_rng(1)
     )
     assert unstable.outcome is Outcome.NOT_CONVERGED
     assert unstable.blocking[0].weight == "stability of the nominal loop"
@@ -204,13 +212,13 @@ def test_a_controller_of_which_all_is_fixed_is_checked_as_it_is():
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"structure": "pid", "ti_s": 0.0}, "ti_s: input should be greater than 0"),
+        ({"structure": "pid", "fixed": {"ti_s": 0.0}}, "fixed.ti_s: input should be greater than 0"),
         ({"structure": "pid", "notches": [{"depth_db": -3.0}]}, "depth_db: input should be greater than 0"),
         ({"structure": "pid", "notches": [{"frequency_hz": 3.0}] * 2}, "two notches at one frequency"),
-        ({"structure": "pd", "ti_s": 0.1}, "structure 'pd' has none"),
-        ({"structure": "pi", "td_s": 0.1}, "structure 'pi' has none"),
+        ({"structure": "pd", "fixed": {"ti_s": 0.1}}, "structure 'pd' has none"),
+        ({"structure": "pi", "fixed": {"td_s": 0.1}}, "structure 'pi' has none"),
         ({"notches": [{}]}, "structure 'biquads' has none"),
-        ({"structure": "p", "kp": 0.0}, "kp must not be 0"),
+        ({"structure": "p", "fixed": {"kp": 0.0}}, "kp must not be 0"),
         ({"structure": "pid", "controller_order": 4}, "leave controller_order out"),
         ({"structure": "pid", "integrator": False}, "leave integrator out"),
         ({"structure": "pid", "low_pass": {"order": 1}}, "take order = 2"),
@@ -230,7 +238,7 @@ def test_parameters_that_contradict_are_refused_in_one_line(fields, words):
         ({"notches": [{"frequency_hz": 120.0}]}, "must be below half of the controller's rate, 100 Hz"),
         ({"notches": [{"frequency_hz": 10.0, "width_hz": 19.5}]}, "too wide for a notch at 10 Hz"),
         ({"low_pass": {"frequency_hz": 100.0}}, "low_pass: frequency_hz = 100 must be below"),
-        ({"tf_s": 0.002}, "tf_s = 0.002 s is faster than the sample: at least 0.0025 s"),
+        ({"fixed": {"tf_s": 0.002}}, "fixed.tf_s = 0.002 s is faster than the sample: at least 0.0025 s"),
     ],
 )
 def test_parameters_that_the_rate_cannot_have_are_refused(fields, words):

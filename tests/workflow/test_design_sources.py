@@ -253,6 +253,24 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
     [
         ("sensitivity_weight = { numerator = [1.0], denominator = [1.0, -2.0] }", "weight is unstable"),
         ("structure = 'pid'\nintegrator = true\ncontroller_order = 1", "leave controller_order out"),
+        (
+            "structure = 'pid'\nfixed = { ti_s = 0.0 }",
+            "specification.fixed.ti_s: input should be greater",
+        ),
+        (
+            "structure = 'pid'\nnotches = [{ depth_db = -3.0 }]",
+            "notches[0].depth_db: input should be",
+        ),
+        ("structure = 'pd'\nfixed = { ti_s = 0.5 }", "structure 'pd' has none"),
+        ("structure = 'pid'\nfixed = { tf_s = 0.001 }", "faster than the sample: at least 0.025 s"),
+        (
+            "structure = 'pid'\nnotches = [{ frequency_hz = 12.0 }]",
+            "notch 1: frequency_hz = 12 must be below half of the controller's rate, 10 Hz",
+        ),
+        (
+            "structure = 'pid'\nnotches = [{ frequency_hz = 2.0 }, { frequency_hz = 2.0 }]",
+            "two notches at one frequency, 2 Hz",
+        ),
         ("bandwith_rad_s = 1.0", "did you mean bandwidth_rad_s"),
         ("[uncertainty]\nmultiplicative = { numerator = [1.0], denominator = [1.0, -2.0] }", "unstable"),
         ("[uncertainty]\nmultiplicative = { numerator = [1.0], denominator = [1.0, 0.0] }", "imaginary axis"),

@@ -152,18 +152,19 @@ def certify_controller(
     }
     doubts = [words(doubt) for doubt in done.certificate.warnings]
     numbers = engineers_numbers(law)
+    shown = {
+        "sources": sources,
+        "law": law,
+        "numbers": numbers,
+        "worst": worst,
+        "found": found,
+        "held": held,
+        "certificate": done.certificate,
+    }
     return RunSummary(
         title=f"certificate of {controller}",
-        sections=rows_of(
-            "summary/certify.j2",
-            sources=sources,
-            law=law,
-            numbers=numbers,
-            worst=worst,
-            found=found,
-            held=held,
-            certificate=done.certificate,
-        ),
+        sections=rows_of("summary/certify.j2", whole=True, **shown),
+        brief=rows_of("summary/certify.j2", whole=False, **shown),
         numbers={
             "plants": [{"plant": source.plant.name, "origin": source.origin} for source in sources],
             "controller": str(controller),

@@ -41,10 +41,7 @@ from workflow.text.templates import said
 UNKNOWN_TO_BRACKET = (
     "controller_order",
     "structure",
-    "kp",
-    "ti_s",
-    "td_s",
-    "tf_s",
+    "fixed",
     "notches",
     "low_pass",
     "controller_damping",
