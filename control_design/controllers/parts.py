@@ -7,10 +7,10 @@ With p = (2/dt)(z - 1)/(z + 1)/scale, the Tustin plane of `biquads`, these are
     low-pass   w/(p + w), or w^2/(p^2 + 2 zeta w p + w^2)
 
 A part holds what is fixed, in units of the scale; what is free stands in the parameter vector of its cascade,
-in the order of the part's `bounds`: Kp as it is, everything else as its logarithm, Td as its ratio to Tf. So a controller of free
-parameters only is stable but for its integrator, and has positive times. Frequencies w are those of the
-Tustin plane: w = tan(pi f dt)/h with h = dt scale/2 (`tustin_corner`), so that a notch at f has its depth at
-f, and a low-pass its corner, in discrete time exactly.
+in the order of the part's `bounds`: Kp as it is, everything else as its logarithm, Td as its ratio to Tf. So
+a controller of free parameters only is stable but for its integrator, and has positive times. Frequencies w
+are those of the Tustin plane: w = tan(pi f dt)/h with h = dt scale/2 (`tustin_corner`), so that a notch at f
+has its depth at f, and a low-pass its corner, in discrete time exactly.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Structure = Literal["p", "pi", "pd", "pid"]
 # which every corner of a controller lies; exp() does not overflow in a wild step. The same as of the free
 # cascade.
 _LARGEST_LOG = 12.0
-# Td over Tf where Td is free, or Tf beside a fixed Td: below a tenth the derivative adds less than 10 % to the
-# gain, and its pole and zero are told apart no longer; ten thousand is no filter. Chosen.
+# Td over Tf where Td is free, or Tf beside a fixed Td: below a tenth the derivative adds less than 10 % to
+# the gain, and its pole and zero are told apart no longer; ten thousand is no filter. Chosen.
 _DERIVATIVE_RATIOS = (0.1, 1e4)
 # Largest logarithm of a free Tf, in units of 1/scale: a filter twenty times slower than the loop leaves no
 # derivative. Chosen.

@@ -129,6 +129,7 @@ def test_a_fixed_notch_is_certified_on_the_simulated_link_and_runs_as_c(flexlink
     text = re.sub(r"^bandwidth_rad_s = .*$", "bandwidth_rad_s = 5.0", text, flags=re.MULTILINE)
     asked = 'structure = "pid"\nnotches = [{ frequency_hz = 8.0, depth_db = 10.0 }]\nlow_pass = {}\n'
     text = text.replace("[specification]\n", f"[specification]\n{asked}")
+    text += "\n[certificate]\njoint_draws = 0\n\n[achievable_performance]\ncompute = false\n"
     (tmp_path / "own.toml").write_text(text)
     out = tmp_path / "run"
     answer = flexlink("run", "--config", tmp_path / "own.toml", "--out", out, "--c-prefix", "hub")

@@ -150,7 +150,9 @@ def design_controller(
             out, law, prefilter.filter, certified=certify.certified, about=known, dialect=dialect
         )
     missed = gamma is not None and gamma > 1
-    advice = (said("order_advice", achievable, gamma, order) or None) if missed else None
+    advice = (
+        (said("order_advice", achievable, gamma, order, specification.structure) or None) if missed else None
+    )
     reason = said("design_verdict", design, certify.certificate, advice, specification)
     shares = joint_numbers(certify.sampled)
     names = [plant.name for plant in plants]

@@ -49,7 +49,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
         reached, order = results.achievable_performance, specification.controller_order
-        advice = said("order_advice", reached, design.gamma, order)
+        advice = said("order_advice", reached, design.gamma, order, specification.structure)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         conditions = results.uncertainty.conditions(config)

@@ -138,7 +138,8 @@ def verdict_of(
     designed for, both."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
-        advice = said("order_advice", achievable, design.gamma, order)
+        structure = "biquads" if asked is None else asked.structure
+        advice = said("order_advice", achievable, design.gamma, order, structure)
     told = ". Also, ".join(words(doubt) for doubt in conditions)
     return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked)
 
