@@ -329,7 +329,7 @@ class _Roots(NamedTuple):
         return cls(-roots[~is_pair].real, pairs)
 
     @property
-    def count(self) -> int:
+    def number(self) -> int:
         """Number of roots."""
         return self.real.size + 2 * len(self.pairs)
 
@@ -377,7 +377,9 @@ def engineers_numbers(controller: Law) -> ControllerNumbers | None:
     if not np.all(np.isfinite(wanted)) or not np.all(np.abs(wanted) > 0):
         return None
 
-    gain, zeros, poles = _sharpened(1j * v, wanted, zeros, poles, integrators)
+    gain, zeros, poles = _sharpened(
+        np.asarray(1j * v, dtype=np.complex128), wanted, zeros, poles, integrators
+    )
     found = _put_together(controller.dt_s, gain, zeros, poles, integrators)
     error = float(np.max(np.abs(found.response(omega) / wanted - 1.0)))
     if not error <= LARGEST_ERROR:
@@ -444,8 +446,8 @@ def _sharpened(
                 break
             step = np.linalg.lstsq(rows, right, rcond=1e-13)[0] * np.array(scales)
             new_gain = gain * (1.0 + float(step[0]))
-            new_zeros = _moved(zeros, step[1 : 1 + zeros.count])
-            new_poles = _moved(poles, step[1 + zeros.count :])
+            new_zeros = _moved(zeros, step[1 : 1 + zeros.number])
+            new_poles = _moved(poles, step[1 + zeros.number :])
             mismatch = _mismatch(t, wanted, new_gain, new_zeros, new_poles, integrators)
             if not mismatch < best:
                 break
@@ -596,11 +598,11 @@ def _pid(
 
     and likewise for what is left of it. Times have to be positive (Tf may be 0).
     """
-    polynomial = np.ones(1)
+    polynomial: Real = np.ones(1)
     for r in real_zeros:
-        polynomial = np.polymul([1.0 / r, 1.0], polynomial)
+        polynomial = np.asarray(np.polymul([1.0 / r, 1.0], polynomial), dtype=np.float64)
     for a, b in zero_pairs:
-        polynomial = np.polymul([1.0 / b, a / b, 1.0], polynomial)
+        polynomial = np.asarray(np.polymul([1.0 / b, a / b, 1.0], polynomial), dtype=np.float64)
     n_zeros = polynomial.size - 1
     if integrators > 1 or n_zeros > integrators + 1:
         return None

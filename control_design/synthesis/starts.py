@@ -117,8 +117,9 @@ _LEAD_JITTER = 0.1
 # Zero of the PI section over the crossover: it costs 3 degrees of phase there. Halved or doubled: 7.4 and
 # 8.0, 7.5 and 2.0.
 _PI_ZERO = 0.05
-# Starts of parts. All are ranges of draws, chosen wide, as the best of many draws is taken; what they are
-# worth is seen in the worst cases of `benchmarks.engineers_structures`.
+# Starts of parts. All are ranges of draws, chosen wide, as the best of many draws is taken. With all of them
+# half or twice as wide, the worst cases of four designs (PID, PD and PI with notches, on a hub and on two
+# links) move by at most .03 %.
 
 # Crossover of a draw over the highest frequency at which tracking is asked, else over the scale.
 _PART_CROSSOVER_DECADES = (-0.7, 0.3)

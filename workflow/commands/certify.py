@@ -152,7 +152,7 @@ def certify_controller(
     }
     doubts = [words(doubt) for doubt in done.certificate.warnings]
     numbers = engineers_numbers(law)
-    shown = {
+    shown: dict[str, Any] = {
         "sources": sources,
         "law": law,
         "numbers": numbers,
