@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from control_design.controllers.anti_windup import anti_windup_gain, anti_windup_radius
+from control_design.controllers.engineers_numbers import ControllerNumbers, engineers_numbers
 from control_design.controllers.law import Law
 from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.plant_set import delayed
@@ -261,14 +262,17 @@ class Controller(Law):
             described[name]["dt_s"] = self.dt_s
         return described
 
+    def engineers_numbers(self) -> ControllerNumbers | None:
+        """The law of one loop as Kp, Ti, Td, Tf, notches and low-passes, or as leads, lags and other factors,
+        without the computational delay; None where it has none (see `controllers.engineers_numbers`)."""
+        return engineers_numbers(self)
+
     def to_dict(self) -> dict[str, Any]:
         """As of `Law`, with the law of one loop in an engineer's numbers beside it, under `engineers_numbers`
-        (without the computational delay; null where it has no such factors). Reading ignores them."""
-        from control_design.controllers.engineers_numbers import engineers_numbers
-
+        (null where it has none). Reading ignores them."""
         plain = super().to_dict()
         if self.D.size == 1:
-            numbers = engineers_numbers(self)
+            numbers = self.engineers_numbers()
             plain["engineers_numbers"] = None if numbers is None else numbers.to_dict()
         return plain
 
