@@ -304,6 +304,8 @@ def synthesise_near(
     tell = progress or (lambda fraction, message: None)
     problem = Problem(tuple(plants), _seen_by_the_data(specification, plants), options or SynthesisOptions())
     cascade = problem.cascade()
+    if not cascade.parameters:
+        return _result(problem, cascade, _as_fixed(problem, cascade), (), tell)
     omega = problem.grids[0]
     known = FreeController(omega, controller.response(omega, with_delay=False))
     # No bound is known: nothing counts as near to it.

@@ -16,6 +16,7 @@ from control_design.controllers.engineers_numbers import (
     PidNumbers,
     engineers_numbers,
 )
+from control_design.synthesis.synthesis import synthesise_near
 
 from .plants import uncertain_hub
 
@@ -201,6 +202,9 @@ def test_a_controller_of_which_all_is_fixed_is_checked_as_it_is():
     )
     assert again.outcome is Outcome.MET_ON_GRID
     assert again.gamma == pytest.approx(found.gamma, rel=1e-6)
+    asked = Specification(**_WISH, structure="pd", fixed=typed)
+    near = synthesise_near(found.controller, [plant], asked, _QUICK, rng=np.random.default_rng(1))
+    assert near.gamma == again.gamma
     turned = typed | {"kp": -pid.kp}
     unstable = synthesise(
         [plant], Specification(**_WISH, structure="pd", fixed=turned), _QUICK, rng=np.random.default_rng(1)

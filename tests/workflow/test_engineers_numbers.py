@@ -29,6 +29,16 @@ low_pass = { frequency_hz = 7.0, damping = 0.7 }
 [uncertainty]
 multiplicative = 0.05
 """
+FREE = """
+[specification]
+bandwidth_rad_s = 0.7
+modulus_margin = 0.4
+effort_limit = 20.0
+controller_order = 3
+
+[uncertainty]
+multiplicative = 0.05
+"""
 
 
 def _asked(path):
@@ -110,6 +120,11 @@ def test_tune_keeps_the_notch_and_draws_the_loop(tmp_path):
     poles = np.sort_complex(np.array(real) + 1j * np.array(imaginary))
     np.testing.assert_allclose(poles, np.sort_complex(nominal.poles()), atol=1e-4)
     assert len(seen["roots"]["controller poles"][0]) == 6
+    # Of a free cascade the page may ask for a PID.
+    (tmp_path / "free.toml").write_text(FREE + QUICK)
+    session = TuningSession([plant], read_design_file(tmp_path / "free.toml"), tmp_path / "saved", 2006)
+    found = session.design({"structure": "pid"})
+    assert dict(found["numbers"])["controller"].startswith("PID Kp = ")
 
 
 @pytest.mark.slow
