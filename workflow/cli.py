@@ -55,6 +55,11 @@ _READING = (
     *("input_name", "output_name", "reference", "time", "time_unit", "dt_s"),
     *("scale", "units", "unwrap", "decimal", "input_limit", "controller_period_s", "command_averaged"),
 )
+# Keys of [specification] that options change most often; all others stand in a configuration.
+_OF_SPECIFICATION = (
+    *("bandwidth_rad_s", "lowest_bandwidth_rad_s", "modulus_margin", "effort_limit", "mode_peak_ratio"),
+    *("controller_order", "controller_dt_s", "delay_margin_s"),
+)
 _OF_LOOP = ("input_name", "output_name", "reference", "time", "time_unit", "decimal", "dt_s")
 _SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
 _MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
@@ -97,6 +102,15 @@ Scheduler = Annotated[
     str | None,
     typer.Option(
         help="Compute on the workers of a Dask cluster, e.g. tcp://host:8786 (extra 'distributed')."
+    ),
+]
+Earlier = Annotated[
+    Path | None,
+    typer.Option(
+        "--from",
+        metavar="RUN",
+        help="Take over from this run every stage that was made from the same; without logs or --config also "
+        "its configuration, with the options below changed. It stays as it is.",
     ),
 ]
 Resume = Annotated[
@@ -192,13 +206,14 @@ def _root(
 
 
 @app.command(short_help="Everything, from records to report.html.")
-@with_fields(reading=_READING)
+@with_fields(reading=_READING, specification=_OF_SPECIFICATION)
 def run(
     log: SomeLogs = None,
     config: Config = None,
     out: Annotated[
         Path | None, typer.Option(help="Run directory, new or empty [default: runs/<name>-<date>-<time>]")
     ] = None,
+    earlier: Earlier = None,
     resume: Resume = False,
     replace: Replace = False,
     c_prefix: CPrefix = None,
@@ -211,6 +226,7 @@ def run(
 ) -> None:
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config, *(log or []))
+    typed = _stated({name: of_fields.pop(name) for name in _OF_SPECIFICATION})
     if not log and (given := [option_name(name) for name in _stated(of_fields)]):
         raise InputError(
             f"{given[0]} says how logs are read: name them, as in flexlink run LOG... {given[0]}"
@@ -223,6 +239,8 @@ def run(
             out,
             log or (),
             _reading(of_fields),
+            earlier_path=earlier,
+            typed=_specified(typed),
             resume=resume,
             replace=replace,
             c_code=_c_code(c_prefix, c_float),
@@ -752,6 +770,27 @@ def _reading(given: Mapping[str, Any]) -> Reading:
         pairs, option = _named(option_name(name), given.get(name)), option_name(name)
         stated[name] = pairs if name == "units" else {key: _number(option, pairs[key]) for key in pairs}
     return _settings(Reading, stated)
+
+
+def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of [specification] as options state them, each within its range. Raises InputError naming the
+    option."""
+    from pydantic import TypeAdapter, ValidationError
+
+    from control_design.specification import Specification
+
+    found = dict(typed)
+    order = found.get("controller_order")
+    if isinstance(order, str) and order.isdigit():  # a number, or "auto"
+        found["controller_order"] = int(order)
+    for name, value in found.items():
+        field = Specification.model_fields[name]
+        try:
+            TypeAdapter(Annotated[field.annotation, field]).validate_python(value)
+        except ValidationError as error:
+            reason = error.errors()[0]["msg"]
+            raise InputError(f"{option_name(name)}: {reason[0].lower()}{reason[1:]}, got {value}") from error
+    return found
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:

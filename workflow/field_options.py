@@ -32,6 +32,9 @@ _NAMES = {
     "gain_rad_per_Vs": "--gain",
     "noise_std_rad": "--noise-std",
     "lead_in_s": "--lead-in",
+    "bandwidth_rad_s": "--bandwidth",
+    "lowest_bandwidth_rad_s": "--lowest-bandwidth",
+    "controller_order": "--order",
 }
 _BY_COLUMN = "COLUMN=VALUE (repeatable): "
 
@@ -59,6 +62,7 @@ SETTINGS = {
     "plan": "plant.experiment_plan:ExperimentPlan",
     "limits": "workflow.tasks.experiment:ExperimentLimits",
     "files": "workflow.config.command_files:CommandFiles",
+    "specification": "control_design.specification:Specification",
     "simulator": "workflow.diagnose.simulator_settings:SimulatorSettings",
 }
 

@@ -76,8 +76,7 @@ def unidentified(monkeypatch: pytest.MonkeyPatch) -> None:
     """`flexlink init` writes what it makes of the logs before it identifies them, within a second."""
     from workflow.commands import init
 
-    def decided(command, logs, file, stated, progress):
-        config, text, found = init.drafted(command, logs, file, stated)
-        return config, text, {}, found
+    def decided(command, logs, file, stated, progress, run):
+        return init.drafted(command, logs, file, stated)
 
     monkeypatch.setattr(init, "decided", decided)

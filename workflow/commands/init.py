@@ -29,6 +29,7 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.changed_specification import with_typed
 from workflow.tasks.early_refusals import (
     naming_readings,
     refuse_constant_input,
@@ -48,7 +49,8 @@ _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 class Found:
     """What the template of the configuration shows, of a command. scale, units: as stated, and the sign that
     is turned; before: the draft that the logs were identified by, where `draft` is what followed; refused:
-    why no friction is identified although it may be there."""
+    why no friction is identified although it may be there; typed: keys of the specification that the user
+    stated."""
 
     command: str
     logs: tuple[Path, ...]
@@ -61,6 +63,7 @@ class Found:
     doubts: tuple[Finding, ...]
     before: Draft | None = None
     refused: str = ""
+    typed: frozenset[str] = frozenset()
 
 
 def init(
@@ -76,7 +79,8 @@ def init(
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
-    config, text, _, found = decided("init", logs, out, stated, progress)
+    with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+        config, text, found = decided("init", logs, out, stated, progress, RunDirectory(Path(folder)))
     storage.write_text(out, text)
     look, draft = found.draft.look, found.draft
     return RunSummary(
@@ -100,21 +104,57 @@ def init(
 
 
 def decided(
-    command: str, logs: Sequence[Path], file: Path, stated: Reading | None, progress: Progress | None
-) -> tuple[RunConfig, str, dict[str, bytes], Found]:
-    """The configuration of logs, to stand in a file, with a specification that follows from the model they
-    were identified by; its text, the files of the stages up to that model, and what was seen. Raises
-    InputError."""
+    command: str,
+    logs: Sequence[Path],
+    file: Path,
+    stated: Reading | None,
+    progress: Progress | None,
+    run: RunDirectory,
+    *,
+    earlier: RunDirectory | None = None,
+    typed: Mapping[str, Any] | None = None,
+) -> tuple[RunConfig, str, Found]:
+    """The configuration of logs, with a specification that follows from the model they were identified by.
+
+    Parameters
+    ----------
+    command : str
+        What a complaint says to type again.
+    logs : sequence of Path
+    file : Path
+        Where the configuration is to stand; nothing is written there.
+    stated : Reading, optional
+        How the logs are read.
+    progress : Progress, optional
+    run : RunDirectory
+        The stages up to the uncertain plant are made in this directory; what is there is replaced.
+    earlier : RunDirectory, optional
+        Whose stages are taken over where they were made from the same.
+    typed : mapping of str to value, optional
+        Keys of [specification] in place of the drafted ones.
+
+    Returns
+    -------
+    config : RunConfig
+    text : str
+        The same as TOML.
+    found : Found
+        What was seen in the logs.
+
+    Raises
+    ------
+    InputError
+        One line; also where `typed` contradicts what is drafted beside it.
+    """
     config, text, found = drafted(command, logs, file, stated, progress)
     from workflow.tasks.draft import informed
     from workflow.tasks.first_look import TOLD
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
-    with naming_readings(found.read.records), tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
-        run = RunDirectory(Path(folder))
+    with naming_readings(found.read.records):
         try:
-            identify_only(config, run.path, config_text=text, progress=progress)
+            identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
         except InputError as refused:
             if not config.control_channel.uncertainty.friction_identified:
                 raise
@@ -122,15 +162,16 @@ def decided(
             found = replace(found, refused=str(refused).partition(": ")[2].partition(". ")[0])
             config, text = written(found, file)
             with suppress(InputError):
-                identify_only(config, run.path, config_text=text, progress=progress)
+                identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
             spread = run.stage_file("uncertainty") and RunResults(run).uncertainty.channels
             if not spread or min(band.median_radius_percent for band in spread[0].bands) > 100 * TOLD:
                 raise
         results, at = RunResults(run), config.control_index
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
-        known = run.stage_files(("records", "identify", "uncertainty"))
-    found = replace(found, draft=draft, before=found.draft)
-    return (*written(found, file), known, found)
+    if typed:
+        draft = replace(draft, specification=with_typed(draft.specification, typed))
+    found = replace(found, draft=draft, before=found.draft, typed=frozenset(typed or ()))
+    return (*written(found, file), found)
 
 
 def drafted(

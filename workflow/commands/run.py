@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import re
+import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record
 from workflow.commands.init import decided
 from workflow.config.joints_config import AnyConfig, JointsConfig, load_any, load_simulation
@@ -17,6 +20,8 @@ from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
+from workflow.field_options import option_name
+from workflow.tasks.changed_specification import config_with_typed
 from workflow.tasks.early_refusals import refuse_hopeless_source
 from workflow.tasks.records import read_records
 
@@ -31,6 +36,8 @@ def run_from_files(
     logs: Sequence[Path] = (),
     stated: Reading | None = None,
     *,
+    earlier_path: Path | None = None,
+    typed: Mapping[str, Any] | None = None,
     resume: bool = False,
     replace: bool = False,
     c_code: Mapping[str, Any] | None = None,
@@ -39,24 +46,85 @@ def run_from_files(
     """Load a configuration and run it; see `run_pipeline`.
 
     Of logs, read as stated, the configuration is that of `flexlink init`, kept in `out`. Without
-    `config_path` or logs the built-in default arm is run, or on resuming the configuration kept in `out`;
-    without `out` a new directory below runs/ is made. Raises InputError.
+    `config_path` or logs it is that of the earlier run, on resuming the one kept in `out`, else that of the
+    built-in default arm. Without `out` a new directory below runs/ is made.
+
+    Parameters
+    ----------
+    config_path, out : Path, optional
+    logs : sequence of Path
+    stated : Reading, optional
+    earlier_path : Path, optional
+        Directory of a run whose stages are taken over where they were made from the same; it stays as it is.
+    typed : mapping of str to value, optional
+        Keys of [specification] in place of those of the earlier run, of the built-in arm, or of those drafted
+        from the logs.
+    resume, replace, c_code, progress
+        As of `run_pipeline`.
+
+    Returns
+    -------
+    RunSummary
+
+    Raises
+    ------
+    InputError
+        One line.
     """
+    typed = dict(typed or {})
     if logs and config_path is not None:
         raise InputError("give logs or --config FILE, which names its logs, not both")
     if (resume or replace) and out is None:
         raise InputError(
             f"{'--resume' if resume else '--replace'} needs --out DIR, the directory of the earlier run"
         )
-    config: AnyConfig
-    note, known = "", dict[str, bytes]()
+    if typed and (resume or config_path is not None):
+        where = config_path or "the configuration of a new run"
+        raise InputError(f"{option_name(min(typed))}: write it into {where}, under [specification]")
+    earlier = None if earlier_path is None else _earlier(earlier_path, out, logs, resume=resume)
     if logs:
-        out = out if out is not None else default_directory(logs[0].stem)
-        RunDirectory(out).refuse_unless_free(resume=resume, replace=replace)
-        config, text, known, found = decided("run", logs, out / "config.toml", stated, progress)
-        note = f"described as recorded, its friction not identified: {found.refused}" if found.refused else ""
-    elif config_path is not None:
+        place = out if out is not None else default_directory(logs[0].stem)
+        RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
+        # The logs are identified before their configuration is decided.
+        with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
+            begun = RunDirectory(Path(folder))
+            drafted, text, found = decided(
+                "run", logs, place / "config.toml", stated, progress, begun, earlier=earlier, typed=typed
+            )
+            note = ""
+            if found.refused:
+                note = f"described as recorded, its friction not identified: {found.refused}"
+            from workflow.report.pages import page_of
+            from workflow.tasks.pipeline import run_pipeline
+
+            return run_pipeline(
+                drafted,
+                place,
+                config_text=text,
+                called="logs",
+                page=page_of(drafted),
+                resume=resume,
+                replace=replace,
+                c_code=c_code,
+                note=note,
+                begun=begun,
+                earlier=earlier,
+                progress=progress,
+            )
+
+    config: AnyConfig
+    note = ""
+    called = "default arm"
+    if config_path is not None:
         config, text = load_any(config_path)
+        called = str(config_path)
+    elif earlier is not None:
+        from workflow.tasks.pipeline import any_config_of
+
+        called = str(earlier.path)
+        config = config_with_typed(any_config_of(earlier), typed, called)
+        changes = ", ".join(f"{key} = {value}" for key, value in typed.items()) or "nothing changed"
+        text = f"# As {path_as_typed(earlier.path / 'config.toml')}, {changes}\n\n{config.to_toml()}"
     elif resume and out is not None and (out / "manifest.json").is_file():
         from workflow.tasks.pipeline import any_config_of
 
@@ -66,9 +134,12 @@ def run_from_files(
     else:
         config, text = built_in_config()
         note = "no --config: this is the built-in default arm, not a machine of yours"
+        if typed:
+            config = config_with_typed(config, typed, called)
+            text = config.to_toml()
     place, read = out if out is not None else default_directory(config.run.name), list[Record]()
     # What is refused does not wait for what computes: that takes seconds to load.
-    if isinstance(config.source, FileSource) and not known and not (resume and place.exists()):
+    if isinstance(config.source, FileSource) and earlier is None and not (resume and place.exists()):
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
         read = read_records(config.source, config.columns)
         refuse_hopeless_source(config, read, progress)
@@ -79,16 +150,45 @@ def run_from_files(
         config,
         place,
         config_text=text,
-        called=str(config_path or ("logs" if logs else "default arm")),
+        called=called,
         page=page_of(config),
         resume=resume,
         replace=replace,
         c_code=c_code,
         note=note,
         read=read,
-        known=known,
+        earlier=earlier,
         progress=progress,
     )
+
+
+def _earlier(path: Path, out: Path | None, logs: Sequence[Path], *, resume: bool) -> RunDirectory:
+    """The run that --from names.
+
+    Parameters
+    ----------
+    path, out : Path
+        Of the earlier run, and of the new one where it is stated.
+    logs : sequence of Path
+        Of the new run; empty where its configuration names them.
+    resume : bool
+        A run that is resumed begins with its own stages.
+
+    Raises
+    ------
+    InputError
+        No run is there, or of another version; it is the new run itself; or it was made from other logs.
+    """
+    earlier = RunDirectory.open(path)
+    earlier.config_document()  # refused where it is damaged
+    if resume:
+        raise InputError("--from begins a new run; --resume continues the one at --out: give one of the two")
+    if out is not None and out.exists() and out.resolve() == path.resolve():
+        raise InputError(f"--out {out}: the run of --from, which stays as it is; choose another --out")
+    if logs:
+        names = {os.path.normpath(log.absolute()): log for log in logs}
+        earlier.refuse_other_inputs({name: storage.sha256_of_file(log) for name, log in names.items()})
+    return earlier
 
 
 def rebuild_report(

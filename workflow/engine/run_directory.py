@@ -31,6 +31,7 @@ from pydantic import BaseModel, ValidationError
 
 from ident.data.foreign_files import path_as_typed
 from workflow.engine import codec, documents, storage
+from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, naming
 from workflow.engine.store import Store
 
@@ -52,9 +53,12 @@ KEPT_FILES = (
 
 
 class _StageEntry(BaseModel):
+    """Of a finished stage. taken_over_from: the run that it was made in, where that is another one."""
+
     seconds: float
     input_sha256: str
     finished: str
+    taken_over_from: str | None = None
 
 
 class _Manifest(BaseModel):
@@ -65,6 +69,7 @@ class _Manifest(BaseModel):
     versions: dict[str, str]
     config_sha256: str
     inputs: dict[str, str]
+    code_sha256: str = ""
     stages: dict[str, _StageEntry]
     c_code: dict[str, str] = {}
 
@@ -119,6 +124,7 @@ class RunDirectory(Store):
             "seed": seed,
             "python": python_version(),
             "versions": package_versions(),
+            "code_sha256": code_digest(),
             "config_sha256": hash_of(config),
             "inputs": dict(inputs),
             "stages": {},
@@ -172,13 +178,39 @@ class RunDirectory(Store):
         except InputError:
             return False  # damaged from outside
 
+    def take_over(self, name: str, input_hash: str, earlier: Iterable[RunDirectory]) -> RunDirectory | None:
+        """The run that has a stage made from exactly this input, whose file is in this run afterwards.
+
+        Parameters
+        ----------
+        name : str
+            Of the stage.
+        input_hash : str
+            Of what the stage would be given now.
+        earlier : iterable of RunDirectory
+            Other runs, asked in turn where this one has no such file; nothing in them is changed.
+
+        Returns
+        -------
+        RunDirectory or None
+            This run where the file was here already; None where nobody has it, or only a damaged one.
+        """
+        for run in (self, *earlier):
+            if not run.is_done(name, input_hash):
+                continue
+            if run is not self:
+                path = run._finished(name)
+                self.write_stage(name, path.suffix, path.read_bytes())
+            return run
+        return None
+
     def save_stage(self, name: str, result: Any, input_hash: str) -> Path:
         """Write a stage's result atomically, replacing what was there under either suffix."""
         content, suffix = stage_bytes(result, input_hash)
         return self.write_stage(name, suffix, content)
 
     def write_stage(self, name: str, suffix: str, content: bytes) -> Path:
-        """The same from the file's content, which another process made."""
+        """Write a stage's file from its content, which another process or another run made."""
         path = self.stages_path / f"{name}{suffix}"
         storage.write_bytes(path, content)
         (self.stages_path / f"{name}{'.npz' if suffix == '.json' else '.json'}").unlink(missing_ok=True)
@@ -192,6 +224,20 @@ class RunDirectory(Store):
             if path.suffix == ".npz":
                 return codec.from_arrays(kind, content)
             return codec.unpack(kind, content[_RESULT], {})
+
+    def refuse_other_inputs(self, inputs: Mapping[str, str]) -> None:
+        """Raise InputError where this run was made from other files than these (name to SHA-256)."""
+        own = self.manifest()["inputs"]
+        if dict(own) == dict(inputs):
+            return
+        changed = [name for name in inputs if name in own and own[name] != inputs[name]]
+        if changed:
+            why = f"{changed[0]} has changed since"
+        else:
+            # Without their folders, where that tells them apart.
+            short = {Path(name).name for name in own} != {Path(name).name for name in inputs}
+            why = f"it was made from {_names(own, short=short)}, not from {_names(inputs, short=short)}"
+        raise InputError(f"--from {self.path}: {why}: no stage can be taken over; leave --from out")
 
     # -- manifest --------------------------------------------------------------------------------------------
 
@@ -226,6 +272,19 @@ class RunDirectory(Store):
             "input_sha256": input_hash,
             "finished": _now(),
         }
+        storage.write_json(self.manifest_path, manifest)
+
+    def record_taken_over(self, name: str, origin: RunDirectory, called: str | None = None) -> None:
+        """Note in the manifest what `origin` notes about a stage that was taken over from there.
+
+        called: what a user knows that run by; None: a directory that is gone afterwards, which is not named.
+        Nothing is noted where `origin` has no such note, as of stages that another process made.
+        """
+        entry = origin.manifest()["stages"].get(name)
+        if entry is None:
+            return
+        manifest = self.manifest()
+        manifest["stages"][name] = dict(entry) if called is None else {**entry, "taken_over_from": called}
         storage.write_json(self.manifest_path, manifest)
 
     def record_status(self, status: str, **more: Any) -> None:
@@ -274,6 +333,11 @@ def _digest(content: Mapping[str, Any]) -> str:
             about, data = "", json.dumps(value, sort_keys=True).encode()
         digest.update(f"{name}\0{about}\0{len(data)}\0".encode() + data)
     return digest.hexdigest()
+
+
+def _names(files: Iterable[str], *, short: bool) -> str:
+    """Files in a complaint, without their folders where they are to be short; "no file" without any."""
+    return ", ".join(Path(name).name if short else name for name in files) or "no file"
 
 
 def package_versions() -> dict[str, str]:

@@ -5,7 +5,6 @@ The same task gives the same bytes anywhere: random streams are keyed by seed an
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -74,10 +73,7 @@ class PointTask:
         for stage in (stage for stage in stages_for(point.config, STAGES) if stage.name in self.stages):
             started = time.monotonic()
             wanted = stage_input_hash(stage, point.config, run, point.inputs)
-            there = (one.stage_file(stage.name) for one in earlier if one.is_done(stage.name, wanted))
-            if path := next(filter(None, there), None):
-                shutil.copyfile(path, run.stages_path / path.name)
-            else:
+            if run.take_over(stage.name, wanted, earlier) is None:
                 run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
             seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
         return Done(run.stage_files(self.stages), seconds, hashes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -43,7 +42,8 @@ def run_pipeline(
     c_code: Mapping[str, Any] | None = None,
     note: str = "",
     read: Sequence[Record] = (),
-    known: Mapping[str, bytes] | None = None,
+    begun: RunDirectory | None = None,
+    earlier: RunDirectory | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
     """Run every stage into `out` and return the table of numbers.
@@ -51,8 +51,9 @@ def run_pipeline(
     config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
     starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
     stated, kept for when it is resumed; note: said once nothing refuses the run; read: the logs,
-    where they have been read; known: files of stages that were performed elsewhere, which stand where they
-    were made from the same. A result that is not certified is no error.
+    where they have been read. begun, earlier: runs whose stages are taken over where they were made from the
+    same, as those of the run itself are when it is resumed; begun is of this same call, earlier one that the
+    user names. A result that is not certified is no error.
 
     Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
     then, unless identification had already been paid for. Raises StageError when a computation fails.
@@ -61,10 +62,16 @@ def run_pipeline(
     run, stages = RunDirectory(Path(out)), stages_for(config, STAGES)
     existed, given = run.path.exists(), _given(config, run, progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
-    inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
+    inputs = input_digests(config, earlier)
     # Records are read before anything is written: a bad log leaves no directory behind.
     ready: tuple[Any, float] | None = None
-    if not (resume and existed) and not known:
+    first_is_there = begun is not None
+    if earlier is not None:
+        nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
+        first_is_there = first_is_there or not nothing_because
+        if nothing_because and begun is None:
+            progress.note(f"nothing of {earlier.path} is taken over: {nothing_because}")
+    if not (resume and existed) and not first_is_there:
         started = time.monotonic()
         with threadpool_limits(1):
             ready = stages[0].run(changed(given, read=read)), time.monotonic() - started
@@ -81,8 +88,6 @@ def run_pipeline(
         kept = run.manifest().get("c_code", {})
         with naming(str(run.manifest_path)):
             before = changed(Dialect(), **{k: kept[k] for k in ("prefix", "number") if k in kept})
-        for name, content in (known or {}).items():
-            run.write_stage(*os.path.splitext(name), content)
         dialect = changed(before, **(c_code or {}))  # as stated now, or else before
         run.record_status("running", c_code=asdict(dialect))
         stages = stages if page is None else (*stages, page)
@@ -91,7 +96,15 @@ def run_pipeline(
             progress.note(note)
         try:
             for stage in stages:
-                _perform(stage, given, inputs, ready if stage is stages[0] else None)
+                _perform(
+                    stage,
+                    given,
+                    inputs,
+                    ready if stage is stages[0] else None,
+                    begun=begun,
+                    earlier=earlier,
+                )
+            _say_what_was_taken_over(run, progress)
             written = _keep_files(given.results, config, dialect)
             for name in KEPT_FILES:  # none of an earlier design stay
                 if run.path / name not in written:
@@ -109,12 +122,18 @@ def run_pipeline(
 
 
 def identify_only(
-    config: RunConfig, out: Path, *, config_text: str = "", progress: Progress | None = None
+    config: RunConfig,
+    out: Path,
+    *,
+    config_text: str = "",
+    earlier: RunDirectory | None = None,
+    progress: Progress | None = None,
 ) -> None:
-    """The stages up to the uncertain plant into `out`, which `flexlink design` reads; an earlier run there is
-    replaced. Raises as a run."""
+    """The stages up to the uncertain plant into `out`, which `flexlink design` reads; what is there is
+    replaced. earlier: a run whose stages are taken over where they were made from the same. Raises as a
+    run."""
     given = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
-    inputs = {str(path): storage.sha256_of_file(path) for path in config.input_files}
+    inputs = input_digests(config)
     stages = plant_stages(config)
     with given.results.run.writing(replace=True), threadpool_limits(1):
         given.results.run.begin_run(
@@ -125,8 +144,12 @@ def identify_only(
             replace=True,
         )
         given.progress.plan([(stage.name, stage.expected_s) for stage in stages])
+        if earlier is not None:
+            nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
+            if nothing_because:
+                given.progress.note(f"nothing of {earlier.path} is taken over: {nothing_because}")
         for stage in stages:
-            _perform(stage, given, inputs)
+            _perform(stage, given, inputs, earlier=earlier)
 
 
 def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
@@ -180,16 +203,28 @@ def _perform(
     inputs: Mapping[str, str],
     ready: tuple[Any, float] | None = None,
     *,
+    begun: RunDirectory | None = None,
+    earlier: RunDirectory | None = None,
     always: bool = False,
 ) -> None:
-    """ready: its result where that is known already, and the seconds it took."""
+    """Leave a stage's file in the run: taken over where a run has one made from the same, else made.
+
+    ready: its result where that is known already, and the seconds it took. begun, earlier: see
+    `run_pipeline`; always: made again although it is there.
+    """
     run, progress = given.results.run, given.progress
     input_hash = stage_input_hash(stage, given.config, run, inputs)
     progress.start(stage.name)
-    there = run.is_done(stage.name, input_hash) and all(p.is_file() for p in stage.also_writes(run))
-    if there and not always:
-        progress.finish(stage.name, 0.0, taken_up=True)
-        return
+    if not always:
+        # What a stage writes beside its own file is not in another run's stages.
+        others = () if stage.also_writes(run) else tuple(filter(None, (begun, earlier)))
+        origin = run.take_over(stage.name, input_hash, others)
+        if origin is not None and all(path.is_file() for path in stage.also_writes(run)):
+            if origin is not run:
+                called = str(origin.path) if origin is earlier else None
+                run.record_taken_over(stage.name, origin, called)
+            progress.finish(stage.name, 0.0, taken_up=True)
+            return
     started = time.monotonic()
     result, before_s = ready or (stage.run(given), 0.0)
     interrupts.check()
@@ -199,6 +234,47 @@ def _perform(
     seconds = time.monotonic() - started + before_s
     run.record_stage(stage.name, seconds, input_hash)
     progress.finish(stage.name, seconds, taken_up=False)
+
+
+def input_digests(config: AnyConfig, earlier: RunDirectory | None = None) -> dict[str, str]:
+    """Every input file with its SHA-256; of one that is gone what an earlier run notes of it.
+
+    Raises InputError where a file cannot be read that `earlier` does not know.
+    """
+    noted = {} if earlier is None else earlier.manifest()["inputs"]
+    return {
+        str(path): noted[str(path)]
+        if str(path) in noted and not path.is_file()
+        else storage.sha256_of_file(path)
+        for path in config.input_files
+    }
+
+
+def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: Mapping[str, str]) -> str:
+    """The reason why a run shares no stage with an earlier one, from its first stage on; "" where it does.
+
+    inputs: every input file with its SHA-256. Raises InputError where the earlier run was made from other
+    files: every stage reads them, through the first.
+    """
+    earlier.refuse_other_inputs(inputs)
+    first = stages_for(config, STAGES)[0]
+    if earlier.is_done(first.name, stage_input_hash(first, config, earlier, inputs)):
+        return ""
+    if earlier.stage_file(first.name) is None:
+        return "it ended before its first stage was done"
+    if earlier.manifest().get("code_sha256") != code_digest():
+        return "it was made by another version of flexlink"
+    return "its records were read with other settings"
+
+
+def _say_what_was_taken_over(run: RunDirectory, progress: Progress) -> None:
+    """Name the stages that came from another run, once for each such run."""
+    by_origin: dict[str, list[str]] = {}
+    for name, entry in run.manifest()["stages"].items():
+        if entry.get("taken_over_from"):
+            by_origin.setdefault(entry["taken_over_from"], []).append(name)
+    for origin, names in by_origin.items():
+        progress.note(f"taken over from {origin}, whose inputs are the same: {', '.join(names)}")
 
 
 def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs: Mapping[str, str]) -> str:
