@@ -2,9 +2,10 @@
 
 from control_design.plants.weights import RationalWeight
 from control_design.specification.requirement import LoopFunction, SpecificationItem, WeightedRequirement
-from control_design.specification.specification import Specification, SpecificationError
+from control_design.specification.specification import GIVES_WAY, Specification, SpecificationError
 
 __all__ = [
+    "GIVES_WAY",
     "LoopFunction",
     "RationalWeight",
     "Specification",

@@ -94,6 +94,16 @@ _LEAST_DAMPING = 1e-9
 _TINY = 1e-300
 
 
+# Keys that may give way, by the key that says how far. The modulus margin is not among them: it is what keeps
+# a loop safe where the plant is not what was identified. Nor is the damping of the controller, its order, or
+# a limit of the machine.
+GIVES_WAY = {
+    "bandwidth_rad_s": "lowest_bandwidth_rad_s",
+    "effort_limit": "highest_effort_limit",
+    "mode_peak_ratio": "highest_mode_peak_ratio",
+}
+
+
 class SpecificationError(ValueError):
     """The specification contradicts itself or the plant; no controller of any order can meet it."""
 
@@ -125,6 +135,11 @@ class Specification(Settings):
     effort_limit: _Positive | None = Field(
         default=None, description="largest |K S|, input unit per measured unit; none = not limited"
     )
+    highest_effort_limit: _Positive | None = Field(
+        default=None,
+        description="where effort_limit cannot be met with the rest (at the lowest bandwidth), as little "
+        "more as is needed, up to here; none = effort_limit as it stands",
+    )
     effort_rolloff_rad_s: _Positive | None = Field(
         default=None, description="above it the limit on |K S| falls with 1/frequency"
     )
@@ -135,6 +150,11 @@ class Specification(Settings):
         default=None,
         description="peak of |Gp S| in the mode's band over the open-loop peak of |Gp| there: below 1 the "
         "loop has to damp the mode, above 1 it may raise it by that much",
+    )
+    highest_mode_peak_ratio: _Positive | None = Field(
+        default=None,
+        description="where mode_peak_ratio cannot be met with the rest (at the lowest bandwidth), as little "
+        "more as is needed, up to here; none = mode_peak_ratio as it stands",
     )
     mode_damping: float | None = Field(
         default=None,
@@ -225,6 +245,11 @@ class Specification(Settings):
                 raise ValueError(
                     "lowest_bandwidth_rad_s needs a larger bandwidth_rad_s, which is tried first"
                 )
+        for key in ("effort_limit", "mode_peak_ratio"):
+            value = getattr(self, key)
+            highest = getattr(self, GIVES_WAY[key])
+            if highest is not None and (value is None or not value < highest):
+                raise ValueError(f"{GIVES_WAY[key]} needs a smaller {key}, which is tried first")
         if self.effort_weight is not None and (self.effort_limit or self.effort_rolloff_rad_s):
             raise ValueError("give effort_limit (with effort_rolloff_rad_s) or effort_weight, not both")
         if self.effort_rolloff_rad_s is not None and self.effort_limit is None:

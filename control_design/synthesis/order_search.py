@@ -31,7 +31,7 @@ from control_design.synthesis.descent import MinimaxDescent, natural_units
 from control_design.synthesis.problem import Problem
 from control_design.synthesis.starts import StartMaker, with_gain
 from control_design.synthesis.synthesis_result import LARGEST_GAMMA, StartReport
-from control_design.synthesis.youla_starts import FreeControllers, fitted
+from control_design.synthesis.youla_starts import FreeController, FreeControllers, fitted
 
 # Called with the share that is done, 0 to 1, and a message for the user.
 Progress = Callable[[float, str], None]
@@ -208,14 +208,25 @@ class OrderSearch:
             return OrderResult(None, tuple(self.reports), (), self._nearest(ends_of_starts))
         return self._exchange(stable_ends)
 
-    def quick(self, free: FreeControllers) -> tuple[OrderResult, bool]:
+    def quick(
+        self,
+        bound: Callable[[], FreeControllers],
+        known: Sequence[FreeController] = (),
+        *,
+        is_trial: bool = False,
+    ) -> tuple[OrderResult, bool]:
         """Best controller from those of the Youla bound, and whether the search may end with it.
 
         Parameters
         ----------
-        free : FreeControllers
-            Responses of controllers of any order, and `gamma`, the worst case that they reach; inf: none is
-            known, nothing counts as near it.
+        bound : callable
+            Gives responses of controllers of any order, and `gamma`, the worst case that they reach; inf:
+            none is known, nothing counts as near it. Called once, if at all.
+        known : sequence of FreeController
+            Responses of controllers that are tried first.
+        is_trial : bool
+            Only whether the result is good enough counts: nothing is improved by exchange that cannot become
+            so by it.
 
         Returns
         -------
@@ -234,6 +245,12 @@ class OrderSearch:
         meets the specification within `_FAIR` of `free.gamma`.
         """
         ends: list[TriedController] = []
+        if known:
+            ends = self._raced(self._fits(FreeControllers(tuple(known), np.inf), weighted=False))
+            if self._good_enough(ends):
+                best = min(ends, key=lambda end: end.gamma)
+                return OrderResult(best, tuple(self.reports), (best.gamma,)), True
+        free = bound()
 
         def near_free(gamma: float) -> bool:
             """Whether a worst case is within `_NEAR` of the bound, and not so far below it (`_FINER`) that
@@ -261,6 +278,11 @@ class OrderSearch:
         if not stable_ends:
             nearest = self._nearest(ends) if ends else None
             return OrderResult(None, tuple(self.reports), (), nearest), False
+        # More frequencies on the lean grid raise an optimum: exchange brings no end below what it has there.
+        least = min(end.gamma_grid for end in stable_ends)
+        if is_trial and least > self.options.sufficient_gamma:
+            best = stable_ends[0]
+            return OrderResult(best, tuple(self.reports), (best.gamma,)), True
         result = self._exchange(stable_ends, hops=False)
         assert result.best is not None
         gamma = result.best.gamma

@@ -88,6 +88,9 @@ def synthesise(
     progress: Progress | None = None,
     guards: Sequence[Guard] = (),
     thorough: bool = True,
+    known: Sequence[Controller] = (),
+    enough: float = 0.0,
+    is_trial: bool = False,
 ) -> SynthesisResult:
     """Design one controller for all plants: smallest gamma over every ellipse.
 
@@ -107,6 +110,14 @@ def synthesise(
         Single responses that must be stable as well, whatever the weights say of them.
     thorough : bool
         Search from many starts where those from the Youla bound do not settle it.
+    known : sequence of Controller
+        Controllers to start from before those of the Youla bound, sampled as the plants; without an effect
+        where the order is "auto".
+    enough : float
+        Worst case gamma up to which many starts are not tried; by default they always are.
+    is_trial : bool
+        Only whether `options.sufficient_gamma` is reached counts: where it is not, the result is the best of
+        the starts as they ended, not improved further.
 
     Returns
     -------
@@ -147,7 +158,12 @@ def synthesise(
     first_grids = list(problem.grids)
     fits_rng = np.random.default_rng([seed, 0])
     search = OrderSearch(problem, cascade, fits_rng, part_of(tell, 0, 2))
-    order_result, settled = search.quick(free_controllers(problem.plants, specification))
+    omega = problem.grids[0]
+    responses = [FreeController(omega, law.response(omega, with_delay=False)) for law in known]
+    order_result, settled = search.quick(
+        lambda: free_controllers(problem.plants, specification), responses, is_trial=is_trial
+    )
+    settled = settled or (order_result.best is not None and order_result.best.gamma <= enough)
     reports = list(search.reports)
 
     # Second search: many starts, from the lowest order upwards.
@@ -252,7 +268,7 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
     if chosen.gamma > enough:
         # Fits with random weights, and other starts, at the order that was chosen.
         search.reports = []
-        again, _ = search.quick(free)
+        again, _ = search.quick(lambda: free)
         reports += search.reports
         if again.best is not None and again.best.gamma < chosen.gamma:
             result = again

@@ -11,7 +11,7 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.stated_uncertainty import StatedDiscs
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification, SpecificationError
-from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.synthesis.giving_way import synthesise_giving_way
 from control_design.synthesis.synthesis import synthesise, synthesise_near
 from control_design.synthesis.synthesis_result import SynthesisResult
 from validation.example_plants import flexible_link, flexible_link_specification
@@ -83,7 +83,7 @@ def test_plants_whose_bounds_no_common_controller_reaches():
 def test_the_order_that_was_chosen_is_stated(highest_rad_s, lowest_rad_s):
     """At a bandwidth that is met, and at one that had to be lowered."""
     asked = auto(WISH, bandwidth_rad_s=highest_rad_s, lowest_bandwidth_rad_s=lowest_rad_s)
-    stated, design = synthesise_widest([lag(0.5)], asked, rng=np.random.default_rng(1))
+    stated, design = synthesise_giving_way([lag(0.5)], asked, rng=np.random.default_rng(1))
     assert stated.controller_order == design.controller.order
     assert (stated.bandwidth_rad_s == highest_rad_s) == (highest_rad_s == 3.0)
 

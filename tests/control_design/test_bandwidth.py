@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from control_design import Specification, SpecificationError, SynthesisOptions, UncertainPlant, synthesise
-from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.synthesis.giving_way import synthesise_giving_way
 
 _DT = 0.01
 _EFFORT = SynthesisOptions(starts=2, grid_points=80, dense_points=2000)
@@ -34,7 +34,7 @@ def test_the_highest_bandwidth_that_is_met_is_taken(delays):
     for delay in delays:
         plant = _inertia(delay)
         asked = _asked(bandwidth_rad_s=8.0, lowest_bandwidth_rad_s=1.2, controller_order=2)
-        used, result = synthesise_widest([plant], asked, _FEW, rng=np.random.default_rng(1))
+        used, result = synthesise_giving_way([plant], asked, _FEW, rng=np.random.default_rng(1))
         assert result.gamma <= 1.0
         assert used.lowest_bandwidth_rad_s is None
         assert 1.2 <= used.bandwidth_rad_s < 8.0
@@ -48,14 +48,14 @@ def test_the_highest_bandwidth_that_is_met_is_taken(delays):
 
 def test_a_bandwidth_that_is_met_stays():
     asked = _asked(bandwidth_rad_s=1.0)
-    used, result = synthesise_widest([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
+    used, result = synthesise_giving_way([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
     assert (used.bandwidth_rad_s, result.gamma <= 1.0) == (1.0, True)
 
 
 def test_nothing_is_lowered_unless_it_is_asked_for():
     asked = _asked(lowest_bandwidth_rad_s=None, bandwidth_rad_s=6.0, controller_order=1)
     plant = _inertia(20)
-    used, result = synthesise_widest([plant], asked, _FEW, rng=np.random.default_rng(1))
+    used, result = synthesise_giving_way([plant], asked, _FEW, rng=np.random.default_rng(1))
     assert used == asked
     assert result.gamma == synthesise([plant], asked, _FEW, rng=np.random.default_rng(1)).gamma
 
@@ -63,7 +63,7 @@ def test_nothing_is_lowered_unless_it_is_asked_for():
 def test_where_none_is_met_the_lowest_is_designed_for():
     asked = _asked(effort_limit=1e-3)
     with pytest.raises(SpecificationError, match="effort"):
-        synthesise_widest([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
+        synthesise_giving_way([_inertia()], asked, _EFFORT, rng=np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("change", [{"bandwidth_rad_s": 0.5}, {"bandwidth_rad_s": None}])

@@ -125,8 +125,8 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     words = verdict_of(design, certify, SimpleNamespace(check=check), conditions=[doubt])
     assert words.startswith(verdict() + ". But dry friction was not identified")
     assert words.endswith('set response = "without friction" in [channels.uncertainty]')
-    asked = SimpleNamespace(bandwidth_rad_s=16.0, lowest_bandwidth_rad_s=1.6)
-    lower = replace(design, specification=SimpleNamespace(bandwidth_rad_s=7.43))
+    asked = Specification(bandwidth_rad_s=16.0, lowest_bandwidth_rad_s=1.6)
+    lower = replace(design, specification=Specification(bandwidth_rad_s=7.43))
     words = verdict_of(lower, certify, SimpleNamespace(check=check), asked=asked)
     assert "every requirement is met for a bandwidth of 7.43 rad/s (specified: 1.6 to 16), and" in words
     plants = [SimpleNamespace(bandwidth_rad_s=8.7), SimpleNamespace(bandwidth_rad_s=8.5)]
@@ -135,6 +135,11 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     assert numbers == {"specified": 16.0, "designed_for": 7.43, "reached": 8.5}
     given = SimpleNamespace(certified=True, plants=[]), ""
     assert said("design_verdict", lower, *given, asked).startswith("; bandwidth_rad_s = 16 was not met")
+    soft = Specification(effort_limit=2.2, highest_effort_limit=8.8, mode_peak_ratio=1.0)
+    less = replace(design, specification=Specification(effort_limit=2.31, mode_peak_ratio=1.0))
+    words = verdict_of(less, certify, SimpleNamespace(check=check), asked=soft)
+    assert "every requirement is met, with effort_limit = 2.31 in place of 2.2, and" in words
+    assert verdict_of(less, certify, SimpleNamespace(check=check), asked=less.specification) == verdict()
     white = {"noise_order": 8, "independent": True, "friction": False, "predictable_share": 0.3}
     small, widened = (finding(FindingKind.NOT_WHITE, **white, observer=known) for known in (False, True))
     lag = finding(FindingKind.NOT_INDEPENDENT, lag=3)
@@ -213,7 +218,7 @@ def test_calibration_is_designed_for(monkeypatch):
         asked.append("jointly")
         return JointDesign(result, (), 10_000, (7, 2), True)
 
-    monkeypatch.setattr("workflow.tasks.design.synthesise_widest", plain)
+    monkeypatch.setattr("workflow.tasks.design.synthesise_giving_way", plain)
     monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
     exact = UncertainPlant("exact", example.model().to_control())
     options = CertificateOptions.model_validate({"calibrate": True})
@@ -264,7 +269,7 @@ def test_a_hint_that_was_not_designed_and_certified_is_not_given(monkeypatch, fa
 
     verdict = SimpleNamespace(certified=False)
     monkeypatch.setattr("workflow.tasks.design.synthesise", lambda *_, **__: quick)
-    monkeypatch.setattr("workflow.tasks.design.synthesise_widest", widest)
+    monkeypatch.setattr("workflow.tasks.design.synthesise_giving_way", widest)
     monkeypatch.setattr("workflow.tasks.design.certify_asked", lambda *_, **__: verdict)
     monkeypatch.setattr("workflow.tasks.design.said", lambda name, *given: f"{name} {given[0]}")
     options = CertificateOptions.model_validate({})

@@ -9,7 +9,7 @@ from pathlib import Path
 from control_design.controllers.c_code import Dialect
 from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.plants.plant_set import UncertainPlant
-from control_design.specification import Specification
+from control_design.specification import GIVES_WAY, Specification
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
@@ -27,6 +27,7 @@ from workflow.tasks.design import (
 )
 from workflow.tasks.design_source import DesignSource, load_sources
 from workflow.tasks.exports import SUFFIXES, filter_file, targets, write_controller
+from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -97,11 +98,12 @@ def of_run(paths: Sequence[Path]) -> RunResults | None:
 
 
 def at_one_bandwidth(specification: Specification, found: RunResults | None) -> Specification:
-    """Of one that leaves the bandwidth open: that which its run has found, or the one to try first. A search
-    for it takes a dozen designs."""
+    """Of one whose requirements give way: as far as they did in its run, or what is tried first. A search for
+    that takes a dozen designs."""
     known = specification.model_dump(include=set(Specification.model_fields), exclude_unset=True)
-    if known.pop("lowest_bandwidth_rad_s", None) is not None and found is not None:
-        known["bandwidth_rad_s"] = (found.design.specification or specification).bandwidth_rad_s
+    for key, limit in GIVES_WAY.items():
+        if known.pop(limit, None) is not None and found is not None:
+            known[key] = getattr(found.design.specification or specification, key)
     return Specification.model_validate(known)
 
 
@@ -153,7 +155,8 @@ def design_controller(
     advice = (
         (said("order_advice", achievable, gamma, order, specification.structure) or None) if missed else None
     )
-    reason = said("design_verdict", design, certify.certificate, advice, specification)
+    given_way = gave_way(specification, design.specification)
+    reason = said("design_verdict", design, certify.certificate, advice, specification, given_way)
     shares = joint_numbers(certify.sampled)
     names = [plant.name for plant in plants]
     about = [
@@ -177,7 +180,11 @@ def design_controller(
         ),
         numbers={
             "plants": about,
-            "design": {**codec.plain(design), "order_advice": advice},
+            "design": {
+                **codec.plain(design),
+                "order_advice": advice,
+                "gave_way": codec.plain(given_way),
+            },
             "engineers_numbers": None if numbers is None else numbers.to_dict(),
             "achievable_performance": bracket_numbers(achievable, gamma),
             "certificate": codec.plain(certify.certificate),

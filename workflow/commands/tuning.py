@@ -27,7 +27,7 @@ from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
-from control_design.specification import Specification, SpecificationError
+from control_design.specification import GIVES_WAY, Specification, SpecificationError
 from control_design.synthesis.synthesis import synthesise_near
 from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
@@ -104,7 +104,8 @@ class TuningSession:
     def settings(self) -> list[dict[str, Any]]:
         """What the page has a control for: name, kind, description, unit, value, range."""
         fields = {**Specification.model_json_schema()["properties"]}
-        del fields["lowest_bandwidth_rad_s"]
+        for limit in GIVES_WAY.values():
+            del fields[limit]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
         if self.drawable:
             words = "confidence of each ellipse: share of the probability inside"

@@ -37,6 +37,7 @@ from workflow.figures.bands import Complex, Real, smooth_grid
 from workflow.figures.style import ratio_unit
 from workflow.tasks.design import joint_numbers
 from workflow.tasks.exports import Logged
+from workflow.tasks.giving_way import GaveWay, gave_way
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import (
@@ -211,8 +212,13 @@ class RunView(AnyRunView):
 
     @property
     def specification(self) -> Specification:
-        """What was designed for: with the bandwidth that was chosen."""
+        """What was designed for: every requirement as far as it gave way."""
         return self.results.design.specification or self.config.specification
+
+    @property
+    def gave_way(self) -> tuple[GaveWay, ...]:
+        """What less was designed for than asked."""
+        return gave_way(self.config.specification, self.results.design.specification)
 
     @cached_property
     def channels(self) -> tuple[ChannelView, ...]:

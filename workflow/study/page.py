@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,6 +21,7 @@ from workflow.figures import style
 from workflow.study.columns import COLUMNS, StudyColumn, numbers_of
 from workflow.study.points import Point, PointRow, State, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
+from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import RunResults
 from workflow.tasks.summary import summarise, verdict_of
 from workflow.text.templates import RunSummary, render_text, rows_of, said
@@ -59,6 +60,9 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         state, why = "does not settle", said("never_settles", check)  # at rest beside the reference
     elif state == "certified" and lowered:
         state = "certified at a lower bandwidth"
+    given_way = said("gave_way", gave_way(specification, design.specification))
+    if given_way:
+        why = f"designed for {given_way}; {why}"
     if lowered:
         why = f"{lowered}; {why}"
     return PointRow(point.number, point.name, point.values, state, why, numbers)
@@ -119,7 +123,7 @@ class StudyView:
     base: str
     rows: Sequence[PointRow]
     units: Mapping[str, str]
-    left_out: float | None = None
+    left_out: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def fronts(self) -> list[list[int]]:

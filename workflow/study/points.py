@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 from pydantic import ValidationError
 
+from control_design.specification import GIVES_WAY
 from workflow.config.joints_config import AnyConfig, load_any
 from workflow.config.run_config import built_in_config
 from workflow.config.settings import check
@@ -37,14 +38,14 @@ State = Literal[
 class Base:
     """What every point starts from: a configuration, and the run whose plant is used where one was given.
 
-    left_out: lowest_bandwidth_rad_s that the configuration had, where an axis sets the bandwidth.
+    left_out: limits up to which requirements of the configuration gave way, where an axis sets these.
     """
 
     config: AnyConfig
     inputs: Mapping[str, str]
     run: RunDirectory | None
     folder: Path
-    left_out: float | None = None
+    left_out: Mapping[str, float] = field(default_factory=dict)
 
     def changed(self, values: Mapping[str, Any], source: str) -> AnyConfig:
         """The configuration with dotted keys set. Raises InputError naming `source` where they do not fit."""
@@ -146,12 +147,16 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
     else:
         config, _ = load_any(base)
     values: dict[str, Any] = dict(study.changes)
-    lowest, left_out = "specification.lowest_bandwidth_rad_s", None
+    left_out: dict[str, float] = {}
     axes = {axis.key for axis in study.axes}
-    # An axis asks for each of its bandwidths: falling back to a lower one would answer another question.
-    if "specification.bandwidth_rad_s" in axes and lowest not in axes | set(values):
-        left_out = getattr(getattr(config, "specification", None), "lowest_bandwidth_rad_s", None)
-        values |= {} if left_out is None else {lowest: None}
+    # An axis asks for each of its values: giving way from it would answer another question.
+    for key, limit in GIVES_WAY.items():
+        if f"specification.{key}" not in axes or f"specification.{limit}" in axes | set(values):
+            continue
+        value = getattr(getattr(config, "specification", None), limit, None)
+        if value is not None:
+            left_out[limit] = value
+            values[f"specification.{limit}"] = None
     if study.study.seed is not None:
         values["run.seed"] = study.study.seed
     inputs = {} if run is None else run.manifest()["inputs"]

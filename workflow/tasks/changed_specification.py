@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from control_design.specification import GIVES_WAY
 from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
-
-# What a key may fall or rise to goes with the key: who types one value means that value.
-GIVES_WAY_TO = {"bandwidth_rad_s": "lowest_bandwidth_rad_s"}
 
 
 def with_typed(specification: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
@@ -27,10 +25,10 @@ def with_typed(specification: Mapping[str, Any], typed: Mapping[str, Any]) -> di
     -------
     dict
         A copy in the same order, new keys at the end. A typed value takes along what the key may give way to
-        (`GIVES_WAY_TO`).
+        (`GIVES_WAY`): who types one value means that value.
     """
     changed = {**specification, **typed}
-    for key, limit in GIVES_WAY_TO.items():
+    for key, limit in GIVES_WAY.items():
         if key in typed and limit not in typed:
             changed.pop(limit, None)
     return changed
@@ -59,7 +57,9 @@ def config_with_typed(config: AnyConfig, typed: Mapping[str, Any], source: str) 
     if not typed:
         return config
     if isinstance(config, JointsConfig):
-        raise InputError(f"{source}: several joints: write the change into a copy of its config.toml, --config")
+        raise InputError(
+            f"{source}: several joints: write the change into a copy of its config.toml, --config"
+        )
     document = config.to_document()
     document["specification"] = with_typed(document["specification"], typed)
     return check(type(config), document, source=source, context={"may_be_gone": True})

@@ -19,8 +19,8 @@ from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import design_reference_filter
 from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
-from control_design.specification import RationalWeight, Specification, SpecificationError
-from control_design.synthesis.bandwidth import synthesise_widest
+from control_design.specification import GIVES_WAY, RationalWeight, Specification, SpecificationError
+from control_design.synthesis.giving_way import synthesise_giving_way, without_limits
 from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis import part_of, synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
@@ -86,7 +86,7 @@ def find_design(
     try:
         if options.calibrate and undrawable(plants) is None:
             parts = [part_of(progress, number, 2) if progress else None for number in range(2)]
-            specification, first = synthesise_widest(
+            specification, first = synthesise_giving_way(
                 plants, specification, synthesis, rng=rng, progress=parts[0]
             )
             found = synthesise_jointly(
@@ -94,7 +94,7 @@ def find_design(
             )
             result, jointly = found.result, said("draws_stable", found)
         else:
-            specification, result = synthesise_widest(
+            specification, result = synthesise_giving_way(
                 plants, specification, synthesis, rng=rng, progress=progress
             )
             jointly = None
@@ -127,8 +127,8 @@ def would_meet(
 ) -> tuple[str, float] | None:
     """A key of the specification, and a value of it with which a design is certified, the rest as it is.
 
-    A larger effort_limit, else a smaller bandwidth (where the lowest one is stated, a smaller lowest one);
-    None where none of a few is. Quick designs find what may do; it is told only once it was designed and
+    A larger effort_limit, else a smaller bandwidth; of a key that gives way a further limit; None where none
+    of a few is. Quick designs find what may do; it is told only once it was designed and
     certified as a user would who typed it. gamma: worst case of the design that missed. rng: as that design
     had it when it began; it is not moved on.
     """
@@ -136,10 +136,11 @@ def would_meet(
     quick = synthesis.model_copy(update={"sufficient_gamma": _CLEARLY})
     # Of a range of bandwidths it is the lowest that was missed.
     left_open = specification.lowest_bandwidth_rad_s is not None
-    missed = specification
+    missed = without_limits(specification)
     if left_open:
-        lowest = {"bandwidth_rad_s": specification.lowest_bandwidth_rad_s, "lowest_bandwidth_rad_s": None}
-        missed = specification.model_copy(update=lowest)
+        missed = missed.model_copy(update={"bandwidth_rad_s": specification.lowest_bandwidth_rad_s})
+    if specification.highest_effort_limit is not None:
+        missed = missed.model_copy(update={"effort_limit": specification.highest_effort_limit})
     whole_designs = 0
     for key, factors in (("effort_limit", (1.5 * gamma, 3 * gamma)), ("bandwidth_rad_s", (0.5, 0.25))):
         stated = getattr(missed, key)
@@ -158,7 +159,7 @@ def would_meet(
             if whole_designs == _MOST_WHOLE_DESIGNS:
                 return None
             whole_designs += 1
-            typed = "lowest_bandwidth_rad_s" if left_open and key == "bandwidth_rad_s" else key
+            typed = key if getattr(specification, GIVES_WAY[key]) is None else GIVES_WAY[key]
             wished = specification.model_copy(update={typed: value})
             design = find_design(plants, wished, synthesis, options, copy.deepcopy(rng), advise=False)
             if not design.met or design.controller is None:

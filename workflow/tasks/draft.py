@@ -30,6 +30,12 @@ from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 # and the one that is asked for at least.
 _PART, _LEAST_PART = 3, 100
 _ORDER = 5  # of the controller: integrator, roll-off and a notch, with one state to spare
+# How far what is drafted gives way where it cannot be met, as a factor. The effort limit is what the recorded
+# command allows a step of half the motion's spread: at four times of it (12 dB) the command stays within its
+# limit for a step of an eighth. The peak of a mode: at twice of it (6 dB) the loop still takes no more than
+# half of the mode's damping. Chosen; doubled, a machine that misses both is certified for less.
+_EFFORT_GIVES_WAY = 4.0
+_PEAK_GIVES_WAY = 2.0
 # An unstable pole has to be left behind by the bandwidth, by this factor.
 _BEYOND_UNSTABLE = 2.5
 # Of one log the last part validates, where that leaves so many samples and the parts are driven alike within
@@ -225,6 +231,7 @@ def _specification(
     at_once = {"computational_delay_samples": 0} if timing.acts_at_once else {}
     band = {
         "mode_peak_ratio": 1.0,
+        "highest_mode_peak_ratio": _PEAK_GIVES_WAY,
         "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
     }
     return {
@@ -232,6 +239,7 @@ def _specification(
         "lowest_bandwidth_rad_s": _rounded(max(min(base / _LEAST_PART, recorded or np.inf), unstable)),
         "modulus_margin": 0.5,
         "effort_limit": _rounded(effort),
+        "highest_effort_limit": _rounded(_EFFORT_GIVES_WAY * _rounded(effort)),
         # Above what the logs tell the command falls off.
         "effort_rolloff_rad_s": _rounded(min(max(highest, _PART * bandwidth), 0.5 * np.pi / dt_s)),
         **(band if look.mode else {}),

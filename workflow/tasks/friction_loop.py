@@ -23,7 +23,7 @@ from control_design.analysis.closed_loop import (
 )
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
-from control_design.specification import Specification
+from control_design.specification import GIVES_WAY, Specification
 from ident.data.arrays import RealArray, kernel_array
 from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
@@ -424,11 +424,15 @@ def soonest(
     if recorded is not None:
         enough_s = min(enough_s, recorded.settling(step).median_s)
 
-    # The bandwidth that was reached stays; fewer states do not slow the loop.
-    reached = getattr(first.specification, "bandwidth_rad_s", None)
-    kept = {}
-    if reached and reached > asked.lowest_bandwidth_rad_s:
-        kept["bandwidth_rad_s"] = reached
+    # The bandwidth that was reached stays, and nothing else gives way further: fewer states do not slow the
+    # loop.
+    reached = first.specification or asked
+    kept: dict[str, Any] = {}
+    if reached.bandwidth_rad_s and reached.bandwidth_rad_s > asked.lowest_bandwidth_rad_s:
+        kept["bandwidth_rad_s"] = reached.bandwidth_rad_s
+    for key, limit in GIVES_WAY.items():
+        if limit != "lowest_bandwidth_rad_s":
+            kept |= {key: getattr(reached, key), limit: None}
     for fewer in range(1, min(3, law.order)):
         if best_s <= enough_s:
             break

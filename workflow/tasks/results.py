@@ -370,7 +370,7 @@ class IdentifiedPlant:
 class DesignResult:
     """synthesis: None where the specification is impossible from the start; reason: met, or how far and which
     frequency and requirement block it; jointly: what became of designing for sampled responses.
-    specification: with the bandwidth that was chosen, where the one asked for leaves that open."""
+    specification: what was designed for, where the one asked for gives way."""
 
     synthesis: SynthesisResult | MultivariableResult | None
     met: bool

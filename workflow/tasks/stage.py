@@ -39,7 +39,7 @@ class StageInput:
 
     @property
     def specification(self) -> Specification:
-        """What was designed for: with the bandwidth that was chosen."""
+        """What was designed for: every requirement as far as it gave way."""
         return self.results.design.specification or self.config.specification
 
     def rng(self, *names: str) -> np.random.Generator:

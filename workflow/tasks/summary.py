@@ -18,6 +18,7 @@ from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design import bracket_numbers, joint_numbers
 from workflow.tasks.exports import Logged
+from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
@@ -37,6 +38,8 @@ def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
     )
     shown: dict[str, Any] = {"config": config, "results": results}
     shown["numbers_of_controller"] = numbers_of_controller(results, config)
+    if isinstance(config, RunConfig):
+        shown["given_way"] = gave_way(config.specification, results.design.specification)
     shares, signals = numbers.get("sampled_responses"), Logged.of(config, results.records).signals
     return RunSummary(
         title=title_of(config, results.run),
@@ -67,6 +70,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
                 "outcome": "IMPOSSIBLE" if design.synthesis is None else design.synthesis.outcome.name,
                 "blocking": [] if design.synthesis is None else codec.plain(design.synthesis.blocking),
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
+                "gave_way": codec.plain(gave_way(config.specification, design.specification)),
                 "controller_dt_s": None if design.controller is None else design.controller.dt_s,
             },
             "engineers_numbers": None if numbers is None else numbers.to_dict(),
@@ -134,14 +138,15 @@ def verdict_of(
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable
     performance is given, whether a higher order would help; up to where the ellipses are wider than the
-    gain, if they are; what the certificate stands or falls with; and where less bandwidth than asked was
-    designed for, both."""
+    gain, if they are; what the certificate stands or falls with; and where less than asked was designed for,
+    both."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         structure = "biquads" if asked is None else asked.structure
         advice = said("order_advice", achievable, design.gamma, order, structure)
     told = ". Also, ".join(words(doubt) for doubt in conditions)
-    return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked)
+    given_way = () if asked is None else gave_way(asked, design.specification)
+    return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked, given_way)
 
 
 def timing_numbers(timing: CommandTiming | None) -> dict[str, Any] | None:
