@@ -497,6 +497,13 @@ def design(
             "a reference filter beside it, as NAME_reference_filter."
         ),
     ] = None,
+    report: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write the page of the design here (HTML, one file), for the plant of one run directory; in "
+            "a directory of --out it is there as report.html."
+        ),
+    ] = None,
     seed: Seed = 2006,
     c_prefix: CPrefix = None,
     c_float: CFloat = None,
@@ -515,7 +522,9 @@ def design(
         file = None if specification is None else read_design_file(specification)
         from workflow.commands.design import design_controller
 
-        summary = design_controller(source, file, out=out, seed=seed, dialect=dialect, progress=progress)
+        summary = design_controller(
+            source, file, out=out, page=report, seed=seed, dialect=dialect, progress=progress
+        )
     _show(summary, as_json)
     _leave(summary)
 
@@ -775,6 +784,8 @@ def _reading(given: Mapping[str, Any]) -> Reading:
 def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
     """Keys of [specification] as options state them, each within its range. Raises InputError naming the
     option."""
+    if not typed:  # the settings are slow to load
+        return {}
     from pydantic import TypeAdapter, ValidationError
 
     from control_design.specification import Specification

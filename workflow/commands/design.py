@@ -10,6 +10,7 @@ from control_design.controllers.c_code import Dialect
 from control_design.controllers.engineers_numbers import engineers_numbers
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import GIVES_WAY, Specification
+from workflow.commands.design_page import refuse_page, write_design_page
 from workflow.config.design_file import DesignFile
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
@@ -112,6 +113,7 @@ def design_controller(
     file: DesignFile | None = None,
     *,
     out: Path | None = None,
+    page: Path | None = None,
     seed: int = 2006,
     dialect: Dialect | None = None,
     progress: Progress | None = None,
@@ -119,7 +121,8 @@ def design_controller(
     """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
 
     file: None takes the specification of a run directory. out: of the controller, by its ending as JSON, MAT
-    file or C source (as of dialect), and beside it of a reference filter. A specification that no controller
+    file or C source (as of dialect), and beside it of a reference filter. page: of the design, for the plant
+    of one run; report.html beside the files where `out` is a directory. A specification that no controller
     can meet is a result: not certified, the reason in `verdict`. Raises InputError.
     """
     name, file = (file.name, file) if file is not None else (str(paths[0]), DesignFile())
@@ -130,9 +133,15 @@ def design_controller(
         paths, [("--out", one) for path in written for one in (path, filter_file(path))]
     )
     progress = progress or Progress()
+    if page is not None:
+        storage.refuse_in_the_way(paths, [("--report", page)])
     progress.plan([("plants", 5.0), ("design", 30.0)])
     with progress.stage("plants"):
         sources_found, asked, specification = load_asked(paths, file)
+    if page is not None:
+        refuse_page(asked, list(paths), sources_found[0].config)
+    elif out is not None and out.is_dir() and len(paths) == 1 and "level" not in file.plant.model_fields_set:
+        page = None if sources_found[0].config is None else out / "report.html"
     plants = [source.plant for source in sources_found]
     logged = [source.logged for source in sources_found if source.logged is not None]
     check_filter(asked.reference_filter, plants[0].dt_s, name)
@@ -151,6 +160,17 @@ def design_controller(
         files = write_controller(
             out, law, prefilter.filter, certified=certify.certified, about=known, dialect=dialect
         )
+    if page is not None and sources_found[0].config is not None:
+        with progress.stage("report"):
+            write_design_page(
+                paths[0],
+                sources_found[0].config,
+                asked,
+                specification,
+                (design, certify, achievable, prefilter),
+                page,
+                progress,
+            )
     missed = gamma is not None and gamma > 1
     advice = (
         (said("order_advice", achievable, gamma, order, specification.structure) or None) if missed else None
@@ -197,4 +217,5 @@ def design_controller(
         },
         certified=certify.certified,
         verdict=reason,
+        report_path=None if page is None else str(page),
     )
