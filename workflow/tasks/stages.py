@@ -33,14 +33,21 @@ def design_controller(stage: StageInput) -> DesignResult:
     """Best controller found for the plant that was identified."""
     config = stage.config
 
-    def found(asked: Specification) -> DesignResult:
+    def found(asked: Specification, *, advise: bool) -> DesignResult:
         report = partial(stage.progress.update, "design")
         return find_design(
-            [stage.plant], asked, config.synthesis, config.certificate, stage.rng("design"), report
+            [stage.plant],
+            asked,
+            config.synthesis,
+            config.certificate,
+            stage.rng("design"),
+            report,
+            advise=advise,
         )
 
     with naming("design"):
-        return soonest(stage, found(config.specification), found)
+        # What a further try misses is not the user's to mend.
+        return soonest(stage, found(config.specification, advise=True), partial(found, advise=False))
 
 
 def find_achievable(stage: StageInput) -> AchievablePerformance:
