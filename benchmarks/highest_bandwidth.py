@@ -46,7 +46,8 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 45) -> None:
         out(f"{seed:4d}  {used.bandwidth_rad_s:15.4g}  {result.gamma:6.4f}  {taken:8.2f}")
     out()
     out(
-        f"met {met} of {len(times)}; CPU seconds of a search: median {np.median(times):.2f}, all {sum(times):.0f}"
+        f"met {met} of {len(times)}; CPU seconds of a search: median {np.median(times):.2f}, "
+        f"all {sum(times):.0f}"
     )
 
 
