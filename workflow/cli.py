@@ -786,21 +786,25 @@ def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
     option."""
     if not typed:  # the settings are slow to load
         return {}
-    from pydantic import TypeAdapter, ValidationError
+    from pydantic import create_model
 
     from control_design.specification import Specification
+    from workflow.config.settings import Section
 
     found = dict(typed)
     order = found.get("controller_order")
     if isinstance(order, str) and order.isdigit():  # a number, or "auto"
         found["controller_order"] = int(order)
-    for name, value in found.items():
-        field = Specification.model_fields[name]
-        try:
-            TypeAdapter(Annotated[field.annotation, field]).validate_python(value)
-        except ValidationError as error:
-            reason = error.errors()[0]["msg"]
-            raise InputError(f"{option_name(name)}: {reason[0].lower()}{reason[1:]}, got {value}") from error
+    elif order not in (None, "auto"):
+        raise InputError(
+            f"{option_name('controller_order')}: expected a number of states or auto, got {order}"
+        )
+    # Each by itself: what contradicts the keys beside it is found where all of them are known.
+    fields: dict[str, Any] = {
+        name: (Specification.model_fields[name].annotation, Specification.model_fields[name])
+        for name in found
+    }
+    _settings(create_model("TypedSpecification", __base__=Section, **fields), found)
     return found
 
 

@@ -104,8 +104,8 @@ def synthesise_giving_way(
     tell = progress or (lambda fraction, message: None)
     giving = [key for key, limit in GIVES_WAY.items() if getattr(specification, limit) is not None]
     if not giving:
-        result = synthesise(plants, specification, options, rng=rng, progress=progress, enough=1.0)
-        return with_order(specification, result), result
+        only = synthesise(plants, specification, options, rng=rng, progress=progress, enough=1.0)
+        return with_order(specification, only), only
 
     designs = _Designs(plants, options, int(rng.integers(2**63)), tell)
     weighted = [key for key in giving if key in _WEIGHTED]
