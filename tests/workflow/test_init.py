@@ -128,7 +128,12 @@ def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, 
     assert channel.identification.integrators == 1
     assert not seen["turned"]
     assert config.specification.integrator
-    assert config.specification.modulus_margin == 0.5
+    wish = config.specification
+    assert wish.modulus_margin == 0.5
+    # What is drafted gives way, and says how far.
+    assert wish.lowest_bandwidth_rad_s < wish.bandwidth_rad_s
+    assert wish.highest_effort_limit == pytest.approx(4 * wish.effort_limit, rel=0.05)
+    assert (wish.highest_mode_peak_ratio is None) == (wish.mode_peak_ratio is None)
     assert f"{1 / DT_S:g} Hz" in text
 
 

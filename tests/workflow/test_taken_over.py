@@ -9,6 +9,7 @@ from tests.workflow.command import FAST_ARM
 from tests.workflow.test_resume import Watch, assert_same_run, plain_page, stage_bytes  # noqa: F401
 from workflow.commands.run import run_from_files
 from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.changed_specification import with_typed
 
 PLANT = ["records", "identify", "uncertainty"]
 
@@ -130,3 +131,16 @@ def test_a_design_for_a_run_has_its_page(flexlink, refused, fast_run, tmp_path, 
     model = fast_run[0] / "model.json"
     words = refused("design", model, "--spec", asked, "--report", page)
     assert "a page shows one run's records and model: give one run directory" in words
+
+
+def test_a_typed_value_is_hard_and_leaves_the_rest_as_it_was():
+    drafted = {"bandwidth_rad_s": 32.0, "lowest_bandwidth_rad_s": 1.0, "effort_limit": 2.2}
+    drafted |= {"highest_effort_limit": 8.8, "modulus_margin": 0.5}
+    assert with_typed(drafted, {}) == drafted
+    typed = with_typed(drafted, {"effort_limit": 3.0})
+    assert typed == {key: typed[key] for key in drafted if key != "highest_effort_limit"}
+    assert (typed["effort_limit"], typed["lowest_bandwidth_rad_s"]) == (3.0, 1.0)
+    # A limit that is typed beside it stays one.
+    both = {"effort_limit": 3.0, "highest_effort_limit": 4.0}
+    assert with_typed(drafted, both) == drafted | both
+    assert with_typed(drafted, {"highest_effort_limit": 4.0}) == drafted | {"highest_effort_limit": 4.0}
