@@ -227,8 +227,10 @@ def test_an_axis_over_the_bandwidth_is_no_question_of_a_lower_one(tmp_path):
         lowest_of = [point.config.specification.lowest_bandwidth_rad_s for point in points]
         found[axes] = made.left_out, lowest_of
     assert found == {
-        width: (0.2, [None, None]), order: (None, [0.2]), width + lowest: (None, [0.05, 0.05])
-    }  # fmt: skip
+        width: ({"lowest_bandwidth_rad_s": 0.2}, [None, None]),
+        order: ({}, [0.2]),
+        width + lowest: ({}, [0.05, 0.05]),
+    }
 
 
 def test_a_point_at_a_lower_bandwidth_is_marked_everywhere():
@@ -248,7 +250,7 @@ def test_a_point_at_a_lower_bandwidth_is_marked_everywhere():
     ):
         view = replace(_view(rows), config=SimpleNamespace(axes=config_axes, pareto=(_PLOT,)))
         assert ("worst_gamma" in [column.name for column, _ in view.best]) == judged
-    view = replace(_view([lower, whole]), left_out=1.6)
+    view = replace(_view([lower, whole]), left_out={"lowest_bandwidth_rad_s": 1.6})
     axes = draw_pareto(view).axes[0]
     ring = {line.get_label(): line for line in axes.lines}["certified at a lower bandwidth than specified"]
     assert list(ring.get_xdata()) == [5.7]

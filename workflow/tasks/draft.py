@@ -30,11 +30,12 @@ from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 # and the one that is asked for at least.
 _PART, _LEAST_PART = 3, 100
 _ORDER = 5  # of the controller: integrator, roll-off and a notch, with one state to spare
-# How far what is drafted gives way where it cannot be met, as a factor. The effort limit is what the recorded
-# command allows a step of half the motion's spread: at four times of it (12 dB) the command stays within its
-# limit for a step of an eighth. The peak of a mode: at twice of it (6 dB) the loop still takes no more than
-# half of the mode's damping. Chosen; doubled, a machine that misses both is certified for less.
+# How far a drafted effort limit gives way where it cannot be met, as a factor: it is what the recorded
+# command allows a step of half the motion's spread, at four times of it (12 dB) a step of an eighth stays
+# within the command's limit. Chosen; doubled, a machine that misses it is certified for smaller steps.
 _EFFORT_GIVES_WAY = 4.0
+# How far the drafted peak of a mode gives way, as a factor: at twice of it (6 dB) the loop takes no more than
+# about half of the mode's damping. Chosen; doubled, three quarters.
 _PEAK_GIVES_WAY = 2.0
 # An unstable pole has to be left behind by the bandwidth, by this factor.
 _BEYOND_UNSTABLE = 2.5
