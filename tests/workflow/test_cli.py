@@ -469,7 +469,7 @@ def test_nothing_is_waited_for(tmp_path, refused, command, what):
 
 
 def test_a_run_without_configuration_says_that_the_arm_is_built_in(flexlink, tmp_path, monkeypatch):
-    def stop(*given):
+    def stop(*given, **how):
         raise InputError("no further")
 
     monkeypatch.setattr("workflow.tasks.pipeline._perform", stop)

@@ -137,7 +137,9 @@ def test_no_picture_that_an_interrupt_went_under_in_is_kept(monkeypatch):
 
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path, flexlink, monkeypatch):
     monkeypatch.setattr(interrupts, "_came", None)
-    monkeypatch.setattr("workflow.tasks.pipeline._perform", lambda *_: signal.raise_signal(signal.SIGALRM))
+    monkeypatch.setattr(
+        "workflow.tasks.pipeline._perform", lambda *_, **__: signal.raise_signal(signal.SIGALRM)
+    )
     called = ("run", "--config", FAST_ARM, "--out", tmp_path / "run", "--time-limit", "600")
     again = f"flexlink {' '.join(map(str, called))} --resume continues"
     answer = flexlink(*called)
