@@ -333,13 +333,14 @@ def _at_share(
 ) -> Specification:
     """What is asked with keys moved by a share of the way to their limits, on a logarithmic scale.
 
-    share: 0: as asked, 1: at the limits of `specification`. Every value is positive, which the limits' fields
-    ensure.
+    share: 0: as asked, 1: at the limits of `specification`. Rounded up to three digits. Every value is
+    positive, which the limits' fields ensure.
     """
     values = {}
     for key in keys:
         value = getattr(specification, key)
-        values[key] = float(value * (getattr(specification, GIVES_WAY[key]) / value) ** share)
+        limit = getattr(specification, GIVES_WAY[key])
+        values[key] = min(_rounded_up(value * (limit / value) ** share), limit)
     return asked.model_copy(update=values)
 
 

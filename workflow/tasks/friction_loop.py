@@ -424,15 +424,14 @@ def soonest(
     if recorded is not None:
         enough_s = min(enough_s, recorded.settling(step).median_s)
 
-    # The bandwidth that was reached stays, and nothing else gives way further: fewer states do not slow the
-    # loop.
+    # No more is tried than the bandwidth that was reached, as fewer states do not slow the loop, and nothing
+    # else gives way further.
     reached = first.specification or asked
     kept: dict[str, Any] = {}
-    if reached.bandwidth_rad_s and reached.bandwidth_rad_s > asked.lowest_bandwidth_rad_s:
-        kept["bandwidth_rad_s"] = reached.bandwidth_rad_s
     for key, limit in GIVES_WAY.items():
-        if limit != "lowest_bandwidth_rad_s":
-            kept |= {key: getattr(reached, key), limit: None}
+        kept |= {key: getattr(reached, key), limit: None}
+    if reached.bandwidth_rad_s and reached.bandwidth_rad_s > asked.lowest_bandwidth_rad_s:
+        kept["lowest_bandwidth_rad_s"] = asked.lowest_bandwidth_rad_s
     for fewer in range(1, min(3, law.order)):
         if best_s <= enough_s:
             break
