@@ -13,12 +13,14 @@ from PIL import Image
 
 import flexlink
 from diagnosis.diagnosis import diagnose
+from flexlink.pictures import as_response
 from tests.browser import Browser
 from workflow.commands.run import run_from_files
 from workflow.commands.tune import tuning
 from workflow.diagnose.case_files import load_case
+from workflow.figures.bode import draw_bode
 from workflow.figures.gap_records import draw_measured_beside_simulated
-from workflow.figures.style import render
+from workflow.figures.svg import alone
 
 DOCS = Path(__file__).parent
 
@@ -33,7 +35,7 @@ def overview() -> bytes:
 def diagnosis() -> bytes:
     """examples/gap_case: measured beside simulated, before and after the repair."""
     case = load_case(DOCS.parent / "examples" / "gap_case").case
-    return render(draw_measured_beside_simulated(diagnose(case))).content
+    return alone(draw_measured_beside_simulated(diagnose(case)))
 
 
 def response() -> bytes:
@@ -41,7 +43,8 @@ def response() -> bytes:
     voltage = flexlink.prbs(register_length=11, hold_samples=2, amplitude_V=12.0, n_samples=4000)
     run = flexlink.simulate(flexlink.paper_link(), voltage, rng=np.random.default_rng(1))
     found = flexlink.identify(run.record("hub_angle_rad"), integrators=1, n_real=1, n_pairs=2)
-    return render(flexlink.bode(flexlink.uncertainty(found))).content
+    name = f"{found.model.input_name} to {found.model.output_name}"
+    return alone(draw_bode(as_response(flexlink.uncertainty(found)), name, "as logged"))
 
 
 def tune() -> bytes:

@@ -75,8 +75,8 @@ def bode(
     found, model = as_response(result, omega_rad_s), getattr(result, "model", result)
     name = f"{getattr(model, 'input_name', 'u')} to {getattr(model, 'output_name', 'y')}"
     if ax is not None and np.size(ax) < 3:
-        return draw_comparison({name: found}, ax=ax, dB=dB, Hz=Hz)
-    return draw_bode(found, name, "as logged", ax=ax, dB=dB, Hz=Hz)
+        return _figure(draw_comparison({name: found}, dB=dB, Hz=Hz), ax)
+    return _figure(draw_bode(found, name, "as logged", dB=dB, Hz=Hz), ax)
 
 
 def compare(
@@ -108,7 +108,7 @@ def compare(
     if not results or len(chosen) != len(results):
         raise ValueError(f"expected a name for each response; got {len(results)} and {len(chosen)} names")
     found = (as_response(result, omega_rad_s) for result in results)
-    return draw_comparison(dict(zip(chosen, found, strict=True)), ax=ax, dB=dB, Hz=Hz)
+    return _figure(draw_comparison(dict(zip(chosen, found, strict=True)), dB=dB, Hz=Hz), ax)
 
 
 def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
@@ -124,7 +124,7 @@ def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
     """
     from workflow.figures.nyquist import draw_alone, draw_nyquist
 
-    return draw_alone(draw_nyquist, _loop_of(loop, controller, omega_rad_s), ax=ax)
+    return _figure(draw_alone(draw_nyquist, _loop_of(loop, controller, omega_rad_s)), ax)
 
 
 def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
@@ -139,7 +139,7 @@ def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
     """
     from workflow.figures.nyquist import draw_alone, draw_nichols
 
-    return draw_alone(draw_nichols, _loop_of(loop, controller, omega_rad_s), ax=ax)
+    return _figure(draw_alone(draw_nichols, _loop_of(loop, controller, omega_rad_s)), ax)
 
 
 def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = None) -> Figure:
@@ -168,7 +168,14 @@ def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = N
         command = control.forced_response(law, found.time, 1 - found.outputs).outputs[None]
         names |= {"command": ("command", "")}
     runs = LoopRuns(output, command, None, np.zeros_like(output, dtype=bool))
-    return draw_closed_loop(found.time, np.ones_like(found.time), runs, names, ax=ax)
+    return _figure(draw_closed_loop(found.time, np.ones_like(found.time), runs, names), ax)
+
+
+def _figure(picture: Any, ax: Any = None) -> Figure:
+    """A picture as a figure of matplotlib, or on axes that the caller has."""
+    from workflow.figures.matplotlib_figure import figure_of
+
+    return figure_of(picture, ax)
 
 
 def _parts(result: Any, controller: Any) -> tuple[Any, Any]:
@@ -234,7 +241,8 @@ def _record(record: Record) -> Figure:
     from workflow.figures.records import draw_records
     from workflow.tasks.results import RunRecord
 
-    return draw_records([RunRecord(record, "estimation", None, "")], record.input_names, record.output_names)
+    shown = [RunRecord(record, "estimation", None, "")]
+    return _figure(draw_records(shown, record.input_names, record.output_names))
 
 
 @plot.register(Simulation)
@@ -252,7 +260,7 @@ def _simulation(simulation: Simulation) -> Figure:
 def _poles(found: Identification) -> Figure:
     from workflow.figures.poles import draw_poles
 
-    return draw_poles(found.model)
+    return _figure(draw_poles(found.model))
 
 
 @plot.register(FrfIdentification)
@@ -273,7 +281,7 @@ def _loop(result: Any) -> Figure:
     assert result.specification is not None
     omega = _grid(plant.dt_s) if plant.own_grid is None else plant.own_grid[plant.own_grid > 0]
     curves = sensitivity_curves(plant, controller, result.specification, omega)
-    return draw_sensitivities(curves, level=plant.level)
+    return _figure(draw_sensitivities(curves, level=plant.level))
 
 
 @plot.register(ClosedLoopTrajectory)
@@ -283,21 +291,21 @@ def _run(run: ClosedLoopTrajectory) -> Figure:
 
     runs = LoopRuns(run.measured[None], run.command[None], None, run.limited[None])
     labels = {"output": ("output", ""), "command": ("command", "")}
-    return draw_closed_loop(run.time_s, run.reference, runs, labels)
+    return _figure(draw_closed_loop(run.time_s, run.reference, runs, labels))
 
 
 @plot.register(ErrorSurface)
 def _surface(surface: ErrorSurface) -> Figure:
     from workflow.figures.pole_search import draw_surface
 
-    return draw_surface(surface)
+    return _figure(draw_surface(surface))
 
 
 @plot.register(Diagnosis)
 def _causes(found: Diagnosis) -> Figure:
     from workflow.figures.gap_answer import draw_probabilities
 
-    return draw_probabilities(found)
+    return _figure(draw_probabilities(found))
 
 
 def _grid(dt_s: float) -> npt.NDArray[np.float64]:

@@ -21,7 +21,7 @@ from validation.paper.quotes import OPEN_CHOICES, REPORTED
 from validation.paper.settings import PaperSettings
 from validation.paper.table import csv_text, rows_of
 from workflow.engine.progress import Progress
-from workflow.figures import style
+from workflow.figures.matplotlib_figure import figure_of
 
 pytestmark = pytest.mark.slow
 
@@ -36,20 +36,19 @@ def results():
 
 @pytest.fixture(scope="module")
 def pictures(results):
-    return {number: style.render(draw(results)) for number, draw in DRAWERS.items()}
+    return {number: draw(results) for number, draw in DRAWERS.items()}
 
 
 @pytest.fixture
 def ready(monkeypatch, results, pictures):
     """The command with its computation and its pictures done."""
     monkeypatch.setattr(command, "run_experiments", lambda settings, progress: results)
-    monkeypatch.setattr(command, "DRAWERS", {number: lambda _, n=number: n for number in pictures})
-    monkeypatch.setattr(command, "render", pictures.__getitem__)
+    monkeypatch.setattr(command, "DRAWERS", {number: lambda _, n=number: pictures[n] for number in pictures})
 
 
 @pytest.mark.parametrize("number", list(DRAWERS))
 def test_figures_have_titles_units_and_nothing_is_hidden(results, number):
-    figure = DRAWERS[number](results)
+    figure = figure_of(DRAWERS[number](results))
     for axes in panels(figure):
         for label in filter(None, (axes.get_xlabel(), axes.get_ylabel())):
             assert re.search(r"\[.+\]", label), f"no unit in {label!r}"

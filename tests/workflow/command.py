@@ -89,13 +89,14 @@ def wait_until(condition: Callable[[], object], process: subprocess.Popen[bytes]
 
 
 def draw_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are built but not rendered: what a page says does not depend on its pictures."""
-    from workflow.figures.style import Picture
+    """Pictures are described but not drawn: what a page says does not depend on its pictures."""
+    from workflow.figures.description import new_picture
+    from workflow.figures.svg import Drawn
     from workflow.report import rendering
 
     nothing = {"axes": [], "cuts": [], "legend": [], "width": 1, "height": 1}
-    empty = Picture("svg", b"<svg/>", nothing)
-    monkeypatch.setattr(rendering, "render", lambda figure, also: empty)
+    empty = Drawn(new_picture(1.0)[0], "", "", [], nothing)
+    monkeypatch.setattr(rendering, "drawn", lambda picture, label, number, styles: empty)
 
 
 class _Built(dict[str, Callable[..., object]]):
@@ -106,7 +107,7 @@ class _Built(dict[str, Callable[..., object]]):
 
 
 def build_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside `draw_nothing`, where the same numbers have been drawn before: figures are not even built."""
+    """Beside `draw_nothing`, where the same numbers have been drawn before: nothing is even described."""
     from workflow.report import rendering
 
     monkeypatch.setattr(rendering, "drawings", _Built)

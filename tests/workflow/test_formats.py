@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from markupsafe import Markup
-from matplotlib.figure import Figure
 
 import workflow.study.page  # noqa: F401 (a drawing outside workflow.figures)
+from workflow.figures.description import Picture, new_picture
 from workflow.figures.style import drawings
 from workflow.report import rendering
 from workflow.text import formats
@@ -94,10 +94,10 @@ PAGE = """
 def line(monkeypatch):
     """A page and a drawing of this test's own."""
 
-    def draw(values: list[float]) -> Figure | None:
-        figure = Figure()
-        figure.subplots().plot(values)
-        return figure if values else None
+    def draw(values: list[float]) -> Picture | None:
+        picture, panel = new_picture(2.0)
+        panel.plot(range(len(values)), values)
+        return picture if values else None
 
     environment = shared()
     loader = ChoiceLoader(

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from control_design.controllers.controller import Controller
 from tests.workflow.command import FAST_ARM, ROOT, finish, start_flexlink, wait_until
@@ -21,7 +20,8 @@ from workflow.engine import interrupts, storage
 from workflow.engine.errors import CommandInterruptedError, InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
-from workflow.figures.style import render
+from workflow.figures.description import new_picture
+from workflow.figures.matplotlib_figure import saved
 from workflow.report import pages
 from workflow.report.pages import REPORT
 from workflow.tasks.exports import write_controller
@@ -129,10 +129,9 @@ def test_an_interrupt_that_went_under_while_libraries_were_loaded_ends_the_first
 
 def test_no_picture_that_an_interrupt_went_under_in_is_kept(monkeypatch):
     monkeypatch.setattr(interrupts, "_came", signal.SIGTERM)
-    figure = Figure()
-    figure.add_subplot()
+    picture, _ = new_picture(1.0)
     with pytest.raises(KeyboardInterrupt):
-        render(figure)
+        saved(picture, "png")
 
 
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path, flexlink, monkeypatch):

@@ -13,7 +13,7 @@ import pandas as pd
 from markupsafe import Markup
 
 from validation.blind.truth import LISTED
-from workflow.figures import style
+from workflow.figures.matplotlib_figure import house_style, new_figure
 from workflow.text.templates import Row, RunSummary, TableSection, environment
 
 _SLICES = ("all", "exact", "uncertain")
@@ -89,8 +89,8 @@ def confusion_figure(scored: Mapping[str, Any]) -> bytes:
     columns = [name for name in order if name in table.columns or name in rows]
     columns += sorted(set(table.columns) - set(order))
     counts = table.reindex(index=rows or ["none"], columns=columns or ["none"], fill_value=0).to_numpy()
-    with style.house_style():
-        figure = style.new_figure(2.2 + 0.27 * counts.shape[0], 2.6 + 0.33 * counts.shape[1])
+    with house_style():
+        figure = new_figure(2.2 + 0.27 * counts.shape[0], 2.6 + 0.33 * counts.shape[1])
         axes = figure.add_subplot()
         share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
         axes.imshow(share, cmap="Blues", vmin=0, vmax=1.3, aspect="auto")

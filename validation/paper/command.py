@@ -8,7 +8,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from matplotlib.figure import Figure
+from markupsafe import Markup
 
 from validation.paper import table
 from validation.paper.bounds import TWO_SIGMA_LEVEL
@@ -31,7 +31,8 @@ from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import package_versions
 from workflow.engine.store import Store
-from workflow.figures.style import Picture, render
+from workflow.figures.description import Picture
+from workflow.figures.svg import COMMON_STYLE, alone, drawn, style_of
 from workflow.report.rendering import embedded
 from workflow.text.templates import Row, RunSummary, TableSection, environment
 
@@ -51,7 +52,7 @@ class PaperDirectory(Store):
     )
 
 
-DRAWERS: Mapping[int, Callable[[PaperResults], Figure]] = {
+DRAWERS: Mapping[int, Callable[[PaperResults], Picture]] = {
     1: lambda results: draw_surface(results.surface),
     2: draw_simulation,
     3: draw_simulation_peers,
@@ -84,7 +85,7 @@ def redraw_paper(
         pictures = {}
         for number, draw in DRAWERS.items():
             update((number - 1) / len(DRAWERS), f"figure {number}")
-            pictures[number] = render(draw(results))
+            pictures[number] = draw(results)
         findings, rows = findings_of(results), table.rows_of(results)
         headlines = headlines_of(results, findings)
         document = {
@@ -104,7 +105,7 @@ def redraw_paper(
             "rows": [asdict(row) for row in rows],
         }
         page = page_html(results, pictures, findings, rows)
-        files = {f"figure-{number}.{one.kind}": one.content for number, one in pictures.items()}
+        files = {f"figure-{number}.svg": alone(picture) for number, picture in pictures.items()}
         files |= {TABLE_CSV: table.csv_text(rows).encode(), TABLE_JSON: plain_text(document).encode()}
         files[store.manifest_name] = page.encode()
         with store.writing(replace=True):
@@ -131,6 +132,7 @@ def page_html(
         .render(
             contents=[],
             styles=styles,
+            looks=lambda: Markup(COMMON_STYLE + style_of(styles)),
             results=results,
             found=findings,
             headlines=headlines_of(results, findings),
@@ -147,10 +149,12 @@ def page_html(
             drawings={
                 item.number: embedded(
                     f"figure-{item.number}",
-                    f"Fig. {item.number}, redrawn: {item.title}",
-                    pictures[item.number],
-                    item.number,
-                    styles,
+                    drawn(
+                        pictures[item.number],
+                        f"Fig. {item.number}, redrawn: {item.title}",
+                        item.number,
+                        styles,
+                    ),
                 )
                 for item in REPORTED
             },

@@ -1,6 +1,6 @@
 """Figs. 2 to 7 redrawn: frequency responses, in the paper's decibels and degrees, and free runs.
 
-One line per method, the same in every figure, in the house colours: those of the controller and the closed
+One line per method, the same in every picture, in the house colours: those of the controller and the closed
 loop are free here, since the page has neither. Green is OE and vermilion is what the paper did. Dashes differ
 too (ARX thin, ARMAX thick, OE dash-dotted, as in the paper), so that a grey print reads.
 """
@@ -10,9 +10,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.uncertainty import FrequencyUncertainty
@@ -22,6 +19,7 @@ from validation.paper.machines import NOISE_STD
 from validation.paper.methods import JUDGED_BAND_RAD_S, METHODS
 from workflow.figures import style
 from workflow.figures.bands import response_band, unwrapped_degrees
+from workflow.figures.description import Panel, Picture, new_picture
 
 PAPER_WAY = style.ACHIEVED
 OUR_WAY = style.MODEL
@@ -44,7 +42,7 @@ _COMMON_TURN_RAD_S = (0.5, 5.0)
 Curves = dict[str, tuple[ComplexArray, dict[str, Any]]]
 
 
-def draw_simulation(results: PaperResults) -> Figure:
+def draw_simulation(results: PaperResults) -> Picture:
     """Fig. 2: the simulated plant, GOBF as we search, and GOBF as the paper searched."""
     shown = results.simulation
     omega = shown.omega_rad_s
@@ -57,14 +55,14 @@ def draw_simulation(results: PaperResults) -> Figure:
     return _bode(shown, curves, "Simulation: plant and GOBF model of order 4")
 
 
-def draw_simulation_peers(results: PaperResults) -> Figure:
+def draw_simulation_peers(results: PaperResults) -> Picture:
     """Fig. 3: the same plant with ARX, ARMAX and OE from the usual starts."""
     shown = results.simulation
     curves = {"simulated plant": (shown.truth, TRUTH_LINE)} | _methods(shown, METHODS[1:])
     return _bode(shown, curves, "Simulation: plant and ARX, ARMAX, OE of order 4, usual starts")
 
 
-def draw_experiment(results: PaperResults) -> Figure:
+def draw_experiment(results: PaperResults) -> Picture:
     """Fig. 4: the nonlinear arm's models, and the linear arm for truth."""
     shown = results.experiment
     curves = {"true linear arm": (shown.truth, TRUTH_LINE)} | _methods(shown, METHODS)
@@ -76,26 +74,24 @@ def _methods(shown: Comparison, names: tuple[str, ...]) -> Curves:
     return {name: (shown.models[name].frequency_response(omega), METHOD_LINES[name]) for name in names}
 
 
-@style.finished
-def _bode(shown: Comparison, curves: Curves, title: str) -> Figure:
+def _bode(shown: Comparison, curves: Curves, title: str) -> Picture:
     omega, (reference, _) = shown.omega_rad_s, next(iter(curves.values()))
-    figure, (gain, phase) = style.panels(6.0, 2, 1, sharex=True, height_ratios=[1.25, 1.0])
+    picture, (gain, phase) = new_picture(6.0, 2, 1, sharex=True, height_ratios=[1.25, 1.0])
     for label, (response, line) in curves.items():
         gain.plot(omega, decibels(np.abs(response)), **line, label=label)
         phase.plot(omega, _phase(omega, response, reference), **line)
     _frequency_axes(gain, phase, omega)
     gain.set(title=title, ylabel=f"gain [dB re 1 {shown.machine.gain_unit}]")
-    phase.set_ylabel("phase [deg]")
-    phase.yaxis.set_major_locator(MultipleLocator(180))
-    return figure
+    phase.set(ylabel="phase [deg]")
+    phase.y.every = 180.0
+    return picture
 
 
-@style.finished
-def draw_gobf_run(shown: Comparison) -> Figure:
+def draw_gobf_run(shown: Comparison) -> Picture:
     """Fig. 5: measured tip and GOBF's free run, and what is left."""
     record = shown.trial.fresh
     time, measured = record.time_s, record.output[:, 0]
-    figure, (upper, lower) = style.panels(4.9, 2, 1, sharex=True, height_ratios=[1.7, 1.0])
+    picture, (upper, lower) = new_picture(4.9, 2, 1, sharex=True, height_ratios=[1.7, 1.0])
     _overlay(upper, shown, "GOBF")
     residual = {**style.MEASURED_LINE, "lw": 0.7}
     lower.plot(time, measured - shown.simulated["GOBF"], **residual, label="measured - simulated")
@@ -104,41 +100,39 @@ def draw_gobf_run(shown: Comparison) -> Figure:
     lower.set(xlabel="time [s]", ylabel="residual [m]")
     fit = shown.scores["GOBF"].fit_percent
     upper.set(title=f"Fresh data, GOBF: fit {fit:.1f} %", xlim=(time[0], time[-1]))
-    return figure
+    return picture
 
 
-@style.finished
-def draw_peer_runs(shown: Comparison) -> Figure:
+def draw_peer_runs(shown: Comparison) -> Picture:
     """Fig. 6: the same for ARX, ARMAX and OE, one panel each on the same axes."""
     measured = shown.trial.fresh.output[:, 0]
     names = METHODS[1:]
-    figure, panels = style.panels(7.0, len(names), 1, sharex=True, sharey=True)
-    for axes, name in zip(panels, names, strict=True):
-        _overlay(axes, shown, name)
+    picture, panels = new_picture(7.0, len(names), 1, sharex=True, sharey=True)
+    for panel, name in zip(panels, names, strict=True):
+        _overlay(panel, shown, name)
         fit = shown.scores[name].fit_percent
         words = f"fit {fit:.1f} %" if np.isfinite(fit) else "runs away"
-        axes.set_title(f"Fresh data, {name}: {words}")
+        panel.set_title(f"Fresh data, {name}: {words}")
     span = float(np.ptp(measured))
     # A run that leaves the measured range by far is not worth making the others unreadable for.
-    panels[0].set_ylim(measured.min() - 0.6 * span, measured.max() + 0.6 * span)
-    panels[0].set_xlim(0, shown.trial.fresh.time_s[-1])
-    panels[-1].set_xlabel("time [s]")
-    return figure
+    panels[0].set(ylim=(measured.min() - 0.6 * span, measured.max() + 0.6 * span))
+    panels[0].set(xlim=(0, shown.trial.fresh.time_s[-1]))
+    panels[-1].set(xlabel="time [s]")
+    return picture
 
 
-def _overlay(axes: Axes, shown: Comparison, name: str) -> None:
+def _overlay(panel: Panel, shown: Comparison, name: str) -> None:
     time = shown.trial.fresh.time_s
-    axes.plot(time, shown.trial.fresh.output[:, 0], **_MEASURED, label="measured")
+    panel.plot(time, shown.trial.fresh.output[:, 0], **_MEASURED, label="measured")
     simulated = np.clip(shown.simulated[name], -1e3, 1e3)
-    axes.plot(time, simulated, **METHOD_LINES[name], label=f"{name}, free run")
-    axes.set_ylabel("tip [m]")
+    panel.plot(time, simulated, **METHOD_LINES[name], label=f"{name}, free run")
+    panel.set(ylabel="tip [m]")
 
 
-@style.finished
-def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
+def draw_bounds(study: BoundsStudy, gain_unit: str) -> Picture:
     """Fig. 7: two-sigma bounds of both recipes on one record, the truth, and its distance from the centre."""
     colours = {"classical": PAPER_WAY, "tangent": OUR_WAY}
-    figure, grid = style.panels(7.4, 3, 2, sharex=True, sharey="row", height_ratios=[1.5, 1.1, 0.9])
+    picture, grid = new_picture(7.4, 3, 2, sharex=True, sharey="row", height_ratios=[1.5, 1.1, 0.9])
     floor = decibels(np.abs(study.truth).min()) - 20
     for column, (name, bound) in enumerate(study.bounds.items()):
         gain, phase, distance = grid[:, column]
@@ -150,7 +144,7 @@ def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
         ):
             shown = np.maximum(values, 1e-3)
             distance.plot(study.omega_rad_s, shown, color=style.REFERENCE, lw=1.2, **line, label=words)
-        distance.set_yscale("log")
+        distance.set(yscale="log")
         _frequency_axes(gain, distance, study.omega_rad_s)
         share = study.inside_percent[name][0]
         low, high = JUDGED_BAND_RAD_S
@@ -159,15 +153,15 @@ def draw_bounds(study: BoundsStudy, gain_unit: str) -> Figure:
     highest, span = decibels(np.abs(study.truth).max()), unwrapped_degrees(study.truth)
     gain.set(ylabel=f"gain [dB re 1 {gain_unit}]", ylim=(floor, highest + 10))
     phase.set(ylabel="phase [deg]", ylim=(span.min() - 200, span.max() + 100))
-    phase.yaxis.set_major_locator(MultipleLocator(180))
+    phase.y.every = 180.0
     largest = max(float(values.max()) for values in study.distance.values())
     distance.set(ylabel="distance of\ntruth [2 sigma]", ylim=(0.05, max(100.0, 1.5 * largest)))
-    return figure
+    return picture
 
 
 def _band(
-    gain: Axes,
-    phase: Axes,
+    gain: Panel,
+    phase: Panel,
     bound: FrequencyUncertainty,
     truth: ComplexArray,
     colour: str,
@@ -187,10 +181,10 @@ def _band(
     phase.plot(omega, unwrapped_degrees(truth), **TRUTH_LINE)
 
 
-def _frequency_axes(top: Axes, bottom: Axes, omega: RealArray) -> None:
+def _frequency_axes(top: Panel, bottom: Panel, omega: RealArray) -> None:
     top.set(xscale="log", xlim=(omega[0], omega[-1]))
-    style.hertz_axis(top)
-    bottom.set_xlabel("frequency [rad/s]")
+    top.hertz = True
+    bottom.set(xlabel="frequency [rad/s]")
 
 
 def _phase(omega: RealArray, response: ComplexArray, reference: ComplexArray) -> RealArray:

@@ -8,9 +8,6 @@ from typing import Any
 
 import control
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MultipleLocator
 
 from ident.basis.model import GobfModel
 from ident.data.distortion import Distortion
@@ -24,6 +21,7 @@ from workflow.figures.bands import (
     extremes,
     response_band,
 )
+from workflow.figures.description import Panel, Picture, X, new_picture, pad_limits, small_multiples
 from workflow.figures.nyquist import loop_of
 from workflow.figures.subjects import ChannelView, RunView
 from workflow.text.formats import share
@@ -42,7 +40,7 @@ _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2
 
 
 @style.drawing("bode")
-def draw_channel(channel: ChannelView, name: str) -> Figure:
+def draw_channel(channel: ChannelView, name: str) -> Picture:
     """Identified response of a channel, its nominal model, and what the records say without one."""
     found, spread = channel.found, channel.spread
     signals = f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}"
@@ -56,27 +54,27 @@ def draw_channel(channel: ChannelView, name: str) -> Figure:
 
 
 @style.drawing("response")
-def draw_response(channel: ChannelView) -> Figure:
+def draw_response(channel: ChannelView) -> Picture:
     """Gain and phase side by side with the band of the ellipses, lightly damped modes marked.
 
     The bands are drawn enlarged where that of the gain is too narrow to be seen.
     """
     found, spread = channel.found, channel.spread
-    figure, (gain, phase) = style.panels(4.4, 1, 2, width_in=12.0)
-    for axes, quantity in ((gain, "gain{}"), (phase, "phase{}_deg")):
-        band = draw_enlarged(axes, spread.frequency, quantity)
+    picture, (gain, phase) = new_picture(4.4, 1, 2, width_in=12.0)
+    for panel, quantity in ((gain, "gain{}"), (phase, "phase{}_deg")):
+        band = draw_enlarged(panel, spread.frequency, quantity)
         for number, (_, mode) in enumerate(channel.light, 1):
             if band.omega_rad_s[0] < mode.omega_rad_s < band.omega_rad_s[-1]:
-                style.tag_below(axes, mode.omega_rad_s, f"mode {number}")
+                style.tag_below(panel, mode.omega_rad_s, f"mode {number}")
     unit = style.plain(style.ratio_unit(channel.units[1], channel.units[0]), 24)
     gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(_gain_floor(band.gain), 3 * band.gain.max()))
-    phase.set_ylabel("phase [deg]")
-    phase.set_ylim(*style.pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
+    phase.set(ylabel="phase [deg]")
+    phase.set(ylim=pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
     gain.set_title(f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}")
-    return figure
+    return picture
 
 
-def draw_enlarged(axes: Axes, response: FrequencyUncertainty, quantity: str = "gain{}") -> ResponseBand:
+def draw_enlarged(panel: Panel, response: FrequencyUncertainty, quantity: str = "gain{}") -> ResponseBand:
     """Gain or phase over rad/s with its band, enlarged where that of the gain is too narrow to be seen.
 
     quantity: names of fields of the band, with a place for _low and _high.
@@ -88,13 +86,12 @@ def draw_enlarged(axes: Axes, response: FrequencyUncertainty, quantity: str = "g
     if quantity == "gain{}":  # where the ellipse holds the origin its lower end is 0
         low = np.maximum(low, 1e-3 * centre)
     label = f"{share(response.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
-    axes.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
-    axes.plot(band.omega_rad_s, centre, **style.MODEL_LINE, label="identified response (centre)")
-    axes.set(xscale="log", xlabel="frequency [rad/s]", xlim=(band.omega_rad_s[0], band.omega_rad_s[-1]))
+    panel.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
+    panel.plot(band.omega_rad_s, centre, **style.MODEL_LINE, label="identified response (centre)")
+    panel.set(xscale="log", xlabel="frequency [rad/s]", xlim=(band.omega_rad_s[0], band.omega_rad_s[-1]))
     return band
 
 
-@style.finished
 def draw_bode(
     uncertainty: FrequencyUncertainty,
     title: str,
@@ -102,16 +99,15 @@ def draw_bode(
     *,
     model: GobfModel | None = None,
     empirical: FrequencyUncertainty | None = None,
-    ax: Any = None,
     dB: bool = False,
     Hz: bool = False,
-) -> Figure:
+) -> Picture:
     """Gain [unit], phase and relative size of the ellipses over frequency; `empirical` as dots.
 
-    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly. ax,
-    dB, Hz: as of `draw_comparison`, with a third panel.
+    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly. dB,
+    Hz: as of `draw_comparison`.
     """
-    figure, (gain, phase, size) = style.panels(7.0, 3, 1, ax=ax, sharex=True, height_ratios=[1.5, 1.1, 0.8])
+    picture, (gain, phase, size) = new_picture(7.0, 3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
     x, y = _units(dB, Hz)
     label = f"{share(uncertainty.level)} ellipses"
     look = style.MODEL_LINE | {"label": "identified response (centre)"}
@@ -140,29 +136,26 @@ def draw_bode(
     size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
     size.plot(x(omega), relative, color=style.UNCERTAIN, lw=1.3)
     size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
-    size.set_yscale("log")
+    size.set(yscale="log")
     finite = relative[np.isfinite(relative) & (relative > 0)]
     if finite.size:
-        size.set_ylim(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max())))
-    size.set(xlabel=phase.get_xlabel(), ylabel="ellipse / gain [%]")
-    phase.set_xlabel("")
-    return figure
+        size.set(ylim=(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max()))))
+    size.set(xlabel=phase.labels[X], ylabel="ellipse / gain [%]")
+    phase.set(xlabel="")
+    return picture
 
 
-@style.finished
 def draw_comparison(
     responses: Mapping[str, FrequencyUncertainty],
     *,
-    ax: Any = None,
     dB: bool = False,
     Hz: bool = False,
-) -> Figure:
+) -> Picture:
     """Gain and phase of several responses by name, with bands where they have ellipses.
 
-    ax: two axes, for gain and phase, in place of a new figure. dB, Hz: one scale, in place of absolute gain
-    and rad/s with dB and Hz on the far sides.
+    dB, Hz: one scale, in place of absolute gain and rad/s with dB and Hz on the far sides.
     """
-    figure, (gain, phase) = style.panels(6.0, 2, 1, ax=ax, sharex=True, height_ratios=[1.4, 1.0])
+    picture, (gain, phase) = new_picture(6.0, 2, 1, sharex=True, height_ratios=[1.4, 1.0])
     colours = (style.MODEL, style.ACHIEVED, style.PREDICTED, style.LIMIT, style.HIGHLIGHT, style.MEASURED)
     lines = ("-", (0, (5, 2)), (0, (1, 1.5)))
     bands = []
@@ -173,18 +166,18 @@ def draw_comparison(
         bands.append(_draw(gain, phase, response, drawn, filled, dB=dB, Hz=Hz))
     _frame(gain, phase, "as logged", *bands, dB=dB, Hz=Hz)
     gain.set_title("Responses compared")
-    return figure
+    return picture
 
 
 @style.drawing("bode-loop")
-def draw_loop(run: RunView) -> Figure:
+def draw_loop(run: RunView) -> Picture:
     """Controller and loop gain of a run, the loop with its ellipses, crossovers and margins."""
     loop = loop_of(run)
     law = replace(
         loop, centre=run.controller.response(loop.omega_rad_s), covariance=np.zeros_like(loop.covariance)
     )
     delay = run.controller.computational_delay_samples
-    figure, grid = style.panels(6.4, 2, 2, sharex=True, height_ratios=[1.3, 1.0])
+    picture, grid = new_picture(6.4, 2, 2, sharex=True, height_ratios=[1.3, 1.0])
     filled = style.BAND | {"label": f"{share(loop.level)} ellipses"}
     for (gain, phase), response, of, title in zip(
         grid.T,
@@ -197,10 +190,10 @@ def draw_loop(run: RunView) -> Figure:
         _frame(gain, phase, style.plain(of, 24), band)
         gain.set_title(title)
     _mark_margins(gain, phase, band)
-    return figure
+    return picture
 
 
-def _mark_margins(gain: Axes, phase: Axes, loop: ResponseBand) -> None:
+def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
     """Crossovers of a nominal loop, with its gain and phase margin as python-control finds them."""
     found = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
     factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in found)
@@ -224,8 +217,8 @@ def _units(dB: bool, Hz: bool) -> tuple[Callable[[Any], Any], Callable[[Any], An
 
 
 def _draw(
-    gain: Axes,
-    phase: Axes,
+    gain: Panel,
+    phase: Panel,
     response: FrequencyUncertainty,
     look: Mapping[str, Any],
     filled: Mapping[str, Any],
@@ -247,8 +240,8 @@ def _draw(
 
 
 def _frame(
-    gain: Axes,
-    phase: Axes,
+    gain: Panel,
+    phase: Panel,
     unit: str,
     *bands: ResponseBand,
     measured: Real | None = None,
@@ -259,18 +252,18 @@ def _frame(
     x, y = _units(dB, Hz)
     every = np.concatenate([band.phase_deg for band in bands])
     ends = [float(x(end)) for band in bands for end in (band.omega_rad_s[0], band.omega_rad_s[-1])]
-    gain.set(xscale="log", yscale="linear" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
+    gain.set(xscale="log", yscale="lin" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
     phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{'Hz' if Hz else 'rad/s'}]")
-    for axes in (gain, phase):
-        axes.set_xlim(min(ends), max(ends))
-    gain.set_ylim(bottom=float(y(min(_gain_floor(band.gain, measured) for band in bands))))
+    for panel in (gain, phase):
+        panel.set(xlim=(min(ends), max(ends)))
+    gain.set(ylim=(float(y(min(_gain_floor(band.gain, measured) for band in bands))), None))
     span = np.ptp(every)
-    phase.yaxis.set_major_locator(MultipleLocator(90 if span < 400 else 180 if span < 1000 else 360))
-    phase.set_ylim(*style.pad_limits(float(every.min()), float(every.max()), 0.15))
+    phase.y.every = 90.0 if span < 400 else 180.0 if span < 1000 else 360.0
+    phase.set(ylim=pad_limits(float(every.min()), float(every.max()), 0.15))
     if not Hz:
-        style.hertz_axis(gain)
+        gain.hertz = True
     if not dB:
-        style.decibel_axis(gain)
+        gain.decibel = True
 
 
 def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
@@ -281,19 +274,19 @@ def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
 
 
 @style.drawing("distortion")
-def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Figure | None:
+def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Picture | None:
     """Best linear approximation, and what scatters around it at every line, as measured: points above the
     line of the noise are distortion. units: of input and output. Nothing where no record is periodic."""
     if not found:
         return None
     columns = min(len(found), 3)
-    figure, places = style.small_multiples(len(found), columns, 3.9, 0.6, sharex=True, sharey=True)
-    for axes, levels in zip(places, found, strict=True):
+    picture, places = small_multiples(len(found), columns, 3.9, 0.6, sharex=True, sharey=True)
+    for panel, levels in zip(places, found, strict=True):
         omega = levels.omega_rad_s
-        axes.plot(omega, np.abs(levels.gain), **style.MODEL_LINE, label="gain, best linear approximation")
+        panel.plot(omega, np.abs(levels.gain), **style.MODEL_LINE, label="gain, best linear approximation")
         if levels.noise_std is not None:
             noise = levels.noise_std / np.sqrt(levels.periods)
-            axes.plot(omega, noise, **style.MEASURED_LINE | {"lw": 1.6}, label="noise, mean of the periods")
+            panel.plot(omega, noise, **style.MEASURED_LINE | {"lw": 1.6}, label="noise, mean of the periods")
         for lines, marker, colour, label in (
             (levels.even, "x", style.LIMIT, "even detection line"),
             (levels.excited, ".", style.PREDICTED, "between realisations"),
@@ -301,10 +294,10 @@ def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Figu
         ):
             if lines is not None:
                 dots: dict[str, Any] = {"ls": "none", "marker": marker, "ms": 3.5, "mew": 0.7}
-                axes.plot(lines.omega_rad_s, np.sqrt(lines.power), color=colour, label=label, **dots)
-        axes.set(xscale="log", yscale="log")
-        axes.set_title(f"{levels.rms:.3g} {style.plain(units[0], 10)} rms".replace("  ", " "))
-        style.hertz_axis(axes)
-        axes.set_xlabel("frequency [rad/s]")
-    places[0].set_ylabel(f"level [{style.ratio_unit(units[1], units[0])}]")
-    return figure
+                panel.plot(lines.omega_rad_s, np.sqrt(lines.power), color=colour, label=label, **dots)
+        panel.set(xscale="log", yscale="log")
+        panel.set_title(f"{levels.rms:.3g} {style.plain(units[0], 10)} rms".replace("  ", " "))
+        panel.hertz = True
+        panel.set(xlabel="frequency [rad/s]")
+    places[0].set(ylabel=f"level [{style.ratio_unit(units[1], units[0])}]")
+    return picture

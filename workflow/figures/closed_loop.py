@@ -6,11 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
+from workflow.figures.description import Panel, Picture, new_picture, pad_limits, small_multiples
 from workflow.figures.sensitivity import curves_of, draw_curve
 from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.tasks.results import LoopRuns
@@ -21,7 +20,7 @@ _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
 
 
 @style.drawing("closed-loop")
-def draw_run(run: RunView) -> Figure:
+def draw_run(run: RunView) -> Picture:
     """The reference step and the disturbance of a run, predicted and on its machine."""
     loop, channel, performance = run.results.closed_loop.check, run.config.control_channel, run.performance
     assert loop is not None
@@ -43,7 +42,7 @@ def draw_run(run: RunView) -> Figure:
     )
 
 
-def draw_signals(
+def draw_closed_loop(
     time_s: Real,
     reference: Real,
     predicted: LoopRuns,
@@ -56,8 +55,8 @@ def draw_signals(
     model: Real | None = None,
     with_friction: Sequence[Real] = (),
     settled_s: float | None = None,
-    ax: Any = None,
-) -> Figure:
+    onto: Panel | None = None,
+) -> Picture | None:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
     disturbance.
 
@@ -66,70 +65,74 @@ def draw_signals(
     plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go, the
     step's panel as far as the longest. settled_s: the panels are cut where nothing moves any more, not before
     this time after the step; None: all is shown. The first run is drawn as a line, all of them as the band
-    between their extremes. ax: axes in place of a new figure, one for each panel.
+    between their extremes. onto: a panel of another picture in place of a new one, of
+    one row and column.
     """
     both = (predicted,) if others is None else (predicted, others)
     dt_s = float(time_s[1] - time_s[0])
     friction_s = float(time_s[0]) + dt_s * (max((line.size for line in with_friction), default=1) - 1)
     onset, windows = _windows(time_s, reference, disturbance, labels, both, settled_s, friction_s)
-    figure, grid = style.panels(
-        2.1 * len(labels) + 0.9, len(labels), len(windows), ax=ax, squeeze=False, sharex="col", sharey="row"
-    )
+    picture = None
+    if onto is not None:
+        grid: Any = np.array([[onto]])
+    else:
+        picture, grid = new_picture(
+            2.1 * len(labels) + 0.9, len(labels), len(windows), squeeze=False, sharex="col", sharey="row"
+        )
     for (kind, label), row in zip(labels.items(), grid, strict=True):
         hold = {"drawstyle": "steps-post"} if kind == "command" else {}
         line: Real = getattr(predicted, kind)[0]
-        for axes, window in zip(row, windows, strict=True):
+        for panel, window in zip(row, windows, strict=True):
             part = _samples(time_s, window)
             time = time_s[part]
             if others is not None:
-                _draw_runs(axes, time, getattr(others, kind)[:, part], machine, hold)
-            axes.plot(*outline(time, line[part], hold=bool(hold)), **_PREDICTED, **hold)
+                _draw_runs(panel, time, getattr(others, kind)[:, part], machine, hold)
+            panel.plot(*outline(time, line[part], hold=bool(hold)), **_PREDICTED, **hold)
             if kind == "output":
                 wanted_s, wanted = outline(time, reference[part], hold=True)
-                axes.plot(np.append(wanted_s, window.stop), np.append(wanted, wanted[-1]), **_REFERENCE)
+                panel.plot(np.append(wanted_s, window.stop), np.append(wanted, wanted[-1]), **_REFERENCE)
                 if window is windows[0]:
                     for output, look in zip(with_friction, FRICTION, strict=False):
                         own_time = time_s[0] + dt_s * np.arange(output.size)
                         seen = own_time <= window.stop
-                        axes.plot(*outline(own_time[seen], output[seen]), **look)
+                        panel.plot(*outline(own_time[seen], output[seen]), **look)
                 if model is not None:
                     looks = style.MODEL_LINE | {"ls": ":", "label": "model to follow"}
-                    axes.plot(*outline(time, model[part]), **looks)
-            axes.set_xlim(window.start, window.stop)
+                    panel.plot(*outline(time, model[part]), **looks)
+            panel.set(xlim=(window.start, window.stop))
             if onset is not None and window.start <= onset <= window.runs_until:
-                axes.axvline(onset, color="#888888", lw=0.8, ls=":")
-        row[0].set_ylabel(style.two_lines(*label))
+                panel.axvline(onset, color="#888888", lw=0.8, ls=":")
+        row[0].set(ylabel=style.two_lines(*label))
         runs = *(with_friction if kind == "output" else ()), *([getattr(others, kind)] if others else ())
         low, high = height(np.append(line, reference) if kind == "output" else line, runs, 3.0)
         limits = () if kind != "command" or command_limit is None else (-command_limit, command_limit)
         for limit in limits:
             if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):  # near enough to matter
                 low, high = min(low, limit), max(high, limit)
-                for axes in row:
-                    axes.axhline(limit, **style.LIMIT_LINE, label="saturation")
-        row[0].set_ylim(*style.pad_limits(low, high, 0.08))
-    for axes, window in zip(grid[0], windows, strict=True):
-        axes.set_title(window.title)
-    for axes in grid[-1]:
-        axes.set_xlabel("time [s]")
-    return figure
+                for panel in row:
+                    panel.axhline(limit, **style.LIMIT_LINE, label="saturation")
+        row[0].set(ylim=pad_limits(low, high, 0.08))
+    for panel, window in zip(grid[0], windows, strict=True):
+        panel.set_title(window.title)
+    for panel in grid[-1]:
+        panel.set(xlabel="time [s]")
+    return picture
 
 
-draw_closed_loop = style.finished(draw_signals)
-
-
-def _draw_runs(axes: Axes, time_s: Real, runs: Real, machine: str, hold: Mapping[str, Any]) -> None:
+def _draw_runs(panel: Panel, time_s: Real, runs: Real, machine: str, hold: Mapping[str, Any]) -> None:
     """Runs (R, T) of a machine as a band with the first as a line, those of other plants as a band."""
     count = runs.shape[0]
     if not machine:
-        axes.fill_between(*envelope(time_s, runs), **style.BAND, label=f"{count} plants from the uncertainty")
+        panel.fill_between(
+            *envelope(time_s, runs), **style.BAND, label=f"{count} plants from the uncertainty"
+        )
         return
     if count > 1:
-        axes.fill_between(
+        panel.fill_between(
             *envelope(time_s, runs), **style.ACHIEVED_BAND, label=f"{machine}: all {count} runs"
         )
     label = f"{machine}: first run" if count > 1 else machine
-    axes.plot(*outline(time_s, runs[0], hold=bool(hold)), **style.ACHIEVED_LINE, **hold, label=label)
+    panel.plot(*outline(time_s, runs[0], hold=bool(hold)), **style.ACHIEVED_LINE, **hold, label=label)
 
 
 class _Window(NamedTuple):
@@ -222,7 +225,7 @@ _MARKERS = (
 
 
 @style.drawing("measured-sensitivity")
-def draw_measured_sensitivity(run: RunView) -> Figure | None:
+def draw_measured_sensitivity(run: RunView) -> Picture | None:
     """|S| as measured on the arm with two standard deviations, beside nominal and worst case; nothing where
     it was not measured."""
     loop = run.results.closed_loop.check
@@ -232,18 +235,20 @@ def draw_measured_sensitivity(run: RunView) -> Figure | None:
     high = min(1.1 * high, run.plant.nyquist_rad_s)
     fine = run.loop_grid[(run.loop_grid > 0.9 * low) & (run.loop_grid < high)]
     curve = curves_of(run, np.union1d(np.geomspace(0.9 * low, high, 900), fine))[0]
-    figure, axes = style.panels(4.4)
-    draw_curve(axes, curve, run.level)
+    picture, panel = new_picture(4.4)
+    draw_curve(panel, curve, run.level)
     for m, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
-        bars = {"elinewidth": 0.6, "capsize": 0, "ls": "none", "label": m.name}
-        axes.errorbar(m.omega_rad_s, m.magnitude, np.minimum(2 * m.std, 0.9 * m.magnitude), **look, **bars)
-    axes.set(title="Sensitivity, reference to error (bars: two standard deviations)")
-    axes.set_xlabel("frequency [rad/s]")
-    return figure
+        half = np.minimum(2 * m.std, 0.9 * m.magnitude)
+        bars = {"color": look["color"], "lw": 0.6, "solid_capstyle": "butt"}
+        panel.uprights(m.omega_rad_s, m.magnitude - half, m.magnitude + half, **bars)
+        panel.plot(m.omega_rad_s, m.magnitude, **look, ls="none", label=m.name)
+    panel.set(title="Sensitivity, reference to error (bars: two standard deviations)")
+    panel.set(xlabel="frequency [rad/s]")
+    return picture
 
 
 @style.drawing("closed-loop-conditions")
-def draw_conditions(run: RunView) -> Figure | None:
+def draw_conditions(run: RunView) -> Picture | None:
     """The loop under other conditions, a panel each: reference, prediction and what the machine did.
 
     Nothing where none was tried.
@@ -252,38 +257,34 @@ def draw_conditions(run: RunView) -> Figure | None:
     if loop is None or not loop.conditions:
         return None
     time_s = loop.time_s[: loop.conditions[0].reference.size]
-    figure, panels = style.small_multiples(len(loop.conditions), columns, 1.95, 0.8, sharex=True)
-    for axes, found in zip(panels, loop.conditions, strict=True):
+    picture, panels = small_multiples(len(loop.conditions), columns, 1.95, 0.8, sharex=True)
+    for panel, found in zip(panels, loop.conditions, strict=True):
         achieved = outline(time_s, found.achieved)
-        axes.plot(*achieved, **style.ACHIEVED_LINE, label=MACHINE[loop.machine])
-        axes.plot(*outline(time_s, found.predicted), **_PREDICTED)
-        axes.plot(*outline(time_s, found.reference, hold=True), **_REFERENCE)
-        axes.set_title(found.name)
+        panel.plot(*achieved, **style.ACHIEVED_LINE, label=MACHINE[loop.machine])
+        panel.plot(*outline(time_s, found.predicted), **_PREDICTED)
+        panel.plot(*outline(time_s, found.reference, hold=True), **_REFERENCE)
+        panel.set_title(found.name)
         low, high = height(np.append(found.reference, found.predicted), [found.achieved], 1.0)
-        axes.set_ylim(*style.pad_limits(low, high, 0.08))
-        axes.set_xlim(float(time_s[0]), float(time_s[-1]))
-    for axes in panels[::columns]:
-        axes.set_ylabel(style.two_lines(run.config.control_channel.output, run.output_unit))
-    for axes in panels[-columns:]:
-        axes.set_xlabel("time [s]")
-        axes.tick_params(labelbottom=True)
-    return figure
+        panel.set(ylim=pad_limits(low, high, 0.08))
+        panel.set(xlim=(float(time_s[0]), float(time_s[-1])))
+    for panel in panels[::columns]:
+        panel.set(ylabel=style.two_lines(run.config.control_channel.output, run.output_unit))
+    for panel in panels[-columns:]:
+        panel.set(xlabel="time [s]")
+    return picture
 
 
 @style.drawing("friction-in-the-loop")
-def draw_friction(run: RunView) -> Figure | None:
+def draw_friction(run: RunView) -> Picture | None:
     """Left: peak of |S| over the rms of the reference, predicted with friction, measured, certified. Right:
     error on the sine. Nothing where friction was not identified."""
     if run.results.closed_loop.check is None or run.results.closed_loop.check.friction is None:
         return None
     loop, found, unit = run.results.closed_loop.check, run.results.closed_loop.check.friction, run.output_unit
     name, sine = run.config.control_channel.output, found.tracking
-    figure, (peaks, errors) = style.panels(3.9, 1, 2)
-    middle = np.sqrt(found.low * found.high)
-    bars = {"elinewidth": 5.0, "capsize": 0, "color": style.UNCERTAIN, "alpha": 0.7}
-    reach = [middle - found.low, found.high - middle]
-    label = "identified arm with friction, 95 %"
-    peaks.errorbar(found.sizes, middle, yerr=reach, marker="_", ls="none", label=label, **bars)
+    picture, (peaks, errors) = new_picture(3.9, 1, 2)
+    bars = {"color": style.UNCERTAIN, "lw": 5.0, "alpha": 0.7, "solid_capstyle": "butt"}
+    peaks.uprights(found.sizes, found.low, found.high, **bars, label="identified arm with friction, 95 %")
     if found.measured is not None:
         looks = {"color": style.ACHIEVED, "marker": "o", "ms": 4.0, "ls": "none"}
         peaks.plot(found.sizes, found.measured, **looks, label=f"measured, {MACHINE[loop.machine]}")
@@ -293,7 +294,7 @@ def draw_friction(run: RunView) -> Figure | None:
     if found.sticking_step > 0:
         peaks.axvline(found.sticking_step, **style.REFERENCE_LINE, label="smaller steps do not move the arm")
     peaks.set(xscale="log", title="Peak of |S| by size of the reference", ylabel="|S| [1]")
-    peaks.set_xlabel(f"rms of the reference [{style.plain(unit, 12)}]")
+    peaks.set(xlabel=f"rms of the reference [{style.plain(unit, 12)}]")
     time_s = np.asarray(np.arange(sine.without.size) * run.plant.dt_s, dtype=np.float64)
     for error, look, words in (
         (sine.without, style.ACHIEVED_LINE, "without feed-forward"),
@@ -305,6 +306,6 @@ def draw_friction(run: RunView) -> Figure | None:
             sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error at rest (friction)"
         )
     errors.set(xlabel="time [s]", title="Error on a sine")
-    errors.set_xlim(0.0, float(time_s[-1]))
-    errors.set_ylabel(style.two_lines(name, unit))
-    return figure
+    errors.set(xlim=(0.0, float(time_s[-1])))
+    errors.set(ylabel=style.two_lines(name, unit))
+    return picture

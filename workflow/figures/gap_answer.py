@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from diagnosis.answer import Diagnosis
 from diagnosis.next_experiment.next_experiment import NextExperiment
 from plant.effects import in_words
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
+from workflow.figures.description import Picture, new_picture
 from workflow.text.formats import listing
 
 _MOST_BARS = 8  # more names are too small to read at the width of a page
@@ -21,7 +21,7 @@ _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 
 @style.drawing("gap_probabilities")
-def draw_probabilities(found: Diagnosis) -> Figure:
+def draw_probabilities(found: Diagnosis) -> Picture:
     """Bars: presence of the likeliest effects, those of the answer in colour; whether more is missing."""
     ranked = sorted(found.effects, key=lambda effect: -effect.presence)
     shown = [e for e in ranked if e.presence >= 0.005 and e.name not in ("none", "unknown")][:_MOST_BARS]
@@ -34,7 +34,7 @@ def draw_probabilities(found: Diagnosis) -> Figure:
 
 
 @style.drawing("gap_waterfall")
-def draw_waterfall(found: Diagnosis) -> Figure:
+def draw_waterfall(found: Diagnosis) -> Picture:
     """Pooled root mean square of (measured - model)/noise: held-out records together, every record alone.
 
     Beside a model error: in per cent of the motion.
@@ -47,35 +47,33 @@ def draw_waterfall(found: Diagnosis) -> Figure:
     }
     rough = found.case.model_error
     words, line = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS, gap_style.floor_of(rough)
-    figure, (left, right) = style.panels(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
-    bars = left.bar(
-        np.arange(len(gaps)),
-        list(gaps.values()),
-        color=[gap_style.MODELS[model]["color"] for model in gaps],
-        width=0.6,
-        tick_label=[gap_style.WORDS[model].replace(" ", "\n") for model in gaps],
-    )
-    digits = [".3g" if rough > 0 else ".3f" if v < 10 else ".1f" for v in gaps.values()]
-    left.bar_label(bars, [format(v, d) for v, d in zip(gaps.values(), digits, strict=True)], padding=3)
+    picture, (left, right) = new_picture(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
+    for at, (model, value) in enumerate(gaps.items()):
+        left.bars(at, value, 0.6, color=gap_style.MODELS[model]["color"])
+        digits = ".3g" if rough > 0 else ".3f" if value < 10 else ".1f"
+        words_at = {"offset": (0.0, 3.0), "size": 9.5, "color": "#000", "horizontal": "center"}
+        left.words(format(value, digits), at, value, **words_at)
+    left.x.named = [(k, gap_style.WORDS[model].replace(" ", "\n")) for k, model in enumerate(gaps)]
     left.axhline(floor, **line, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
     left.set(ylabel=words, title="Validation records together")
-    left.grid(visible=False, axis="x")
+    left.grid_lines[0] = False
     for model in gaps:
         marker, offset = _LOOKS[model]
         at = np.arange(len(rows)) + offset
-        right.plot([entry[model] for entry in rows.values()], at, marker, ms=6, **_label(model))
+        values = [entry[model] for entry in rows.values()]
+        right.plot(values, at, marker=marker, ls="none", ms=6, **_label(model))
     right.axvline(floor, **line)
     every = [value for entry in rows.values() for value in entry.values()]
     # Beside a model error the repaired model may lie far below the threshold.
     right.set(xscale="log", xlim=(0.8 * min(*every, floor), 1.3 * max(*every, 2 * floor)))
-    right.set_yticks(range(len(rows)), [style.plain(name, 34) for name in rows])
+    right.y.named = [(k, style.plain(name, 34)) for k, name in enumerate(rows)]
     right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words, title="Every experiment alone")
-    return figure
+    return picture
 
 
 @style.drawing("gap_partial")
-def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Figure:
+def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Picture:
     """Bars: share of the held-out gap that effects close by themselves."""
     names = [style.plain(listing([in_words(name) for name in effects]), 60) for effects, _ in partial]
     percent = [100 * share for _, share in partial]
@@ -91,32 +89,38 @@ def _bars(
     colours: Sequence[str],
     title: str,
     axis: str,
-) -> Figure:
-    figure, axes = style.panels(1.0 + 0.34 * len(names))
-    bars = axes.barh(np.arange(len(names)), percent, color=colours, height=0.62, tick_label=names)
-    axes.bar_label(bars, labels, padding=4, fontsize=9)
-    axes.invert_yaxis()
-    axes.set(xlim=(0, 112), xticks=[0, 20, 40, 60, 80, 100], xlabel=axis, title=title)
-    axes.grid(visible=False, axis="y")
-    return figure
+) -> Picture:
+    picture, panel = new_picture(1.0 + 0.34 * len(names))
+    for at, (value, label, colour) in enumerate(zip(percent, labels, colours, strict=True)):
+        panel.bars(at, value, 0.62, lying=True, color=colour)
+        panel.words(label, value, at, offset=(4.0, 0.0), size=9.0, color="#000", vertical="center")
+    panel.y.named = list(enumerate(names))
+    panel.x.every = 20.0
+    # The first bar on top; room for the words of a bar that is 100 % long.
+    panel.set(xlim=(0, 112), ylim=(len(names) - 0.5, -0.5), xlabel=axis, title=title)
+    panel.grid_lines[1] = False
+    return picture
 
 
 @style.drawing("gap_overview")
-def draw_case_gaps(cases: Sequence[Any]) -> Figure:
+def draw_case_gaps(cases: Sequence[Any]) -> Picture:
     """One line per case (`fleet.Machine`): RMS over noise with the nominal parameters, and with the effects
     added."""
     before, after = ([case.numbers[key] for case in cases] for key in ("gap_before", "gap_after"))
     at, floor = np.arange(len(cases)), float(np.median([case.numbers["noise_floor"] for case in cases]))
-    figure, axes = style.panels(1.5 + 0.32 * len(cases))
-    axes.plot([before, after], [at, at], color="#999999", lw=1.0, zorder=1)
+    picture, panel = new_picture(1.5 + 0.32 * len(cases))
+    for place, ends in enumerate(zip(before, after, strict=True)):
+        panel.plot(ends, [place, place], color="#999999", lw=1.0, zorder=1)
     for model, values in (("stated", before), ("repaired", after)):
-        axes.plot(values, at, _LOOKS[model][0], ms=7, **_label(model))
-    axes.axvline(floor, **gap_style.FLOOR, zorder=0)
-    axes.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
-    axes.set_yticks(at, [f"{style.plain(c.name, 34)}: {style.plain(c.answer, 44)}" for c in cases])
-    axes.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"validation {gap_style.RESIDUAL_AXIS}")
-    axes.set_title("Model error, nominal and with effects")
-    return figure
+        panel.plot(values, at, marker=_LOOKS[model][0], ls="none", ms=7, **_label(model))
+    panel.axvline(floor, **gap_style.FLOOR, zorder=0)
+    panel.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
+    panel.y.named = [
+        (k, f"{style.plain(case.name, 34)}: {style.plain(case.answer, 44)}") for k, case in enumerate(cases)
+    ]
+    panel.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"validation {gap_style.RESIDUAL_AXIS}")
+    panel.set_title("Model error, nominal and with effects")
+    return picture
 
 
 def _label(model: str) -> dict[str, Any]:
@@ -124,26 +128,26 @@ def _label(model: str) -> dict[str, Any]:
 
 
 @style.drawing("gap_next")
-def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Figure:
+def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequence[str]) -> Picture:
     """Voltage, and difference (T, Y) of the two likeliest answers in standard deviations, hub before tip."""
     time_s = np.arange(proposal.voltage_V.size, dtype=np.float64) * proposal.dt_s
-    figure, (above, below) = style.panels(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
-    above.step(time_s, proposal.voltage_V, where="post", color=style.REFERENCE, lw=0.8)
+    picture, (above, below) = new_picture(4.2, 2, 1, sharex=True, height_ratios=[1.0, 1.3])
+    above.plot(time_s, proposal.voltage_V, drawstyle="steps-post", color=style.REFERENCE, lw=0.8)
     above.set(ylabel="voltage [V]", title="Proposed experiment")
     below.axhspan(-2, 2, **{**gap_style.NOISE_BAND, "label": "2 standard deviations"})
     for signal, (words, _, colour) in zip(difference.T, gap_style.OUTPUTS.values(), strict=False):
         below.plot(*outline(time_s, signal), color=colour, lw=1.0, label=words)
     title = f"{style.plain(names[0], 48)} minus {style.plain(names[1], 48)}"
-    below.set_title(title, fontweight="normal", fontsize=9.5)
+    below.set_title(title, size=9.5, bold=False)
     below.set(xlabel="time [s]", ylabel="difference over\nstandard deviation [1]")
-    below.margins(x=0.01)
-    return figure
+    below.x.margin = 0.01
+    return picture
 
 
 @style.drawing("gap_controller")
 def draw_controller_check(
     time_s: Real, reference_m: Real, tips_m: Sequence[Real], commands_V: Sequence[Real]
-) -> Figure:
+) -> Picture:
     """The same step with the design on the nominal rig and on the repaired one, a column each.
 
     Runs in the order nominal predicted by its own model (dashed), nominal achieved on the repaired machine,
@@ -153,16 +157,16 @@ def draw_controller_check(
         ({**style.PREDICTED_LINE, "ls": (0, (4, 1.5))}, "predicted by its own model"),
         (style.ACHIEVED_LINE, "achieved on the repaired machine"),
     )
-    figure, grid = style.panels(4.6, 2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
+    picture, grid = new_picture(4.6, 2, 2, sharex=True, sharey="row", height_ratios=[1.6, 1.0])
     for column, design in enumerate(("nominal parameters", "repaired rig")):
         above, below = grid[:, column]
         above.plot(time_s, 1e3 * reference_m, **style.REFERENCE_LINE, label="reference")
         for run, (look, label) in enumerate(looks, 2 * column):
             above.plot(time_s, 1e3 * tips_m[run], **look, label=label)
-            below.step(time_s, commands_V[run], where="post", **look)
+            below.plot(time_s, commands_V[run], drawstyle="steps-post", **look)
         above.set_title(f"Design with the {design}")
-        below.set_xlabel("time [s]")
-        above.margins(x=0.01)
-    grid[0, 0].set_ylabel("tip position [mm]")
-    grid[1, 0].set_ylabel("voltage [V]")
-    return figure
+        below.set(xlabel="time [s]")
+        above.x.margin = 0.01
+    grid[0, 0].set(ylabel="tip position [mm]")
+    grid[1, 0].set(ylabel="voltage [V]")
+    return picture

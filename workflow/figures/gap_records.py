@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
-from scipy.signal import welch
 
 from diagnosis.answer import Diagnosis
 from diagnosis.fit.residual import pooled_rms
@@ -14,13 +12,14 @@ from diagnosis.machine.case import Case
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
+from workflow.figures.description import Picture, new_picture, small_multiples
 
 _SEGMENT = 512  # samples: 257 lines, more than a panel shows; short records still hold several
 _MODES = 3  # marks of higher ones stand too close
 
 
 @style.drawing("gap_measured")
-def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
+def draw_measured_beside_simulated(found: Diagnosis) -> Picture:
     """Validation record with the largest model error, a column per output in its unit; residuals below.
 
     Of a model that fits hold near its records, the plain simulations from the recorded start.
@@ -28,7 +27,7 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
     case, runs = found.case, found.replays
     worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
     time = np.arange(len(worst.output), dtype=np.float64) * case.dt_s
-    figure, grid = style.panels(
+    picture, grid = new_picture(
         4.6, 2, len(case.outputs), sharex=True, squeeze=False, height_ratios=[1.6, 1.0]
     )
     for column, output in enumerate(case.outputs):
@@ -46,23 +45,23 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Figure:
             below.plot(*outline(time, residual), **look)
         above.set(title=f"{style.plain(worst.name, 30)}: {words}", ylabel=f"{words} [{unit}]")
         below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
-        above.margins(x=0.01)
+        above.x.margin = 0.01
         if runs:  # a free run may fall over, far away from what was measured
             far = np.ptp(measured)
-            for axes, low, high in ((above, np.min(measured), np.max(measured)), (below, 0.0, 0.0)):
-                bottom, top = axes.get_ylim()
-                axes.set_ylim(max(bottom, low - far), min(top, high + far))
-    return figure
+            for panel, low, high in ((above, np.min(measured), np.max(measured)), (below, 0.0, 0.0)):
+                bottom, top = panel.y.limits()
+                panel.set(ylim=(max(bottom, low - far), min(top, high + far)))
+    return picture
 
 
 @style.drawing("gap_traces")
-def draw_residual_traces(found: Diagnosis) -> Figure:
+def draw_residual_traces(found: Diagnosis) -> Picture:
     """Rows are experiments, columns are sensors; the band is two standard deviations of the sensor noise.
 
     Beside a model error residuals are in per cent of the motion, and there is no band.
     """
     case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
-    figure, grid = style.panels(
+    picture, grid = new_picture(
         0.9 + 1.25 * len(case.experiments),
         len(case.experiments),
         len(case.outputs),
@@ -73,26 +72,27 @@ def draw_residual_traces(found: Diagnosis) -> Figure:
         residuals = {model: found.residuals[model][experiment.name] for model in models}
         time = np.arange(len(experiment.output), dtype=np.float64) * case.dt_s
         role = " (validation)" if experiment.role == "held_out" else ""
-        for column, axes in enumerate(row):
+        for column, panel in enumerate(row):
             if not case.model_error > 0:
-                axes.axhspan(-2, 2, **gap_style.NOISE_BAND)
+                panel.axhspan(-2, 2, **gap_style.NOISE_BAND)
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
-                axes.plot(*outline(time, e[:, column]), **look, label=gap_style.WORDS[model])
+                panel.plot(*outline(time, e[:, column]), **look, label=gap_style.WORDS[model])
             reach = max(4.0, 1.05 * max(float(np.max(np.abs(e[:, column]))) for e in residuals.values()))
-            axes.set_ylim(-reach, reach)
-            axes.margins(x=0.01)
+            panel.set(ylim=(-reach, reach))
+            panel.x.margin = 0.01
             title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.look_of(case.outputs[column])[0]}"
-            axes.set_title(title, fontsize=9, fontweight="normal")
+            panel.set_title(title, size=9, bold=False)
         unit = "[% of motion]" if case.model_error > 0 else "over noise [1]"
-        row[0].set_ylabel(f"residual\n{unit}", fontsize=8.5)
-    for axes in grid[-1]:
-        axes.set_xlabel("time [s]")
-    return figure
+        row[0].set(ylabel=f"residual\n{unit}")
+        row[0].label_size = 8.5
+    for panel in grid[-1]:
+        panel.set(xlabel="time [s]")
+    return picture
 
 
 @style.drawing("gap_spectra")
-def draw_residual_spectra(found: Diagnosis) -> Figure:
+def draw_residual_spectra(found: Diagnosis) -> Picture:
     """Spectra of the residuals over noise, all experiments together; white noise of the stated size is 1.
 
     The lowest flexible modes of the nominal rig are marked.
@@ -101,27 +101,30 @@ def draw_residual_spectra(found: Diagnosis) -> Figure:
     dt_s = case.dt_s
     poles = linear_arm(case.rig).poles() if isinstance(case, Case) else np.zeros(0, complex)
     modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
-    figure, panels = style.small_multiples(len(case.outputs), len(case.outputs), 3.7, 0.0, sharey=True)
-    for column, axes in enumerate(panels):
+    picture, panels = small_multiples(len(case.outputs), len(case.outputs), 3.7, 0.0, sharey=True)
+    for column, panel in enumerate(panels):
         for model in found.models:
             frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
-            axes.loglog(frequency, power, **gap_style.MODELS[model], label=gap_style.WORDS[model])
-        axes.axhline(1.0, **gap_style.FLOOR)
+            panel.set(xscale="log", yscale="log")
+            panel.plot(frequency, power, **gap_style.MODELS[model], label=gap_style.WORDS[model])
+        panel.axhline(1.0, **gap_style.FLOOR)
         for number, mode in enumerate(modes_Hz[:_MODES], 1):
             if mode < 0.5 / dt_s:
-                style.tag_below(axes, mode, f"mode {number}")
-        axes.set(
+                style.tag_below(panel, mode, f"mode {number}")
+        panel.set(
             xlabel="frequency [Hz]", title=f"Residual of the {gap_style.look_of(case.outputs[column])[0]}"
         )
     # Once all are drawn: a limit that is set ends the scaling of the panels that share it.
-    low, high = panels[0].get_ylim()
-    panels[0].set_ylim(min(low, 0.1), max(high, 10.0))
-    panels[0].set_ylabel("power over that of the noise [1]")
-    return figure
+    low, high = panels[0].y.limits()
+    panels[0].set(ylim=(min(low, 0.1), max(high, 10.0)))
+    panels[0].set(ylabel="power over that of the noise [1]")
+    return picture
 
 
 def _spectrum(signals: Sequence[Real], dt_s: float) -> tuple[Real, Real]:
     """Welch's estimate over all records, relative to white noise of unit variance."""
+    from scipy.signal import welch  # half a second to load, which only this picture needs
+
     length = min(_SEGMENT, *(s.size for s in signals))
     total, weight = np.zeros(length // 2 + 1), 0
     frequency = np.asarray(np.fft.rfftfreq(length, dt_s), dtype=np.float64)

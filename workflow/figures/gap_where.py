@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from diagnosis.where.findings import SENSORS, BandGap, Where
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real
+from workflow.figures.description import Picture, X, new_picture, small_multiples
 from workflow.text.formats import portion
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
@@ -48,14 +48,14 @@ def _look(where: Where, sensor: str) -> tuple[str, str]:
 
 
 @style.drawing("gap_bands")
-def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure:
+def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Picture:
     """Size of the gap, noise (or what a model may miss) taken off: by band and experiment, of every sensor.
 
     With 95 % intervals. Parts in which nothing is found beyond chance are drawn pale. The frequency panel
     ends at 0.05 noise deviations; less is drawn at its edge.
     """
     experiments, (factor, words) = where.experiments, _size(model_error)
-    figure, (left, right) = style.panels(
+    picture, (left, right) = new_picture(
         max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
     )
     sensors = [one.sensor for one in where.sensors]
@@ -77,72 +77,78 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Figure
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
     # Up to the threshold at least, so that a frame in which nothing is large is not empty.
-    left.set_ylim(factor * gap_style.LEAST, max(left.get_ylim()[1], factor))
+    left.set(ylim=(factor * gap_style.LEAST, max(left.y.limits()[1], factor)))
     left.set_title("By frequency")
     for row, entry in enumerate(experiments):
         for sensor, part, offset in zip(sensors, entry.sensors, 0.15 * apart, strict=True):
             pale = 1.0 if part.found else 0.35
-            right.barh(
+            right.bars(
                 row + offset,
                 factor * part.gap_rms,
-                height=0.54 / len(sensors),
+                0.54 / len(sensors),
+                lying=True,
                 color=_look(where, sensor)[1],
                 alpha=pale,
             )
             right.plot(factor * np.array(part.interval), [row + offset] * 2, **_WHISKER)
-    right.set_yticks(range(len(experiments)), [style.plain(e.experiment, 30) for e in experiments])
-    right.set(ylim=(len(experiments) - 0.5, -0.5), xlabel=words, title="By experiment and sensor")
-    right.grid(visible=False, axis="y")
+    right.y.named = [(k, style.plain(entry.experiment, 30)) for k, entry in enumerate(experiments)]
+    right.set(
+        xlim=(0.0, None), ylim=(len(experiments) - 0.5, -0.5), xlabel=words, title="By experiment and sensor"
+    )
+    right.grid_lines[1] = False
     left.plot([], [], **_WHISKER, label="95 % interval")
-    return figure
+    return picture
 
 
 @style.drawing("gap_regimes")
-def draw_regimes(where: Where, model_error: float = 0.0) -> Figure | None:
+def draw_regimes(where: Where, model_error: float = 0.0) -> Picture | None:
     """Residual energy over a regime variable where it depends on it, with what chance would give."""
     findings = [finding for finding in where.regimes if finding.found][:_MOST_REGIMES]
     if not findings:
         return None
     floor = "the\nthreshold" if model_error > 0 else "the noise"
-    figure, panels = style.small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
-    for axes, finding in zip(panels, findings, strict=True):
+    picture, panels = small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
+    for panel, finding in zip(panels, findings, strict=True):
         at, count = np.arange(len(finding.bins)), len(finding.bins)
         low, high = np.array([one.interval for one in finding.bins]).T
-        axes.bar(at, high - low, bottom=low, width=0.8, color="#dddddd", label="95 % of what chance gives")
+        panel.bars(at, high, 0.8, begins=low, color="#dddddd", label="95 % of what chance gives")
         name, colour = _look(where, finding.sensor)
-        axes.plot(at, [one.energy for one in finding.bins], "o", ms=6, color=colour, label=name)
+        panel.plot(
+            at, [one.energy for one in finding.bins], marker="o", ls="none", ms=6, color=colour, label=name
+        )
         # The label where there is room for words, else the range on two lines.
         named = [
             style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
             for one in finding.bins
         ]
-        axes.set_xticks(at, named, fontsize=8)
-        axes.axhline(1.0, **gap_style.floor_of(model_error))
-        axes.set_ylim(bottom=0)
-        axes.grid(visible=False, axis="x")
-        axes.set_xlabel(_with_unit(_REGIMES.get(finding.axis, finding.axis), finding.unit))
-        axes.set_ylabel(f"residual energy\nover that of {floor} [1]")
-        axes.set_title(name, fontsize=9.5, fontweight="normal")
-    return figure
+        panel.x.named = list(zip(at, named, strict=True))
+        panel.tick_size[X] = 8.0
+        panel.axhline(1.0, **gap_style.floor_of(model_error))
+        panel.set(ylim=(0, None))
+        panel.grid_lines[0] = False
+        panel.set(xlabel=_with_unit(_REGIMES.get(finding.axis, finding.axis), finding.unit))
+        panel.set(ylabel=f"residual energy\nover that of {floor} [1]")
+        panel.set_title(name, size=9.5, bold=False)
+    return picture
 
 
 @style.drawing("gap_curves")
-def draw_curves(where: Where) -> Figure | None:
+def draw_curves(where: Where) -> Picture | None:
     """The gap read as one missing function of a variable, two standard errors either side."""
     curves = [curve for curve in where.curves if curve.found]
     if not curves:
         return None
-    figure, panels = style.small_multiples(len(curves), min(3, max(2, len(curves))), 2.6, 0.9)
-    for axes, curve in zip(panels, curves, strict=True):
+    picture, panels = small_multiples(len(curves), min(3, max(2, len(curves))), 2.6, 0.9)
+    for panel, curve in zip(panels, curves, strict=True):
         at, value = np.array(curve.centres), np.array(curve.values)
         error = 2 * np.array(curve.standard_errors)
-        axes.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
-        axes.plot(at, value, "o-", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
-        axes.axhline(0, color="#555555", lw=0.8)
-        axes.set_xlabel(_with_unit(curve.axis.replace("_", " "), curve.unit))
-        axes.set_ylabel(_with_unit(_ROUTES[curve.route], curve.value_unit))
-        axes.set_title(f"{portion(curve.share)} of the gap energy", fontsize=9.5, fontweight="normal")
-    return figure
+        panel.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
+        panel.plot(at, value, marker="o", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
+        panel.axhline(0, color="#555555", lw=0.8)
+        panel.set(xlabel=_with_unit(curve.axis.replace("_", " "), curve.unit))
+        panel.set(ylabel=_with_unit(_ROUTES[curve.route], curve.value_unit))
+        panel.set_title(f"{portion(curve.share)} of the gap energy", size=9.5, bold=False)
+    return picture
 
 
 def _with_unit(words: str, unit: str) -> str:

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from workflow.figures import style
 from workflow.figures.bode import draw_enlarged
-from workflow.figures.closed_loop import draw_signals
+from workflow.figures.closed_loop import draw_closed_loop
+from workflow.figures.description import Picture, new_picture
 from workflow.figures.nyquist import draw_nyquist, loop_of
 from workflow.figures.subjects import MACHINE, RunView
 from workflow.tasks.results import LoopRuns
 
 
 @style.drawing("overview")
-def draw_overview(run: RunView) -> Figure:
+def draw_overview(run: RunView) -> Picture:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the reference step, without
     the disturbance that follows it."""
-    figure, (gain, around, step) = style.panels(4.4, 1, 3, width_in=12.0)
+    picture, (gain, around, step) = new_picture(4.1, 1, 3, width_in=12.0)
     spread, loop = run.control.spread, run.results.closed_loop.check
     assert loop is not None
     band = draw_enlarged(gain, spread.frequency)
@@ -26,7 +26,7 @@ def draw_overview(run: RunView) -> Figure:
     gain.plot(band.omega_rad_s, nominal, **dotted, label="nominal model")
     unit = style.plain(style.ratio_unit(run.output_unit, run.input_unit), 30)
     gain.set(yscale="log", ylabel=f"gain [{unit}]")
-    gain.set_ylim(0.3 * band.gain.min(), 3 * band.gain.max())
+    gain.set(ylim=(0.3 * band.gain.min(), 3 * band.gain.max()))
     gain.set_title("Identified, with its uncertainty")
     margin = run.specification.modulus_margin
     draw_nyquist(around, loop_of(run), margin, near=True)
@@ -35,7 +35,7 @@ def draw_overview(run: RunView) -> Figure:
         LoopRuns(runs.output[:, half], runs.command[:, half], None, runs.limited[:, half])
         for runs in (loop.predicted_runs, loop.achieved_runs)
     )
-    draw_signals(
+    draw_closed_loop(
         loop.time_s[half],
         loop.reference[half],
         predicted,
@@ -44,7 +44,7 @@ def draw_overview(run: RunView) -> Figure:
         machine=MACHINE["simulated"] if loop.machine == "simulated" else "",
         with_friction=loop.with_friction,
         settled_s=loop.longest_settling_s,
-        ax=step,
+        onto=step,
     )
     step.set_title("Checked in closed loop")
-    return figure
+    return picture

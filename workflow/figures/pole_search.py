@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from contourpy import contour_generator
 
 from ident.search.error_surface import ErrorSurface, error_surface
 from ident.search.order_selection import OrderStep
@@ -17,9 +16,16 @@ from ident.stabilisation import Stabilisation
 from ident.uncertainty import FrequencyUncertainty
 from workflow.figures import style
 from workflow.figures.bands import Real
+from workflow.figures.description import Panel, Picture, new_picture
 from workflow.figures.subjects import ChannelView
 
 _DOTS: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 5, "color": "white", "mec": "black", "mew": 0.3}
+# Colours of the error surface from its floor upwards: cividis of matplotlib, reversed, at nine even steps
+# (Nunez, Anderton and Renslow, PLoS ONE 13(7), 2018: even in lightness for every colour vision).
+_CIVIDIS = np.array([
+    (254, 232, 56), (221, 200, 88), (187, 173, 109), (154, 147, 118), (124, 123, 120), (96, 100, 111),
+    (66, 78, 108), (24, 55, 111), (0, 34, 78),
+])  # fmt: skip
 _PAIR_AXIS = "frequency of the pair [rad/s]"
 _HOLLOW: dict[str, Any] = {
     "ls": "none",
@@ -32,7 +38,7 @@ _HOLLOW: dict[str, Any] = {
 
 
 @style.drawing("error-surface")
-def draw_error_surface(channel: ChannelView) -> Figure | None:
+def draw_error_surface(channel: ChannelView) -> Picture | None:
     """The surface of the slowest lightly damped pair, on a grid around it; nothing without a pair."""
     if channel.shown_pair is None:
         return None
@@ -41,19 +47,21 @@ def draw_error_surface(channel: ChannelView) -> Figure | None:
     return draw_surface(surface, searched, style.plain(channel.name, 34))
 
 
-@style.finished
-def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str = "") -> Figure:
+def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str = "") -> Picture:
     """Residual RMS over that of the smallest grid point: contours, and the floor along the first coordinate.
 
     searched: points (E, 2) that a search tried.
     """
     first, second = surface.first, surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
-    figure, (left, bar, right) = style.panels(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
+    picture, (left, bar, right) = new_picture(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
     top = max(float(np.percentile(ratio, 99)), 1.0001)
     levels = np.geomspace(1.0, top, 22)
     shades = np.clip(ratio, 1.0, top)
-    filled = left.contourf(first, second, shades, levels=levels, cmap="cividis_r", norm="log")
+    # In logarithms a contour is straight between neighbours of the grid.
+    fill_levels(left, first, second, np.log(shades), np.log(levels))
+    bar.set(yscale="log")
+    colour_bar(bar, levels)
     low, high = [first[0], second[0]], [first[-1], second[-1]]
     if searched is not None:
         seen = searched[np.all((searched >= low) & (searched <= high), axis=1)]
@@ -74,20 +82,47 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
     star = style.STAR | {"ms": 15, "mew": 0.8}
     left.plot(surface.pole[:1], surface.pole[1:], **star, label=f"found: {words}")
     scale, labels = (
-        ("log", (_PAIR_AXIS, "damping ratio of the pair [1]")) if polar else ("linear", surface.names)
+        ("log", (_PAIR_AXIS, "damping ratio of the pair [1]")) if polar else ("lin", surface.names)
     )
     left.set(xscale=scale, yscale=scale, xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     left.set(xlabel=labels[0], ylabel=labels[1])
     left.set_title(f"Error surface: {name}" if name else "Error surface")
-    # Its own log ticks run into each other.
-    figure.colorbar(filled, cax=bar).set_ticks(list(levels[::7]), labels=[f"{v:.3g}" for v in levels[::7]])
-    bar.minorticks_off()
+    bar.y.named = [(level, f"{level:.3g}") for level in levels[::7]]
     right.plot(first, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale=scale, yscale="log", xlim=(first[0], first[-1]))
     title = "Along frequency, best damping" if polar else "Along beta, best gamma"
     right.set(xlabel=labels[0], ylabel="residual RMS / smallest [1]", title=title)
-    return figure
+    return picture
+
+
+def fill_levels(panel: Panel, x: Real, y: Real, values: Real, levels: Real) -> None:
+    """Areas between neighbouring levels (L,) of values (Y, X) over a grid x (X,), y (Y,), in the colours of
+    their numbers."""
+    contours = contour_generator(x, y, values, fill_type="ChunkCombinedOffset")
+    least = 1e-9 * (levels[-1] - levels[0])  # so that a value at the end of all levels is in one
+    for number, (low, high) in enumerate(pairwise(levels)):
+        (points,), (ends,) = contours.filled(low - least, high + least)
+        if points is not None:
+            colour = _shade(number / (levels.size - 2))
+            panel.fill(np.split(points, ends[1:-1]), whole=True, color=colour, lw=0.3)
+
+
+def colour_bar(panel: Panel, levels: Real) -> None:
+    """The colours between neighbouring levels (L,), below each other on a narrow panel."""
+    panel.set(xlim=(0.0, 1.0), ylim=(float(levels[0]), float(levels[-1])))
+    panel.x.named = []
+    panel.grid_lines = [False, False]
+    panel.colour_bar = True
+    for number, (low, high) in enumerate(pairwise(levels)):
+        panel.bars(0.5, high, 1.0, begins=low, color=_shade(number / (levels.size - 2)), lw=0.3)
+
+
+def _shade(share: float) -> str:
+    """The colour of a share of the surface's height: 0 its floor, 1 its top."""
+    place = share * (len(_CIVIDIS) - 1)
+    channels = [round(float(np.interp(place, np.arange(len(_CIVIDIS)), column))) for column in _CIVIDIS.T]
+    return "#" + "".join(f"{value:02x}" for value in channels)
 
 
 def _surface(channel: ChannelView, pair: int) -> ErrorSurface:
@@ -130,7 +165,7 @@ _LINEAR = 10.0
 
 
 @style.drawing("order")
-def draw_order(channel: ChannelView) -> Figure | None:
+def draw_order(channel: ChannelView) -> Picture | None:
     """Left: criterion of every structure tried, above the best. Right: pole pairs of fits with 0, 1, 2 ...
 
     The response straight from the records stands faintly behind the right panel: modes belong on its peaks.
@@ -139,55 +174,54 @@ def draw_order(channel: ChannelView) -> Figure | None:
     plot, steps = channel.found.stabilisation, channel.found.identification.order_table
     if plot is None or not steps:
         return None
-    figure, (left, right) = style.panels(4.6, 1, 2, width_ratios=[1.0, 1.7])
+    picture, (left, right) = new_picture(4.6, 1, 2, width_ratios=[1.0, 1.7])
     _criterion(left, steps, (plot.n_real, plot.chosen))
     left.set_title(f"Criterion: {style.plain(channel.name, 16)}")
     _stabilisation(right, plot, channel.spread.empirical)
-    return figure
+    return picture
 
 
-def _criterion(axes: Axes, steps: Sequence[OrderStep], chosen: tuple[int, int]) -> None:
+def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]) -> None:
     order = np.array([step.order for step in steps])
     above = np.array([step.criterion for step in steps])
     above -= above.min()
-    axes.plot(
+    panel.plot(
         order, above, ls="none", marker="o", ms=5, mfc="white", mec=style.MODEL, label="structure tried"
     )
     lowest = np.unique(order)
-    axes.plot(lowest, [above[order == n].min() for n in lowest], color=style.MODEL, lw=1.0)
+    panel.plot(lowest, [above[order == n].min() for n in lowest], color=style.MODEL, lw=1.0)
     mine = [k for k, step in enumerate(steps) if (step.n_real, step.n_pairs) == chosen]
     if mine:
         label = f"the model: {chosen[0]} real, {chosen[1]} pairs"
-        axes.plot(order[mine], above[mine], **style.STAR | {"ms": 14, "mew": 0.7}, label=label)
-    axes.set_yscale("symlog", linthresh=_LINEAR)
-    axes.set_ylim(-0.15 * _LINEAR, max(2.5 * above.max(), 1.5 * _LINEAR))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.set_xlim(order.min() - 0.6, order.max() + 0.6)
-    axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
-    axes.set(xlabel="searched poles [1]", ylabel="criterion above the best [1]")
+        panel.plot(order[mine], above[mine], **style.STAR | {"ms": 14, "mew": 0.7}, label=label)
+    panel.set(yscale=_LINEAR)
+    panel.set(ylim=(-0.15 * _LINEAR, max(2.5 * above.max(), 1.5 * _LINEAR)))
+    panel.set(xlim=(order.min() - 0.6, order.max() + 0.6))
+    panel.x.whole = True
+    panel.set(xlabel="searched poles [1]", ylabel="criterion above the best [1]")
 
 
-def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertainty | None) -> None:
+def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncertainty | None) -> None:
     omega, count = plot.omega_rad_s, plot.n_pairs
     stable, same = plot.stable, plot.previous >= 0
-    axes.set_xscale("log")
+    panel.set(xscale="log")
     if response is not None:
         # The gain behind the marks, on a log scale of its own that nobody has to read.
         gain = np.abs(response.centre)
         seen, log = response.omega_rad_s[gain > 0], np.log(gain[gain > 0])
         low, high = np.percentile(log, 1), log.max()
-        axes.plot(
+        panel.plot(
             seen,
             0.03 + 0.94 * np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0),
-            transform=axes.get_xaxis_transform(),
+            across=True,
             color=style.MEASURED,
             lw=0.8,
             alpha=0.4,
             label="gain computed from the records (own log scale)",
         )
-        axes.set_xlim(seen[0], seen[-1])
+        panel.set(xlim=(seen[0], seen[-1]))
     for mode in plot.columns():
-        axes.axvline(mode.omega_rad_s, color=style.PREDICTED, lw=0.9, alpha=0.5)
+        panel.axvline(mode.omega_rad_s, color=style.PREDICTED, lw=0.9, alpha=0.5)
     kinds = (
         (stable & plot.needed, "o", style.PREDICTED, style.PREDICTED, 6.5, "stable and significant"),
         (stable & ~plot.needed, "o", "white", style.MEASURED, 5.5, "stable, not significant"),
@@ -197,13 +231,13 @@ def _stabilisation(axes: Axes, plot: Stabilisation, response: FrequencyUncertain
     )
     for here, marker, face, edge, size, label in kinds:
         if here.any():
-            axes.plot(
+            panel.plot(
                 omega[here], count[here], ls="none", marker=marker, ms=size, mfc=face, mec=edge, label=label
             )
-    axes.axhline(plot.chosen, color=style.HIGHLIGHT, lw=5, alpha=0.35, label="number of pairs in the model")
-    axes.set_ylim(-0.4, max(plot.rss.size - 1, 1) + 0.6)
-    axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+    panel.axhline(plot.chosen, color=style.HIGHLIGHT, lw=5, alpha=0.35, label="number of pairs in the model")
+    panel.set(ylim=(-0.4, max(plot.rss.size - 1, 1) + 0.6))
+    panel.y.whole = True
     if response is None and omega.size:
-        axes.set_xlim(omega.min() / 1.5, omega.max() * 1.5)
-    axes.set_title("Stabilisation: which modes stay")
-    axes.set(xlabel=_PAIR_AXIS, ylabel="pole pairs in the fit [1]")
+        panel.set(xlim=(omega.min() / 1.5, omega.max() * 1.5))
+    panel.set_title("Stabilisation: which modes stay")
+    panel.set(xlabel=_PAIR_AXIS, ylabel="pole pairs in the fit [1]")

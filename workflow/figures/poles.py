@@ -5,17 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 
 from ident.basis.model import GobfModel
 from workflow.figures import style
 from workflow.figures.bands import Complex
+from workflow.figures.description import Panel, Picture, new_picture
+from workflow.figures.ticks import linear_ticks
 from workflow.tasks.results import Intervals
 from workflow.text.formats import share
 
 _DAMPINGS = (0.02, 0.1, 0.3, 0.6)
+# Of a pole's real part times the period: e^-7 is a thousandth, where a line meets the origin.
+_DECAYED = 7.0
+# Where along its visible part a line bears its value: lines of small damping lie close together.
+_NAMED_AT = {"0.02": 0.85, "0.1": 0.7, "0.3": 0.6}
+_ELSE_AT = 0.5
 _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
 
 
@@ -25,28 +29,28 @@ def draw_poles(
     name: str = "",
     closed_loop: Complex | None = None,
     intervals: Intervals | None = None,
-) -> Figure:
+) -> Picture:
     """Poles and zeros of a model, its known poles at z = 1: whole circle and near z = 1.
 
     closed_loop (n,): poles of a loop around it. intervals: of the poles; the area that frequency and damping
     of a mode leave is filled.
     """
     poles, zeros = np.concatenate([model.stable_poles.values, model.unstable_poles]), model.zeros()
-    figure, panels = style.panels(5.6, 1, 2)
-    whole, near = panels
+    picture, both = new_picture(5.6, 1, 2)
+    whole, near = both
     corner = _near_corner(poles)
     whole.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
     near.set(xlim=(1 - corner, 1 + 0.12 * corner), ylim=(-0.12 * corner, corner))
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
-    for axes in panels:
-        axes.set(aspect="equal", xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
-        axes.grid(visible=False)
-        axes.plot(turn.real, turn.imag, color="#333333", lw=1.0)
-        _grid(axes, model.dt_s, named=axes is near)
+    for panel in both:
+        panel.set(equal=True, xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
+        panel.grid_lines = [False, False]
+        panel.plot(turn.real, turn.imag, color="#333333", lw=1.0)
+        _grid(panel, model.dt_s, named=panel is near)
         if intervals is not None:
             label = f"{share(intervals.level)} intervals of a pole"
-            for area in _areas(intervals, model.dt_s):
-                axes.fill(area.real, area.imag, **style.BAND | {"lw": 1.5}, label=label)
+            areas = [np.column_stack([area.real, area.imag]) for area in _areas(intervals, model.dt_s)]
+            panel.fill(areas, **style.BAND | {"lw": 1.5}, label=label)
         for at, marker, colour, label in (
             (closed_loop, "s", style.PREDICTED, "closed loop, nominal plant"),
             (zeros, "o", style.MEASURED, "zeros"),
@@ -54,13 +58,13 @@ def draw_poles(
         ):
             if at is not None:
                 look = {"marker": marker, "ms": 6.5, "mec": colour, "mew": 1.5, "label": label}
-                axes.plot(at.real, at.imag, **_HOLLOW, **look)
+                panel.plot(at.real, at.imag, **_HOLLOW, **look)
         if model.integrators:
             label = f"integrator (x {model.integrators})"
-            axes.plot([1], [0], ls="none", marker="*", ms=10, color=style.REFERENCE, label=label)
+            panel.plot([1], [0], ls="none", marker="*", ms=10, color=style.REFERENCE, label=label)
     whole.set_title(f"Poles, zeros: {style.plain(name or 'model', 13)} ({model.dt_s * 1e3:.4g} ms)")
     near.set_title("Near z = 1 (dashed: damping, dotted: frequency)")
-    return figure
+    return picture
 
 
 def _areas(intervals: Intervals, dt_s: float) -> list[Complex]:
@@ -88,16 +92,37 @@ def _near_corner(poles: Complex) -> float:
     return float(np.clip(1.7 * away.min(), 0.02, 0.9)) if away.size else 0.5
 
 
-def _grid(axes: Axes, dt_s: float, *, named: bool) -> None:
-    """Lines of constant damping and of constant undamped frequency [rad/s] inside the circle, as contours."""
-    x, y = np.meshgrid(*(np.linspace(*ends, 150) for ends in (axes.get_xlim(), axes.get_ylim())))
-    z = np.where(np.hypot(x, y) < 1, x + 1j * np.abs(y) + 1e-12j, np.nan)
-    s = np.log(z) / dt_s
-    rounds = MaxNLocator(5, steps=[1, 2, 5]).tick_values(0, float(np.nanmax(np.abs(s[:, :75]))))[1:4]
-    for value, levels, dashes, words in (
-        (-s.real / np.abs(s), _DAMPINGS, "--", "{:g}"),
-        (np.abs(s), rounds, ":", "{:.4g} rad/s"),
-    ):
-        lines = axes.contour(x, y, value, levels, colors="#b5b5b5", linewidths=0.7, linestyles=dashes)
+def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
+    """Lines of constant damping and of constant undamped frequency [rad/s] inside the circle.
+
+    named: with their values, where they are in view.
+    """
+    fastest = float(np.pi / dt_s)
+    along = np.linspace(0.0, 1.0, 120)
+    (left, right), (low, high) = panel.x.limits(), panel.y.limits()
+    # The largest frequency in view decides which frequencies are round ones here.
+    corner = np.array([complex(x, y) for x in (left, (left + right) / 2) for y in (low, high) if x or y])
+    inside = np.where(np.abs(corner) < 1, corner, corner / np.maximum(np.abs(corner), 1e-12))
+    reach = min(fastest, float(np.max(np.abs(np.log(inside + 1e-12)))) / dt_s)
+    rounds = linear_ticks(0.0, reach, 5, (1.0, 2.0, 5.0, 10.0)).places[1:4]
+    look: dict[str, Any] = {"color": "#b5b5b5", "lw": 0.7}
+    lines = []
+    for damping in _DAMPINGS:
+        turned = np.sqrt(1 - damping**2)
+        omega = fastest / turned * along  # up to the negative real axis
+        lines.append((np.exp((-damping + 1j * turned) * omega * dt_s), "--", f"{damping:g}"))
+    for omega in rounds:
+        damping = along[along * omega * dt_s <= _DECAYED]
+        pole = omega * dt_s * (-damping + 1j * np.sqrt(1 - damping**2))
+        # Beyond the Nyquist frequency a line would come back from below the real axis.
+        lines.append((np.exp(pole[pole.imag <= np.pi]), ":", f"{omega:.4g} rad/s"))
+    for line, dashes, words in lines:
+        for half in (line, line.conj()):
+            panel.plot(half.real, half.imag, ls=dashes, **look)
         if named:
-            axes.clabel(lines, fmt=words.format, fontsize=8, colors="#666666")
+            seen = np.flatnonzero(
+                (line.real > left) & (line.real < right) & (line.imag > max(low, 0.0)) & (line.imag < high)
+            )
+            if seen.size:
+                place = line[seen[int(_NAMED_AT.get(words, _ELSE_AT) * seen.size)]]
+                panel.words(words, place.real, place.imag, horizontal="center")

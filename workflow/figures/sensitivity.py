@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import distance_to_minus_one, largest_disturbance_gain
@@ -16,6 +14,7 @@ from control_design.specification import Specification
 from control_design.specification.requirement import LoopFunction
 from workflow.figures import style
 from workflow.figures.bands import Real
+from workflow.figures.description import Panel, Picture, small_multiples
 from workflow.figures.subjects import RunView
 from workflow.text.formats import share
 
@@ -102,42 +101,41 @@ def curves_of(run: RunView, omega_rad_s: Real | None = None) -> tuple[Sensitivit
 
 
 @style.drawing("sensitivities")
-def draw_run(run: RunView) -> Figure:
+def draw_run(run: RunView) -> Picture:
     """Closed-loop gains of a run, its first lightly damped modes marked."""
     modes = enumerate(run.control.light[:4], 1)
     marks = [(mode.omega_rad_s, f"mode {number}") for number, (_, mode) in modes]
     return draw_sensitivities(curves_of(run), level=run.level, marks=marks)
 
 
-@style.finished
 def draw_sensitivities(
     curves: Sequence[SensitivityCurve], *, level: float, marks: Sequence[tuple[float, str]] = ()
-) -> Figure:
+) -> Picture:
     """One panel per closed-loop gain; `marks` are frequencies [rad/s] with a word, e.g. the first mode."""
-    figure, panels = style.small_multiples(len(curves), 2, 2.7, 0.8, sharex=True)
-    for axes, curve in zip(panels, curves, strict=True):
-        draw_curve(axes, curve, level)
+    picture, panels = small_multiples(len(curves), 2, 2.7, 0.8, sharex=True)
+    for panel, curve in zip(panels, curves, strict=True):
+        draw_curve(panel, curve, level)
         note = "" if curve.exact else " (band: upper bound)"
-        axes.set_title(f"{curve.symbol}: {curve.meaning}{note}", fontsize=9.5)
+        panel.set_title(f"{curve.symbol}: {curve.meaning}{note}", size=9.5)
         for at, word in marks:
             if curve.omega_rad_s[0] < at < curve.omega_rad_s[-1]:
-                style.tag_below(axes, at, word)
-    for axes in panels[-2:]:
-        axes.set_xlabel("frequency [rad/s]")
-    return figure
+                style.tag_below(panel, at, word)
+    for panel in panels[-2:]:
+        panel.set(xlabel="frequency [rad/s]")
+    return picture
 
 
-def draw_curve(axes: Axes, curve: SensitivityCurve, level: float) -> None:
+def draw_curve(panel: Panel, curve: SensitivityCurve, level: float) -> None:
     """Nominal, worst case over the ellipses of `level`, and limit of a closed-loop gain."""
     omega = curve.omega_rad_s
     finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
-    axes.fill_between(omega, curve.nominal, finite, **style.BAND)
-    axes.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
-    axes.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
+    panel.fill_between(omega, curve.nominal, finite, **style.BAND)
+    panel.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
+    panel.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
     if np.any(np.isfinite(curve.limit)):
-        axes.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
-    axes.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))
-    axes.set_ylabel(f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
+        panel.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
+    panel.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))
+    panel.set(ylabel=f"{curve.symbol} [{style.plain(curve.unit, 16)}]")
 
 
 def _range(curve: SensitivityCurve) -> tuple[float, float]:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ident.checks.validation import FreshFit, ScatterRow
 from workflow.figures import style
 from workflow.figures.bands import Real, liveliest, outline
+from workflow.figures.description import Picture, new_picture
 from workflow.figures.subjects import ChannelView
 from workflow.text.formats import share
 
@@ -24,7 +24,7 @@ _THIN = style.MODEL_LINE | {"lw": 0.9}
 
 
 @style.drawing("validation")
-def draw_validation(channel: ChannelView) -> Figure:
+def draw_validation(channel: ChannelView) -> Picture:
     """The free run on a record kept back, or on the first fitted one where there is none.
 
     Above: both outputs, whole and close up. Below: the residual, with +-2 standard deviations of the noise.
@@ -39,7 +39,7 @@ def draw_validation(channel: ChannelView) -> Figure:
         record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
     time_s = record.time_s[record.n_samples - fit.residual.size :]  # a delayed answer begins later
     noise = 2 * found.identification.noise_std
-    figure, grid = style.panels(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
+    picture, grid = new_picture(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
     length = min(400, max(time_s.size // 4, min(100, time_s.size)))
     close = liveliest(fit.simulated + fit.residual, length)
     for panels, part in zip(grid.T, (slice(None), close), strict=True):
@@ -47,9 +47,9 @@ def draw_validation(channel: ChannelView) -> Figure:
     grid[0, 0].set_title(f"{style.plain(record.name, 34)} ({_WORDS[role]}): fit {fit.fit_percent:.1f} %")
     grid[0, 1].set_title("Close-up")
     unit = record.output_units[0] if record.output_units else ""
-    grid[0, 0].set_ylabel(style.two_lines(record.output_names[0], unit))
-    grid[1, 0].set_ylabel(style.two_lines("residual", unit))
-    return figure
+    grid[0, 0].set(ylabel=style.two_lines(record.output_names[0], unit))
+    grid[1, 0].set(ylabel=style.two_lines("residual", unit))
+    return picture
 
 
 def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: slice = slice(None)) -> None:
@@ -61,12 +61,12 @@ def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: 
     upper.plot(*outline(time, simulated), **_THIN, label="model, simulated")
     lower.plot(*outline(time, residual), **style.MEASURED_LINE | {"lw": 0.7}, label="residual")
     lower.axhspan(-noise, noise, **style.BAND, zorder=0, label="±2 standard deviations of the noise")
-    lower.set_xlabel("time [s]")
-    upper.set_xlim(time[0], time[-1])
+    lower.set(xlabel="time [s]")
+    upper.set(xlim=(time[0], time[-1]))
 
 
 @style.drawing("residuals")
-def draw_residual_tests(channel: ChannelView) -> Figure | None:
+def draw_residual_tests(channel: ChannelView) -> Picture | None:
     """Both correlations with the band of each lag taken alone, lags outside it marked.
 
     Nothing where the records allow no test.
@@ -75,42 +75,44 @@ def draw_residual_tests(channel: ChannelView) -> Figure | None:
     if not {"whiteness", "independence"} <= tests.keys():
         return None
     whiteness, independence = tests["whiteness"], tests["independence"]
-    figure, panels = style.panels(3.5, 1, 2, width_ratios=[1.0, 1.35])
-    left, right = panels
+    picture, both = new_picture(3.5, 1, 2, width_ratios=[1.0, 1.35])
+    left, right = both
     dots = {"ls": "none", "ms": 4}
-    for axes, test in zip(panels, (whiteness, independence), strict=True):
+    for panel, test in zip(both, (whiteness, independence), strict=True):
         lags, size = test.lags, test.correlation
-        axes.fill_between(
+        panel.fill_between(
             lags, -test.band, test.band, **style.BAND, label=f"{share(test.level)} band of each lag"
         )
-        axes.vlines(lags, 0, size, color=style.MEASURED, lw=0.9)
-        axes.plot(lags, size, marker=".", color=style.MEASURED, label="inside", **dots)
+        panel.uprights(lags, 0.0, size, color=style.MEASURED, lw=0.9)
+        panel.plot(lags, size, marker=".", color=style.MEASURED, label="inside", **dots)
         outside = np.abs(size) > test.band
         if outside.any():
-            axes.plot(lags[outside], size[outside], marker="o", color=style.ACHIEVED, label="outside", **dots)
-        axes.axhline(0, color="#555555", lw=0.8)
+            panel.plot(
+                lags[outside], size[outside], marker="o", color=style.ACHIEVED, label="outside", **dots
+            )
+        panel.axhline(0, color="#555555", lw=0.8)
         reach = 1.25 * max(float(np.abs(size).max()), float(test.band.max()), 1e-6)
-        axes.set_ylim(-reach, reach)
-        axes.margins(x=0.02)
-        axes.set_xlabel("lag [samples]")
-    left.set_ylabel("correlation [1]")
+        panel.set(ylim=(-reach, reach))
+        panel.x.margin = 0.02
+        panel.set(xlabel="lag [samples]")
+    left.set(ylabel="correlation [1]")
     # "passed" is about all lags together; single lags outside their band are expected now and then.
     name = style.plain(channel.name, 24)
     left.set_title(f"Residual, {name}: {'white' if whiteness.passed else 'not white'}")
     right.set_title(f"With the input: {'independent' if independence.passed else 'not independent'}")
-    return figure
+    return picture
 
 
 @style.drawing("repeats")
-def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
+def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Picture:
     """Relative scatter per band, predicted and measured, and their ratio.
 
     Raises ValueError without a band.
     """
     if not rows:
         raise ValueError("there is no band of repeat scatter to draw")
-    figure, (upper, lower) = style.panels(4.4, 2, 1, sharex=True, height_ratios=[1.5, 1.0])
-    for axes, field, factor, color, label in (
+    picture, (upper, lower) = new_picture(4.4, 2, 1, sharex=True, height_ratios=[1.5, 1.0])
+    for panel, field, factor, color, label in (
         (upper, "predicted", 100, style.MODEL, "one repeat, predicted"),
         (upper, "measured", 100, style.MEASURED, "measured between repeats"),
         (upper, "between", 100, style.HIGHLIGHT, "between conditions (amplitude, day)"),
@@ -121,12 +123,12 @@ def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Figure:
             value = factor * getattr(row, field)
             if np.isfinite(value) and value > 0:
                 ends = [row.omega_low_rad_s * 1.02, row.omega_high_rad_s / 1.02]
-                axes.plot(ends, [value, value], color=color, lw=3, solid_capstyle="butt", label=label)
+                panel.plot(ends, [value, value], color=color, lw=3, solid_capstyle="butt", label=label)
     upper.set(xscale="log", yscale="log", ylabel="scatter / gain [%]")
     upper.set_title(f"Repeat scatter: {style.plain(name, 40)}")
     lower.axhline(1.0, color=style.MODEL, lw=1.2)
     lower.set(yscale="log", xlabel="frequency [rad/s]", ylabel="measured /\npredicted [1]")
-    low, high = lower.get_ylim()
-    lower.set_ylim(min(0.4, low), max(2.5, high))
-    style.hertz_axis(upper)
-    return figure
+    low, high = lower.y.limits()
+    lower.set(ylim=(min(0.4, low), max(2.5, high)))
+    upper.hertz = True
+    return picture

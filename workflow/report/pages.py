@@ -14,6 +14,7 @@ from workflow.config.run_config import RunConfig
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.subjects import AnyRunView, RunView, log_channel
+from workflow.figures.svg import svg_file
 from workflow.report.rendering import RenderedPage, render_page
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import RunRecord, RunResults
@@ -39,22 +40,24 @@ def write_report(
     page = render_page(
         "report.html.j2",
         progress,
-        also=also,
         title=title_of(config, run),
         run=view(config, results, run.manifest()),
         study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
         certified=summarise(results, config).certified,
     )
-    return _write(run, page)
+    return _write(run, page, also)
 
 
-def _write(run: RunDirectory, page: RenderedPage) -> Path:
+def _write(run: RunDirectory, page: RenderedPage, also: Iterable[str]) -> Path:
     run.figures_path.mkdir(exist_ok=True)
     files = {
-        run.figures_path / f"{name}.{kind}": content
-        for name, picture in page.pictures.items()
-        for kind, content in {picture.kind: picture.content, **picture.files}.items()
+        run.figures_path / f"{name}.svg": svg_file(made, page.looks) for name, made in page.pictures.items()
     }
+    if also:
+        from workflow.figures.matplotlib_figure import saved  # half a second to load
+
+        for name, made in page.pictures.items():
+            files |= {run.figures_path / f"{name}.{kind}": saved(made.picture, kind) for kind in also}
     storage.write_together({**files, run.report_path: page.html.encode()})
     for stale in sorted(run.figures_path.iterdir()):
         if stale.suffix in (".svg", ".png", ".pdf") and stale not in files:

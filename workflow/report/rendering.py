@@ -6,27 +6,25 @@ A template sees the typed values it is given, the filters of `workflow.text.form
 
 from __future__ import annotations
 
-import base64
-import gc
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from markupsafe import Markup
 
-from workflow.figures.style import Picture, drawings, render
-from workflow.report.inline import inline
+from workflow.figures.style import drawings
+from workflow.figures.svg import COMMON_STYLE, Drawn, drawn, style_of
 from workflow.text.templates import environment
 
 
 @dataclass(frozen=True)
 class RenderedPage:
-    """The page as HTML, and its pictures by the names of their files (without ending)."""
+    """The page as HTML, and its pictures by the names of their files (without ending), with their looks."""
 
     html: str
-    pictures: Mapping[str, Picture] = field(default_factory=dict)
+    pictures: Mapping[str, Drawn] = field(default_factory=dict)
+    looks: Mapping[str, str] = field(default_factory=dict)
 
 
 def render_page(
@@ -34,67 +32,54 @@ def render_page(
     progress: Callable[[float, str], None] | None = None,
     *,
     filters: Iterable[tuple[str, Callable[..., Any]]] = (),
-    also: Iterable[str] = (),
     **values: Any,
 ) -> RenderedPage:
     """A page whose template extends base.html.j2. Equal values give equal bytes.
 
-    filters: (name, function) of this page, beside those of all. also: see `render`.
+    filters: (name, function) of this page, beside those of all.
 
     Pictures are drawn where the template asks for them; progress(share, picture) is told of each. How many
     are to come is not known, so the share only approaches 1.
     """
-    pictures: dict[str, Picture] = {}
+    pictures: dict[str, Drawn] = {}
     styles: dict[str, str] = {}
 
-    def draw(name: str, caption: str, file: str, *what: Any) -> Drawn | None:
+    def draw(name: str, caption: str, file: str, *what: Any) -> Embedded | None:
         if progress is not None:
             progress(len(pictures) / (len(pictures) + 6), name)
-        figure = drawings()[name](*what)
-        if figure is None:
+        picture = drawings()[name](*what)
+        if picture is None:
             return None
         stem = f"{name}-{file}" if file else name
         if stem in pictures:
             raise ValueError(f"the page has two pictures called {stem!r}: give one another `file`")
-        pictures[stem] = render(figure, also)
-        return embedded(stem, Markup(caption).striptags(), pictures[stem], len(pictures), styles)
+        label = Markup(caption).striptags()
+        pictures[stem] = made = drawn(picture, label, len(pictures) + 1, styles)
+        return embedded(stem, made)
 
     page = environment(*filters).get_template(template)
-    with _garbage_left():
-        html = page.render(draw=draw, contents=[], styles=styles, **values)
+    html = page.render(
+        draw=draw, contents=[], styles=styles, looks=lambda: Markup(COMMON_STYLE + style_of(styles)), **values
+    )
     # The name of a file, in a locale that cannot read it, holds halves of characters.
     html = html.encode("utf-8", "replace").decode()
-    return RenderedPage(html.strip() + "\n", pictures)
-
-
-@contextmanager
-def _garbage_left() -> Iterator[None]:
-    """While pictures are drawn, what was there before is not looked through for garbage.
-
-    A picture is tens of thousands of small objects; to go through all that the numerical libraries hold
-    whenever their number has grown by so many takes a sixth of the drawing's time.
-    """
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
+    return RenderedPage(html.strip() + "\n", pictures, styles)
 
 
 @dataclass(frozen=True)
-class Drawn:
+class Embedded:
     """What the macro `picture` puts: image, samples and words of the legend, JSON for the script."""
 
     name: str
     image: Markup
-    legend: list[tuple[Markup, str]] = field(default_factory=list)
-    plot: str = ""
+    legend: list[tuple[Markup, str]]
+    plot: Markup
 
 
-def embedded(name: str, label: str, picture: Picture, number: int, styles: dict[str, str]) -> Drawn:
-    """The picture inside the page; label: plain text, read in its place; styles: see `inline`."""
-    if picture.kind == "png":
-        content = base64.b64encode(picture.content).decode("ascii")
-        return Drawn(name, Markup('<img src="data:image/png;base64,{}" alt="{}">').format(content, label))
-    image, legend = inline(picture, label, number, styles)
-    return Drawn(name, image, legend, json.dumps(picture.plot, separators=(",", ":")))
+def embedded(name: str, made: Drawn) -> Embedded:
+    """A picture as a template puts it. name: of its file, without ending."""
+    plot = json.dumps(made.plot, separators=(",", ":"), ensure_ascii=False)
+    # For an attribute in single quotes: there are a thousand double ones.
+    quoted = Markup(plot.replace("&", "&amp;").replace("'", "&#39;").replace("<", "&lt;"))
+    legend = [(Markup(sample), words) for sample, words in made.samples]
+    return Embedded(name, Markup(made.svg), legend, quoted)

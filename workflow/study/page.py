@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from workflow.config.joints_config import JointsConfig
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
+from workflow.figures.description import Panel, Picture, pad_limits, small_multiples
 from workflow.study.columns import COLUMNS, StudyColumn, numbers_of
 from workflow.study.points import Point, PointRow, State, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
@@ -223,26 +222,28 @@ _FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
 
 
 @style.drawing("pareto")
-def draw_pareto(study: StudyView) -> Figure:
+def draw_pareto(study: StudyView) -> Picture:
     """Certified points filled (those on the front coloured and numbered), others hollow."""
     plots = study.config.pareto
-    figure, places = style.small_multiples(len(plots), min(len(plots), 2), 4.3, 0.4)
-    for axes, plot, front in zip(places, plots, study.fronts, strict=True):
-        _draw(axes, study, plot, front)
-    return figure
+    picture, places = small_multiples(len(plots), min(len(plots), 2), 4.3, 0.4)
+    for panel, plot, front in zip(places, plots, study.fronts, strict=True):
+        _draw(panel, study, plot, front)
+    return picture
 
 
-def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> None:
+def _draw(panel: Panel, study: StudyView, plot: ParetoPlot, front: list[int]) -> None:
     x_column, y_column = study.column(plot.x), study.column(plot.y)
     x_label, y_label = study.heading(plot.x), study.heading(plot.y)
-    for say, label, column in ((axes.set_xlabel, x_label, x_column), (axes.set_ylabel, y_label, y_column)):
-        say(f"{style.plain(label, 40)} ({column.better} is better)")
-    axes.set_title(style.plain(f"{y_label} against {x_label}", 70))
+    panel.set(
+        xlabel=f"{style.plain(x_label, 40)} ({x_column.better} is better)",
+        ylabel=f"{style.plain(y_label, 40)} ({y_column.better} is better)",
+    )
+    panel.set_title(style.plain(f"{y_label} against {x_label}", 70))
     at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
     there = ~np.isnan(at).any(axis=1)
     if not there.all():
         words = f"{np.count_nonzero(~there)} not drawn: no number here"
-        axes.annotate(words, (0.99, 0.01), xycoords="axes fraction", ha="right", fontsize=8, color="#666666")
+        panel.words(words, 0.99, 0.01, across_x=True, across_y=True, horizontal="right")
     number = np.array([row.number for row in study.rows])
     good, on = np.array([row.good for row in study.rows]), np.isin(number, front)
     for kind, label, look in (
@@ -251,29 +252,22 @@ def _draw(axes: Axes, study: StudyView, plot: ParetoPlot, front: list[int]) -> N
         (on, "certified, on the front", _FRONT),
     ):
         if (kind & there).any():
-            axes.plot(*at[kind & there].T, label=label, **look)
+            panel.plot(*at[kind & there].T, label=label, **look)
     if (lower := there & np.array([row.lowered for row in study.rows])).any():
-        axes.plot(*at[lower].T, label="certified at a lower bandwidth than specified", **_RING)
+        panel.plot(*at[lower].T, label="certified at a lower bandwidth than specified", **_RING)
     if on.sum() > 1:
-        axes.plot(*at[on][np.lexsort(at[on].T[::-1])].T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
+        panel.plot(*at[on][np.lexsort(at[on].T[::-1])].T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
     if there.any():
-        for limits, values in ((axes.set_xlim, at[there, 0]), (axes.set_ylim, at[there, 1])):
-            limits(*style.pad_limits(values.min(), values.max(), 0.1))
-        _number(axes, at[on], number[on])
+        x, y = at[there].T
+        panel.set(xlim=pad_limits(x.min(), x.max(), 0.1), ylim=pad_limits(y.min(), y.max(), 0.1))
+        _number(panel, at[on], number[on])
 
 
-def _number(axes: Axes, at: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> None:
+def _number(panel: Panel, at: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> None:
     """Numbers as in the table at places (P, 2), those of points in one place together."""
     # A fiftieth of the axes: closer together, two labels would lie on one another.
-    shares = np.rint(50 * axes.transLimits.transform(at)) if number.size else at
+    shares = np.rint(50 * np.column_stack([panel.x.shares(at[:, 0]), panel.y.shares(at[:, 1])]))
     for share in np.unique(shares, axis=0):
         here = np.all(shares == share, axis=1)
-        axes.annotate(
-            style.plain(", ".join(map(str, sorted(number[here]))), 18),
-            at[here][0],
-            xytext=(6, 5),
-            textcoords="offset points",
-            fontsize=8.5,
-            color=style.REFERENCE,
-            zorder=4,
-        )
+        words = style.plain(", ".join(map(str, sorted(number[here]))), 18)
+        panel.words(words, *at[here][0], offset=(6.0, 5.0), size=8.5, color=style.REFERENCE)

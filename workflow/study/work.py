@@ -15,6 +15,7 @@ from workflow.engine.errors import InputError, StageError
 from workflow.engine.executor import Executor, Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.figures.svg import svg_file
 from workflow.report.pages import REPORT
 from workflow.report.rendering import render_page
 from workflow.study.directory import StudyDirectory
@@ -210,7 +211,7 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
     )
     directory.link_numbers(rows)
     page = render_page("study.html.j2", title=title, study=view)
-    files = {f"{name}.{picture.kind}": picture.content for name, picture in page.pictures.items()}
+    files = {f"{name}.svg": svg_file(made, page.looks) for name, made in page.pictures.items()}
     files["table.csv"] = csv_text(study.axes, rows, view.fronts).encode()
     files["table.json"] = codec.plain_text(view.document).encode()
     files["study.html"] = page.html.encode()

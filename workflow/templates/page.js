@@ -1,5 +1,5 @@
 // Values under the pointer, zoom, legend entries to hide, pictures to save. The picture itself is plain SVG: without
-// this script it stands as it is. `data-plot` is what workflow/figures/reading.py says of it.
+// this script it stands as it is. `data-plot` is what workflow/figures/svg.py says of it.
 (() => {
 "use strict";
 const NS = "http://www.w3.org/2000/svg";
@@ -36,25 +36,21 @@ const ticks = (low, high, kind) => {
   for (let k = Math.ceil(low / step); k * step <= high; k++) found.push([k * step, number(k * step, 6)]);
   return found;
 };
-// Lines of a path (relative steps), each a list of points.
-const runs = (path, dx = 0, dy = 0) => {
+// Lines of a path of relative steps, each a list of points.
+const runs = path => {
   const found = [];
-  let x = dx, y = dy, start = [x, y];
-  for (const [, command, text] of path.getAttribute("d").matchAll(/([mlqcz])([^mlqcz]*)/g)) {
-    if (command === "z") [x, y] = start;
-    else {
-      const steps = text.match(/-?\d*\.?\d+/g).map(Number);
-      x += steps.at(-2);
-      y += steps.at(-1);
-      if (command === "m") { found.push([]); start = [x, y]; }
-    }
-    found.at(-1).push([x, y]);
+  let x = 0, y = 0;
+  for (const [, steps, closed] of path.getAttribute("d").matchAll(/m([^mz]*)(z?)/g)) {
+    const numbers = steps.match(/-?\d*\.?\d+/g).map(Number), line = [];
+    for (let k = 0; k < numbers.length; k += 2) line.push([x += numbers[k], y += numbers[k + 1]]);
+    if (closed) line.push([x, y] = line[0]);
+    found.push(line);
   }
   return found;
 };
-const wide = lines => lines.flat().some(([x, y]) => Math.abs(x) > 30 || Math.abs(y) > 30);
-const shape = use => runs(document.getElementById(use.getAttribute("href").slice(1)));
-const at = use => [Number(use.getAttribute("x")), Number(use.getAttribute("y"))];
+// Places of a path of markers: as they stood before any zoom.
+const places = path => path.places ??= runs(path).flat();
+const at = text => [Number(text.getAttribute("x")), Number(text.getAttribute("y"))];
 
 class Plot {
   constructor(holder) {
@@ -127,11 +123,8 @@ class Plot {
     const found = [];
     for (const group of this.svg.querySelectorAll(`.a${j} > [class^=k], .a${j} > .d`)) {
       const entry = group.getAttribute("class").slice(1), lines = [], marks = [];
-      for (const path of group.querySelectorAll("path")) if (!path.closest("defs")) lines.push(...runs(path));
-      for (const use of group.querySelectorAll("use")) {
-        if (wide(shape(use))) lines.push(...runs(document.getElementById(use.getAttribute("href").slice(1)), ...at(use)));
-        else marks.push(at(use));
-      }
+      for (const path of group.querySelectorAll(".m > path")) lines.push(...runs(path));
+      for (const path of group.querySelectorAll(".p")) marks.push(...places(path));
       found.push({entry, words: entry ? this.plot.legend[entry] : "", lines, marks});
     }
     const named = found.filter(item => item.entry);
@@ -307,10 +300,10 @@ class Plot {
       const [sx, tx] = this.zoomed(j, 0), [sy, ty] = this.zoomed(j, 1), {box} = this.plot.axes[j];
       for (const moving of svg.querySelectorAll(`.a${j} > g > .m`)) {
         moving.setAttribute("transform", `matrix(${sx} 0 0 ${sy} ${tx} ${ty})`);
-        for (const use of moving.querySelectorAll("use")) if (!wide(shape(use))) {
-          const [x, y] = at(use);
-          use.setAttribute("transform", `translate(${x} ${y}) scale(${1 / sx} ${1 / sy}) translate(${-x} ${-y})`);
-        }
+      }
+      // Markers move, but keep their size.
+      for (const path of svg.querySelectorAll(`.a${j} > g > .p`)) {
+        path.setAttribute("d", "M" + places(path).map(([x, y]) => `${sx * x + tx} ${sy * y + ty}`).join("L"));
       }
       for (const words of svg.querySelectorAll(`.a${j} > .t, .a${j} > .u`)) {
         const text = words.querySelector("text"), fixed = words.getAttribute("class") === "u";
@@ -322,25 +315,36 @@ class Plot {
       for (const dim of [0, 1]) this.label(svg, j, dim);
     }
   }
-  // Ticks of a zoomed axis are copies of one of its own, moved.
+  // Numbers, marks and lines of a zoomed axis, where the first number of the whole one has them.
   label(svg, j, dim) {
-    const own = [...svg.querySelectorAll(`.a${j} > .${"xy"[dim]}`)], [a, b] = this.view[j][dim];
-    for (const tick of own.filter(tick => tick.dataset.added)) tick.remove();
-    const all = own.filter(tick => !tick.dataset.added), whole = a === 0 && b === 1;
-    for (const tick of all) tick.style.display = whole ? "" : "none";
-    const model = all.find(tick => tick.querySelector("text")) ?? all.find(tick => tick.querySelector("use"));
-    if (whole || !model?.querySelector("use")) return;
+    const own = svg.querySelector(`.a${j} > .${"xy"[dim]}`), [a, b] = this.view[j][dim], whole = a === 0 && b === 1;
+    own?.nextElementSibling?.dataset.added && own.nextElementSibling.remove();
+    if (!own) return;
+    own.style.display = whole ? "" : "none";
+    if (whole) return;
     const axes = this.plot.axes[j], [low, high] = [axes.box[dim ? 3 : 0], axes.box[dim ? 1 : 2]].map(place => this.value(j, dim, place));
+    const group = document.createElementNS(NS, "g"), text = own.querySelector("text");
+    group.setAttribute("class", own.getAttribute("class"));
+    group.dataset.added = "1";
+    const {box, second} = axes, edge = second ? (dim ? box[2] : box[1]) : dim ? box[0] : box[3], out = (dim === 0) === !second ? 3.5 : -3.5;
+    const strokes = [["gl", dim ? box[0] : box[1], dim ? box[2] : box[3]], ["tk", edge, edge + out]];
     for (const [value, words] of ticks(Math.min(low, high), Math.max(low, high), (dim ? axes.y : axes.x)[2])) {
-      const tick = model.cloneNode(true), by = this.whereIs(j, dim, value) - at(model.querySelector("use"))[dim];
-      for (const known of tick.querySelectorAll("defs")) known.remove();
-      tick.dataset.added = "1";
-      tick.style.display = "";
-      tick.setAttribute("transform", dim ? `translate(0 ${by})` : `translate(${by} 0)`);
-      const text = tick.querySelector("text");
-      if (text) text.textContent = words;
-      model.after(tick);
+      const place = this.whereIs(j, dim, value);
+      for (const [look, from, to] of strokes) if (own.querySelector("." + look)) {
+        const path = document.createElementNS(NS, "path");
+        path.setAttribute("class", look);
+        path.setAttribute("d", dim ? `M${from} ${place}H${to}` : `M${place} ${from}V${to}`);
+        group.append(path);
+      }
+      if (!text) continue;
+      const label = text.cloneNode(), [x, y] = at(text);
+      // The foot of a number beside its mark: as far below as that of the first one.
+      label.setAttribute("x", dim ? x : place);
+      label.setAttribute("y", dim ? place + 3.2 : y);
+      label.textContent = words;
+      group.append(label);
     }
+    own.after(group);
   }
   key(event) {
     const panels = [...this.plot.axes.keys()].filter(j => !this.plot.axes[j].second);

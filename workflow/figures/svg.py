@@ -1,0 +1,863 @@
+"""A picture as SVG, written straight from its description: for a page, or as a file of its own.
+
+Lengths are in points, y down. A page gives looks classes and stands the legend beside the picture as words;
+its script reads values, zooms and hides from the classes of the groups: `aN` of the N-th pair of axes, in it
+`kE` of what stands under entry E of the legend, `d` of other data, `t` and `u` of words at a place in the
+data (of `u` only x is), `x` and `y` of an axis; inside of `kE` and `d` a group `m` of outlines and paths `p`
+with a marker at every point.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import groupby
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from workflow.figures import look as looks
+from workflow.figures.description import (
+    Area,
+    Arrow,
+    Axis,
+    Curve,
+    Mark,
+    Panel,
+    Picture,
+    Real,
+    Rule,
+    Span,
+    Words,
+    X,
+    Y,
+)
+from workflow.figures.ticks import DECIBEL_STEPS, Ticks, linear_ticks, log_ticks, ticks_of
+
+POINT = 72  # to the inch
+# Room around the words of every panel [pt]: 0.06 inches, as of matplotlib's constrained layout in this house.
+_PAD = 4.32
+# From the edge of a panel to the numbers: a mark of 3.5 pt and as much room [pt].
+_TO_NUMBERS = 7.0
+_MARK, _SMALL_MARK = 3.5, 2.0  # lengths of the marks of an axis [pt]
+_TO_LABEL = 4.0  # from the numbers to the label of an axis [pt]
+_TO_TITLE = 6.0  # from the panel, or what stands above it, to its title [pt]
+_SECOND_SIZE = 8.5  # letters of second axes [pt]
+_LINE = 1.2  # from line to line, in sizes of the letters
+_ASCENT = 0.76  # from the foot of a letter to its head, in sizes of the letters
+_POWER_ROOM = 12.0  # above a panel, for the power of ten of its numbers [pt]
+# Letters of DejaVu Sans from the blank to the tilde: widths in hundredths of the size. Verdana is as wide.
+_WIDTHS = (
+    32, 40, 46, 84, 64, 95, 78, 27, 39, 39, 50, 84, 32, 36, 32, 34, 64, 64, 64, 64, 64, 64, 64, 64,
+    64, 64, 34, 34, 84, 84, 84, 53, 100, 68, 69, 70, 77, 63, 58, 77, 75, 29, 29, 66, 56, 86, 75, 79,
+    60, 79, 69, 63, 61, 73, 68, 99, 69, 61, 69, 39, 34, 39, 84, 50, 50, 61, 63, 55, 63, 62, 35, 63,
+    63, 28, 28, 58, 28, 97, 63, 61, 63, 63, 41, 52, 39, 63, 59, 82, 59, 59, 52, 64, 34, 64, 84,
+)  # fmt: skip
+_OTHER_WIDTH = 0.65  # of letters beyond these, in sizes: as of most in the font
+_SUPERSCRIPT_WIDTH = 0.42  # of raised digits, in sizes
+_BOLD = 1.105  # how much wider bold letters are, the mean over these letters
+# Points of a line that are nearer than this to the line without them are left out [pt]: a seventh of a pixel
+# where a page is 1000 pixels wide, and less than a thousandth of a panel's height. Twice as much saves a
+# tenth of a page.
+_UNSEEN = 0.1
+# The same on a logarithmic axis, where a tenth of a point may be 1 % of the value that the script reads
+# there.
+_UNSEEN_LOG = 0.04
+# How often every second point of a line is looked at; each time leaves at least half of them.
+_THINNINGS = 10
+# Lines that run beside a panel at less than this distance [pt] are drawn: half of the widest line of the
+# house.
+_EDGE = 3.0
+# Areas that are smaller than this [pt] in both ways are left out: the line of the house in whose middle they
+# lie hides them.
+_SPECK = 0.4
+_PIXEL = 0.72  # of a page that is 1000 pixels wide [pt]
+# Farther outside of the picture than this [pt] a place is drawn at this distance.
+_FAR = 2e4
+# A legend of a file: height of a row, width of a sample, room after it and after an entry [pt].
+_ROW, _SAMPLE, _AFTER_SAMPLE, _AFTER_ENTRY = 13.0, 18.0, 7.0, 16.0
+_LEGEND_SIZE = 9.0
+# What all pictures have in common; looks of data are added to it.
+COMMON_STYLE = (
+    "svg *{stroke-linejoin:round}"
+    'svg text{font-family:"DejaVu Sans",Verdana,sans-serif;font-size:9px;fill:#333}'
+    ".gl{fill:none;stroke:#ddd;stroke-width:.6}.tk{fill:none;stroke:#333;stroke-width:.8}"
+    ".tn{fill:none;stroke:#333;stroke-width:.6}.fr{fill:none;stroke:#444;stroke-width:.8}"
+    ".p{fill:none;stroke:none}.lb{font-size:9.5px;fill:#000}.ti{font-weight:bold;font-size:10.5px;fill:#000}"
+    ".se{font-size:8.5px;fill:#666}.mi{text-anchor:middle}.en{text-anchor:end}"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A picture in a page: the groups of its SVG without a legend; sample (groups around the middle of a box
+    from (0, -4.5) to (18, 4.5)) and words of each entry of the legend; what the script reads of it."""
+
+    picture: Picture
+    label: str
+    body: str
+    legend: list[tuple[str, str]]
+    plot: dict[str, Any]
+
+    @property
+    def svg(self) -> str:
+        """The image that stands in the page."""
+        size = f"0 0 {self.plot['width']:g} {self.plot['height']:g}"
+        label = escape(self.label, {'"': "&quot;"})
+        return f'<svg viewBox="{size}" role="img" aria-label="{label}">{self.body}</svg>'
+
+    @property
+    def samples(self) -> list[tuple[str, str]]:
+        """Sample and words of each entry, each sample an image of its own."""
+        box = 'viewBox="-1 -4.5 20 9" aria-hidden="true"'
+        return [(f"<svg {box}>{sample}</svg>", words) for sample, words in self.legend]
+
+
+def text_width(text: str, size: float, *, bold: bool = False) -> float:
+    """Length [pt] of the longest line of a text."""
+    longest = max((sum(map(_letter, line)) for line in text.split("\n")), default=0.0)
+    return longest * size * (_BOLD if bold else 1.0)
+
+
+@lru_cache(maxsize=1000)
+def _letter(letter: str) -> float:
+    place = ord(letter) - 32
+    if 0 <= place < len(_WIDTHS):
+        return _WIDTHS[place] / 100
+    return _SUPERSCRIPT_WIDTH if letter in "⁻⁰¹²³⁴⁵⁶⁷⁸⁹" else _OTHER_WIDTH
+
+
+# -- places
+# ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(eq=False)
+class _Frame:
+    """A panel in its place: box (left, top, right, bottom) [pt], numbers of its axes and of its second axes,
+    and how far its words reach around it (left, top, right, bottom)."""
+
+    panel: Panel
+    box: Real
+    x: Ticks
+    y: Ticks
+    hertz: Ticks | None = None
+    decibel: Ticks | None = None
+    numbered: tuple[bool, bool] = (True, True)
+
+    @property
+    def width(self) -> float:
+        return float(self.box[2] - self.box[0])
+
+    @property
+    def height(self) -> float:
+        return float(self.box[3] - self.box[1])
+
+    def place(self, which: int, values: Any) -> Real:
+        """Where values of an axis lie [pt]."""
+        shares = self.panel.axis(which).shares(values)
+        found = self.box[0] + shares * self.width if which == X else self.box[3] - shares * self.height
+        return np.asarray(np.clip(found, -_FAR, _FAR))
+
+    def written(self, points: Real) -> Real:
+        """A line (N, 2) as it is written: without points that are not seen; in y to a tenth where the axis is
+        linear, which is 0.03 % of a panel's height."""
+        if self.panel.y.kind != "lin":
+            return thinned(points, _UNSEEN_LOG)
+        points = thinned(points)
+        return np.column_stack([points[:, X], np.round(points[:, Y], 1)])
+
+    def number_room(self, which: int) -> float:
+        """Room for the marks and numbers of an axis [pt]."""
+        if not self.numbered[which]:
+            return _MARK
+        ticks = self.y if which else self.x
+        size = self.panel.tick_size[which]
+        if which == Y:
+            return _TO_NUMBERS + max((text_width(word, size) for word in ticks.words), default=0.0)
+        lines = max((word.count("\n") + 1 for word in ticks.words), default=1)
+        return _TO_NUMBERS + size * (_ASCENT + _LINE * (lines - 1) + 0.24)
+
+    def label_room(self) -> float:
+        """Room for the label of the y axis, beside the numbers [pt]."""
+        label = self.panel.labels[Y]
+        return _TO_LABEL + _lines(label) * self.panel.label_size * _LINE if label else 0.0
+
+    def above(self) -> float:
+        """Height of what stands over the panel, but for its title [pt]."""
+        if self.hertz is not None:
+            return _TO_NUMBERS + _SECOND_SIZE + _TO_LABEL + _SECOND_SIZE * _LINE
+        return _POWER_ROOM if self.y.power else 0.0
+
+    def around(self) -> Real:
+        """Room (4,) that its words need: left, top, right, bottom; but for the label of the y axis."""
+        panel = self.panel
+        left = self.number_room(Y)
+        right = 0.0
+        if panel.colour_bar:
+            left, right = 0.0, left
+        bottom = self.number_room(X)
+        if panel.labels[X]:
+            bottom += _TO_LABEL + panel.label_size * _LINE
+        top = self.above()
+        if panel.title:
+            raised = max(panel.title_raised, top + _TO_TITLE)
+            top = raised + _lines(panel.title) * panel.title_size * _LINE
+        if self.decibel is not None:
+            words = max((text_width(word, _SECOND_SIZE) for word in self.decibel.words), default=0.0)
+            right = _TO_NUMBERS + words + _TO_LABEL + _SECOND_SIZE * _LINE
+        if self.numbered[X] and self.x.words:
+            places = self.place(X, self.x.places)
+            half = np.array([text_width(word, panel.tick_size[X]) / 2 for word in self.x.words])
+            right = max(right, float(np.max(places + half - self.box[2])))
+            left = max(left, float(np.max(self.box[0] - places + half)))
+        for mark in panel.marks:
+            if isinstance(mark, Words) and not mark.clipped:
+                x, y = self.anchor(mark)
+                if not self.box[0] <= x <= self.box[2]:
+                    continue
+                right = max(right, x + text_width(mark.text, mark.size) - self.box[2]) if (
+                    mark.horizontal == "left"
+                ) else right  # fmt: skip
+                top = max(top, self.box[1] - y + mark.size)
+        return np.array([left, top, right, bottom])
+
+    def anchor(self, words: Words) -> tuple[float, float]:
+        """Where words stand [pt]."""
+        x = self.box[0] + words.x * self.width if words.across_x else float(self.place(X, words.x))
+        y = self.box[3] - words.y * self.height if words.across_y else float(self.place(Y, words.y))
+        return x + words.offset[0], y - words.offset[1]
+
+    def reach(self) -> tuple[float, float]:
+        """From where to where its words reach [pt], its title included."""
+        left, _, right, _ = self.around()
+        panel = self.panel
+        title = self.box[0] + text_width(panel.title, panel.title_size, bold=panel.title_bold)
+        return float(self.box[0] - left - self.label_room()), max(float(self.box[2] + right), title)
+
+
+def _lines(text: str) -> int:
+    return text.count("\n") + 1
+
+
+def _laid_out(picture: Picture, height: float) -> list[_Frame]:
+    """Panels in what their widest words leave of so high a picture."""
+    width = picture.width_in * POINT
+    rows, columns = picture.grid.shape
+    frames: list[_Frame] = []
+    # First as if all panels were alike, then by the words that this gave.
+    for room in (np.array([55.0, 25.0, 12.0, 25.0]), None):
+        before, after = np.full((2, max(rows, columns)), _PAD), np.full((2, max(rows, columns)), _PAD)
+        labels = np.zeros(columns)  # under each other, beside the widest numbers of the column
+        for panel in picture.panels:
+            row, column = panel.place
+            if room is not None:
+                around = room
+            else:
+                frame = next(frame for frame in frames if frame.panel is panel)
+                around = frame.around()
+                labels[column] = max(labels[column], frame.label_room())
+            before[X, column] = max(before[X, column], around[0] + _PAD)
+            after[X, column] = max(after[X, column], around[2] + _PAD)
+            before[Y, row] = max(before[Y, row], around[1] + _PAD)
+            after[Y, row] = max(after[Y, row], around[3] + _PAD)
+        x = _edges(before[X, :columns] + labels, after[X, :columns], picture.width_ratios, width)
+        y = _edges(before[Y, :rows], after[Y, :rows], picture.height_ratios, height)
+        frames = [
+            _framed(picture, panel, x[:, panel.place[1]], y[:, panel.place[0]]) for panel in picture.panels
+        ]
+    return frames
+
+
+def _edges(before: Real, after: Real, ratios: Any, total: float) -> Real:
+    """Begin and end (2, N) of each column or row, without the room before and after it."""
+    sizes = np.asarray(ratios) / np.sum(ratios) * max(total - before.sum() - after.sum(), 1.0)
+    starts = np.cumsum(before + np.append(0.0, (sizes + after)[:-1]))
+    return np.array([starts, starts + sizes])
+
+
+def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
+    """A panel between the edges of its column and its row, with its numbers."""
+    box = np.array([x[0], y[0], x[1], y[1]])
+    if panel.equal:
+        # A unit is as long in x as in y: the box shrinks around its middle.
+        spans = np.abs([np.ptp(panel.x.limits()), np.ptp(panel.y.limits())])
+        scale = min((x[1] - x[0]) / spans[X], (y[1] - y[0]) / spans[Y])
+        half = scale * spans / 2
+        middle = np.array([x.mean(), y.mean()])
+        box = np.concatenate([middle - half, middle + half])
+    along, up = box[2] - box[0], box[3] - box[1]
+    size = panel.tick_size
+    frame = _Frame(
+        panel,
+        box,
+        _fitting(panel.x, float(along), size[X]),
+        ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, 9))),
+        numbered=(picture.numbered(panel, X), picture.numbered(panel, Y)),
+    )
+    if panel.hertz:
+        low, high = np.array(panel.x.limits()) / (2 * np.pi)
+        frame.hertz = log_ticks(float(low), float(high), int(np.clip(along / 27, 1, 9)))
+    if panel.decibel:
+        low, high = 20 * np.log10(panel.y.limits())
+        frame.decibel = linear_ticks(float(low), float(high), 6, DECIBEL_STEPS)
+    return frame
+
+
+def _fitting(axis: Axis, length: float, size: float) -> Ticks:
+    """As many numbers as fit along a length [pt]."""
+    most = int(np.clip(length / (3 * size), 1, 9))
+    while True:
+        ticks = ticks_of(axis, most)
+        widest = max((text_width(word, size) for word in ticks.words), default=0.0)
+        places = np.sort(axis.shares(ticks.places)) * length
+        nearest = float(np.min(np.diff(places), initial=np.inf))
+        if most <= 2 or axis.named is not None or widest + 4 < nearest:
+            return ticks
+        most -= 1
+
+
+# -- paths
+# -----------------------------------------------------------------------------------------------------
+
+
+def path_of(points: Real, *, closed: bool = False, start: tuple[int, int] = (0, 0)) -> str:
+    """Points (N, 2) [pt] as a path of relative steps, to a tenth in x and a hundredth in y. start: where the
+    path before it ended, in hundredths."""
+    steps = np.diff(_hundredths(points), axis=0, prepend=np.array([start]))
+    text = " ".join(map(_short, steps.ravel().tolist())).replace(" -", "-")
+    return f"m{text}{'z' if closed else ''}"
+
+
+def _hundredths(points: Real) -> Any:
+    places = np.rint(points * np.array([10.0, 100.0])).astype(np.int64)
+    places[:, 0] *= 10
+    return places
+
+
+@lru_cache(maxsize=20_000)
+def _short(hundredths: int) -> str:
+    whole, rest = divmod(abs(hundredths), 100)
+    text = (str(whole) if whole else "") + (f".{rest:02d}".rstrip("0") if rest else "")
+    return ("-" if hundredths < 0 else "") + (text or "0")
+
+
+def _lines_of(points: Real, box: Real) -> Iterator[Real]:
+    """Parts of a line (N, 2) that are seen in a box (left, top, right, bottom), between points that are no
+    numbers."""
+    with np.errstate(invalid="ignore"):
+        beyond = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
+    # A step whose ends lie beyond the same side is not in the box.
+    drawn_steps = ~np.any(beyond[1:] & beyond[:-1], axis=1)
+    finite = np.isfinite(points).all(axis=1)
+    drawn_steps &= finite[1:] & finite[:-1]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], drawn_steps, [False]]).astype(int)))
+    for first, last in edges.reshape(-1, 2):
+        yield points[first : last + 1]
+
+
+def thinned(points: Real, unseen: float = _UNSEEN) -> Real:
+    """A line (N, 2) without points that are not seen: those nearer than `unseen` [pt] to the line between
+    their neighbours, and of a signal that goes up and down within a pixel all but four there."""
+    points = _four_a_pixel(points)
+    for turn in range(_THINNINGS):
+        if points.shape[0] < 3:
+            break
+        # Every second point in turn, so that no two neighbours go at once.
+        middle = np.arange(1 + turn % 2, points.shape[0] - 1, 2)
+        if not middle.size:
+            continue
+        before, after = points[middle - 1], points[middle + 1]
+        way = after - before
+        length = np.hypot(*way.T)
+        off = points[middle] - before
+        with np.errstate(divide="ignore", invalid="ignore"):
+            beside = np.abs(way[:, 0] * off[:, 1] - way[:, 1] * off[:, 0]) / length
+            along = np.sum(way * off, axis=1) / length**2
+        straight = (beside < unseen) & (along >= 0) & (along <= 1)
+        if not straight.any():
+            if turn % 2:
+                break
+            continue
+        points = np.delete(points, middle[straight], axis=0)
+    return points
+
+
+def _four_a_pixel(points: Real) -> Real:
+    """Of a line (N, 2) that only goes to the right, the first, the smallest, the largest and the last point
+    of each pixel: they cover the same pixels as all of it (M4: Jugel et al., Proc. VLDB 7(10), 2014)."""
+    x, y = points.T
+    if x.size < 5 or np.any(np.diff(x) < 0) or x[-1] - x[0] > x.size / 4 * _PIXEL:
+        return points
+    pixel = np.floor(x / _PIXEL).astype(np.int64)
+    firsts = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
+    lasts = np.append(firsts[1:], x.size) - 1
+    order = np.lexsort((y, pixel))  # sorted by pixel, then by value
+    return points[np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))]
+
+
+def _many(parts: list[Real], *, closed: bool = False) -> str:
+    """Several lines as one path."""
+    texts = []
+    end = (0, 0)
+    for part in parts:
+        texts.append(path_of(part, closed=closed, start=end))
+        last = _hundredths(part[:1] if closed else part[-1:])[0]
+        end = int(last[0]), int(last[1])
+    return "".join(texts)
+
+
+def _held(points: Real) -> Real:
+    """Points (N, 2) of a signal that holds each value until the next."""
+    held = np.repeat(points, 2, axis=0)
+    return np.column_stack([held[1:, 0], held[:-1, 1]])
+
+
+# -- groups
+# ----------------------------------------------------------------------------------------------------
+
+
+class _Writer:
+    """Writes a picture; classes: looks of the page by what they say, added to."""
+
+    def __init__(self, picture: Picture, number: int, classes: dict[str, str]) -> None:
+        self.picture = picture
+        self.number = number
+        self.classes = classes
+        self.markers: dict[tuple[str, str], str] = {}
+        self.entries = picture.legend()
+        self.entry_of_look = {
+            looks.key(mark): k for k, mark in reversed(list(enumerate(self.entries.values())))
+        }
+        self.entry_of_label = {label: k for k, label in enumerate(self.entries)}
+
+    def named(self, look: str) -> str:
+        """The class of a look."""
+        return self.classes.setdefault(look, f"s{len(self.classes)}")
+
+    def panel(self, place: int, frame: _Frame) -> str:
+        """The group of a panel, its second axes not included."""
+        clip = f"f{self.number}-c{place}"
+        corners = frame.box[[0, 1, 2, 1, 2, 3, 0, 3]].reshape(4, 2)
+        parts = [
+            f'<clipPath id="{clip}"><path d="{path_of(corners, closed=True)}"/></clipPath>',
+            self.axis(frame, X),
+            self.axis(frame, Y),
+        ]
+        drawn = [mark for mark in frame.panel.layered() if not isinstance(mark, Words | Arrow)]
+        for name, marks in groupby(drawn, self.group_name):
+            parts.append(self.data(list(marks), name, clip, frame))
+        left, top, right, bottom = frame.box
+        spine = np.array([[left, top], [left, bottom], [right, bottom]])
+        parts.append(f'<path class="fr" d="{path_of(spine)}"/>')
+        for mark in frame.panel.marks:
+            if isinstance(mark, Words):
+                parts.append(self.words(mark, frame))
+            elif isinstance(mark, Arrow):
+                parts.append(self.arrow(mark, clip, frame))
+        parts.append(self.title(frame))
+        return f'<g class="a{place}">{"".join(parts)}</g>'
+
+    def group_name(self, mark: Mark) -> str:
+        """`kE` of what the legend names or what looks like it, `d` of all else."""
+        entry = self.entry_of_label.get(getattr(mark, "label", ""))
+        if entry is None:
+            entry = self.entry_of_look.get(looks.key(mark))
+        return "d" if entry is None else f"k{entry}"
+
+    def data(self, marks: list[Mark], name: str, clip: str, frame: _Frame) -> str:
+        """A group of data: what can be stretched in a group of its own, then markers."""
+        stretched: list[str] = []
+        dots: list[str] = []
+        for mark in marks:
+            if isinstance(mark, Area):
+                stretched += self.area(mark, frame)
+            elif isinstance(mark, Curve):
+                line, markers = self.curve(mark, frame)
+                stretched += line
+                dots += markers
+            elif isinstance(mark, Rule | Span):
+                stretched.append(self.across(mark, frame))
+        moving = f'<g class="m">{"".join(stretched)}</g>' if stretched else ""
+        return f'<g class="{name}" clip-path="url(#{clip})">{moving}{"".join(dots)}</g>'
+
+    def area(self, mark: Area, frame: _Frame) -> list[str]:
+        shapes = []
+        for outline in mark.outlines:
+            points = np.column_stack([frame.place(X, outline[:, X]), frame.place(Y, outline[:, Y])])
+            if len(points) and np.isfinite(points).all() and np.ptp(points, axis=0).max() > _SPECK:
+                shapes.append(frame.written(points))
+        if not shapes:
+            return []
+        look = self.named(looks.filling(mark.look))
+        if mark.whole:
+            return [f'<path class="{look}" fill-rule="evenodd" d="{_many(shapes, closed=True)}"/>']
+        return [f'<path class="{look}" d="{path_of(shape, closed=True)}"/>' for shape in shapes]
+
+    def curve(self, mark: Curve, frame: _Frame) -> tuple[list[str], list[str]]:
+        """Paths of the line, and of the markers."""
+        y = frame.box[3] - mark.y * frame.height if mark.across else frame.place(Y, mark.y)
+        points = np.column_stack([frame.place(X, mark.x), y])
+        lines: list[str] = []
+        if looks.is_line(mark.look):
+            seen = _held(points) if mark.look.get("drawstyle") == "steps-post" else points
+            if path := _many([frame.written(part) for part in _lines_of(seen, frame.box)]):
+                lines = [f'<path class="{self.named(looks.stroke(mark.look))}" d="{path}"/>']
+        dots = []
+        if mark.look.get("marker"):
+            there = points[np.isfinite(points).all(axis=1)]
+            inside = (there >= frame.box[:2] - 1) & (there <= frame.box[2:] + 1)
+            there = there[inside.all(axis=1)]
+            if len(there):
+                known = self.marker(mark.look)
+                dots = [f'<path class="p" style="marker:url(#{known})" d="{path_of(there)}"/>']
+        return lines, dots
+
+    def marker(self, look: Mapping[str, Any]) -> str:
+        """The id of a marker."""
+        style, outline = looks.marker(look)
+        return self.markers.setdefault((self.named(style), outline), f"f{self.number}-m{len(self.markers)}")
+
+    def definitions(self) -> str:
+        """Markers of the picture."""
+        found = "".join(
+            f'<marker id="{name}" markerUnits="userSpaceOnUse" overflow="visible"><path class="{style}" '
+            f'd="{outline}"/></marker>'
+            for (style, outline), name in self.markers.items()
+        )
+        return f"<defs>{found}</defs>" if found else ""
+
+    def across(self, mark: Rule | Span, frame: _Frame) -> str:
+        """A line or a strip from edge to edge."""
+        ends = np.array([mark.at] if isinstance(mark, Rule) else [mark.low, mark.high])
+        places = frame.place(mark.axis, ends)
+        along = frame.box[[0, 2]] if mark.axis == Y else frame.box[[1, 3]]
+        corners = [(a, b) for b, sides in zip(places, (along, along[::-1]), strict=False) for a in sides]
+        points = np.array([(b, a) if mark.axis == X else (a, b) for a, b in corners])
+        if isinstance(mark, Rule):
+            return f'<path class="{self.named(looks.stroke(mark.look))}" d="{path_of(points)}"/>'
+        return f'<path class="{self.named(looks.filling(mark.look))}" d="{path_of(points, closed=True)}"/>'
+
+    def words(self, mark: Words, frame: _Frame) -> str:
+        x, y = frame.anchor(mark)
+        if mark.vertical == "center":
+            y += 0.35 * mark.size
+        left, top, right, bottom = frame.box
+        if mark.clipped and not (left <= x <= right and top <= y <= bottom):
+            return ""
+        name = "w" if mark.across_x else "u" if mark.across_y else "t"
+        look = self.named(f"font-size:{mark.size:g}px;fill:{mark.color}")
+        return f'<g class="{name}">{_text(mark.text, x, y, look, mark.horizontal)}</g>'
+
+    def arrow(self, mark: Arrow, clip: str, frame: _Frame) -> str:
+        """The head of an arrow, as long as letters are high."""
+        start, tip = (
+            np.array([float(frame.place(X, x)), float(frame.place(Y, y))]) for x, y in (mark.start, mark.tip)
+        )
+        way = tip - start
+        length = float(np.hypot(*way))
+        if not length > 0:
+            return ""
+        ahead = way / length
+        beside = np.array([-ahead[1], ahead[0]])
+        corners = np.array([tip, tip - 8 * ahead + 3.4 * beside, tip - 8 * ahead - 3.4 * beside])
+        look = self.named(f"fill:{mark.color}")
+        path = path_of(corners, closed=True)
+        return f'<g class="d" clip-path="url(#{clip})"><g class="m"><path class="{look}" d="{path}"/></g></g>'
+
+    def axis(self, frame: _Frame, which: int) -> str:
+        """Lines of the grid, marks, numbers and label of an axis."""
+        panel, ticks = frame.panel, frame.y if which else frame.x
+        left, top, right, bottom = frame.box
+        places = frame.place(which, ticks.places)
+        minor = frame.place(which, ticks.minor)
+        parts = []
+        if panel.grid_lines[which] and places.size:
+            ends = (left, right) if which else (bottom, top)
+            parts.append(f'<path class="gl" d="{_strokes(places, which, *ends)}"/>')
+        edge = left if which else bottom
+        outwards = -1 if which else 1
+        side = "en" if which else "mi"
+        if panel.colour_bar and which == Y:
+            edge, outwards, side = right, 1, "st"
+        beside = edge + outwards * _TO_NUMBERS
+        for values, long, name in ((places, _MARK, "tk"), (minor, _SMALL_MARK, "tn")):
+            if values.size:
+                parts.append(
+                    f'<path class="{name}" d="{_strokes(values, which, edge, edge + outwards * long)}"/>'
+                )
+        size = panel.tick_size[which]
+        look = "" if size == 9 else self.named(f"font-size:{size:g}px;fill:#333")
+        if frame.numbered[which]:
+            for place, word in zip(places, ticks.words, strict=True):
+                if which == X:
+                    parts.append(_text(word, place, bottom + _TO_NUMBERS + _ASCENT * size, look, size=size))
+                else:
+                    parts.append(_text(word, beside, place + 0.36 * size, look))
+        group = f'<g class="{"xy"[which]} {side}">{"".join(parts)}</g>'
+        if ticks.power and frame.numbered[which]:
+            if which == X:
+                group += _text(ticks.power, right, bottom + frame.number_room(X) + size, "pw", "right")
+            else:
+                group += _text(ticks.power, left, top - 3.0, "pw", "left")
+        label = panel.labels[which]
+        if not label:
+            return group
+        look = "lb" if panel.label_size == 9.5 else self.named(f"font-size:{panel.label_size:g}px;fill:#000")
+        if which == X:
+            foot = bottom + frame.number_room(X) + _TO_LABEL + _ASCENT * panel.label_size
+            return group + _text(label, (left + right) / 2, foot, look, "center")
+        # Labels of a column stand under each other: beside the widest numbers of all its panels.
+        outer = left - self.number_rooms[panel.place[1]] - _TO_LABEL
+        foot = outer - 0.24 * panel.label_size - (_lines(label) - 1) * panel.label_size * _LINE
+        return group + _turned(label, foot, (top + bottom) / 2, look, panel.label_size)
+
+    def second(self, frame: _Frame, which: int, place: int) -> str:
+        """A second axis: Hz above, dB on the right."""
+        ticks = frame.decibel if which else frame.hertz
+        assert ticks is not None
+        left, top, right, bottom = frame.box
+        values = 10 ** (ticks.places / 20) if which else ticks.places * 2 * np.pi
+        places = frame.place(which, values)
+        minor = frame.place(which, 10 ** (ticks.minor / 20) if which else ticks.minor * 2 * np.pi)
+        edge, outwards = (right, 1) if which else (top, -1)
+        parts = []
+        for ends, long, name in ((places, _MARK, "tk"), (minor, _SMALL_MARK, "tn")):
+            if ends.size:
+                parts.append(
+                    f'<path class="{name}" d="{_strokes(ends, which, edge, edge + outwards * long)}"/>'
+                )
+        for at, word in zip(places, ticks.words, strict=True):
+            if which == X:
+                parts.append(_text(word, at, top - _TO_NUMBERS, "se"))
+            else:
+                parts.append(_text(word, right + _TO_NUMBERS, at + 0.36 * _SECOND_SIZE, "se"))
+        widest = max((text_width(word, _SECOND_SIZE) for word in ticks.words), default=0.0)
+        if which == X:
+            foot = top - _TO_NUMBERS - _SECOND_SIZE - _TO_LABEL
+            label = _text("frequency [Hz]", (left + right) / 2, foot, "se", "center")
+        else:
+            beside = right + _TO_NUMBERS + widest + _TO_LABEL + _ASCENT * _SECOND_SIZE
+            label = _turned("[dB]", beside, (top + bottom) / 2, "se", _SECOND_SIZE)
+        line = np.array([[right, top], [right, bottom]] if which else [[left, top], [right, top]])
+        return (
+            f'<g class="a{place}"><path class="fr" d="{path_of(line)}"/>'
+            f'<g class="{("x mi", "y")[which]}">{"".join(parts)}</g>{label}</g>'
+        )
+
+    def title(self, frame: _Frame) -> str:
+        panel = frame.panel
+        if not panel.title:
+            return ""
+        look = "ti"
+        if panel.title_size != 10.5 or not panel.title_bold:
+            weight = "bold" if panel.title_bold else "normal"
+            look = self.named(f"font-weight:{weight};font-size:{panel.title_size:g}px;fill:#000")
+        raised = max(panel.title_raised, frame.above() + _TO_TITLE)
+        lines = (_lines(panel.title) - 1) * panel.title_size * _LINE
+        return _text(panel.title, frame.box[0], frame.box[1] - raised - lines, look, "left", panel.title_size)
+
+    def sample(self, mark: Mark) -> str:
+        """What stands before a word of the legend: a line, an area or a marker around the middle of a box
+        from (0, -4.5) to (18, 4.5)."""
+        if isinstance(mark, Area | Span):
+            return f'<path class="{self.named(looks.filling(mark.look))}" d="m0-3h18v6h-18z"/>'
+        assert isinstance(mark, Curve | Rule)
+        parts = ""
+        if looks.is_line(mark.look):
+            parts = f'<path class="{self.named(looks.stroke(mark.look))}" d="m0 0h18"/>'
+        if mark.look.get("marker"):
+            style, outline = looks.marker(mark.look)
+            parts += f'<path class="{self.named(style)}" transform="translate(9)" d="{outline}"/>'
+        return parts
+
+    def body(self, frames: list[_Frame]) -> tuple[str, list[dict[str, Any]]]:
+        """Groups of all axes, and what the script reads of each."""
+        rooms: dict[int, float] = {}
+        for frame in frames:
+            column = frame.panel.place[1]
+            rooms[column] = max(rooms.get(column, 0.0), frame.number_room(Y))
+        self.number_rooms = rooms
+        groups: list[str] = []
+        read: list[dict[str, Any]] = []
+        first_of: dict[int, int] = {}
+        for frame in frames:
+            place = len(read)
+            panel = frame.panel
+            groups.append(self.panel(place, frame))
+            shared = [first_of.setdefault(id(axis), place) for axis in (panel.x, panel.y)]
+            read.append(_read(self.picture, frame, shared))
+            for which, ticks in enumerate((frame.hertz, frame.decibel)):
+                if ticks is not None:
+                    groups.append(self.second(frame, which, len(read)))
+                    read.append(_read_second(frame, which, shared))
+        return self.definitions() + "".join(groups), read
+
+
+def _read(picture: Picture, frame: _Frame, shared: list[int]) -> dict[str, Any]:
+    """What the script reads of a panel: `box`, scales, names, and which others share its x or y."""
+    panel = frame.panel
+    return {
+        "box": [round(float(value), 2) for value in frame.box],
+        "near": panel.equal,  # a plane: values belong to points, not to an x
+        "x": _scale(panel.x),
+        "y": _scale(panel.y),
+        "second": False,
+        "names": [picture.name(panel, X), picture.name(panel, Y)],
+        "with": shared,
+    }
+
+
+def _read_second(frame: _Frame, which: int, shared: list[int]) -> dict[str, Any]:
+    """What the script reads of a second axis: the same box in other units."""
+    x, y = _scale(frame.panel.x), _scale(frame.panel.y)
+    names = ["", ""]
+    if which == X:
+        x = [float(f"{end / (2 * np.pi):.7g}") for end in x[:2]] + x[2:]
+        names[X] = "frequency [Hz]"
+    else:
+        y = [float(f"{20 * np.log10(end):.7g}") for end in y[:2]] + ["lin"]
+        names[Y] = "[dB]"
+    box = [round(float(value), 2) for value in frame.box]
+    return {"box": box, "near": False, "x": x, "y": y, "second": True, "names": names, "with": shared}
+
+
+def _scale(axis: Axis) -> list[Any]:
+    """Ends and kind of a scale."""
+    return [*(float(f"{end:.7g}") for end in axis.limits()), axis.kind]
+
+
+def _strokes(places: Real, which: int, first: float, last: float) -> str:
+    """Straight strokes across an axis at places along it, there and back in turn."""
+    ends = np.array([first, last])
+    path = []
+    at = np.zeros(2, dtype=np.int64)
+    for number, place in enumerate(places):
+        begin, end = ends[::-1] if number % 2 else ends
+        corners = np.array([[begin, place], [end, place]] if which else [[place, begin], [place, end]])
+        start, stop = _hundredths(corners)
+        step = " ".join(map(_short, (start - at).tolist())).replace(" -", "-")
+        path.append(f"m{step}{'h' if which else 'v'}{_short(int((stop - start)[1 - which]))}")
+        at = stop
+    return "".join(path)
+
+
+def _text(words: str, x: float, y: float, look: str, side: str = "left", size: float = 9.0) -> str:
+    """Words at a place, several lines of them below each other."""
+    end = {"center": " mi", "right": " en"}.get(side, "")
+    name = f' class="{(look + end).strip()}"' if look or end else ""
+    place = f'x="{_tenth(x)}" y="{_tenth(y)}"'
+    first, *others = words.split("\n")
+    if not others:
+        return f"<text{name} {place}>{escape(first)}</text>"
+    spans = "".join(
+        f'<tspan x="{_tenth(x)}" dy="{size * _LINE:.1f}">{escape(line)}</tspan>' for line in others
+    )
+    return f"<text{name} {place}>{escape(first)}{spans}</text>"
+
+
+def _tenth(length: float) -> str:
+    """A length to a tenth."""
+    return f"{length:.1f}".removesuffix(".0")
+
+
+def _turned(words: str, x: float, y: float, look: str, size: float) -> str:
+    """Words that read upwards, several lines of them beside each other; x: foot of the first line."""
+    lines = []
+    for k, line in enumerate(words.split("\n")):
+        foot = x + k * size * _LINE
+        lines.append(
+            f'<text class="{look} mi" transform="translate({foot:.1f} {y:.1f})rotate(-90)">'
+            f"{escape(line)}</text>"
+        )
+    return "".join(lines)
+
+
+def _cuts(frames: list[_Frame]) -> list[float]:
+    """Where columns of panels may be parted; a colour bar stays with what is left of it."""
+    columns = sorted(
+        (0.0 if frame.panel.colour_bar else frame.reach()[0], frame.reach()[1]) for frame in frames
+    )
+    found = []
+    reach = columns[0][1] if columns else 0.0
+    for low, high in columns[1:]:
+        if low > reach:
+            found.append(round((low + reach) / 2, 1))
+        reach = max(reach, high)
+    return found
+
+
+def _legend_rows(picture: Picture) -> list[list[str]]:
+    """Words of the legend in rows that fit into the width of the picture."""
+    rows: list[list[str]] = [[]]
+    left = _PAD
+    for label in picture.legend():
+        width = _SAMPLE + _AFTER_SAMPLE + text_width(label, _LEGEND_SIZE) + _AFTER_ENTRY
+        if rows[-1] and left + width > picture.width_in * POINT:
+            rows.append([])
+            left = _PAD
+        rows[-1].append(label)
+        left += width
+    return rows if rows[0] else []
+
+
+def _legend_height(picture: Picture) -> float:
+    """Height of the legend with room above and below it [pt]."""
+    rows = len(_legend_rows(picture))
+    return _ROW * rows + 2 * _PAD if rows else 0.0
+
+
+def drawn(picture: Picture, label: str, number: int, classes: dict[str, str]) -> Drawn:
+    """A picture for a page. label: what is read aloud in its place; number: of the picture in the page;
+    classes: looks of the page by what they say, added to."""
+    writer = _Writer(picture, number, classes)
+    width = picture.width_in * POINT
+    height = picture.height_in * POINT - _legend_height(picture)
+    frames = _laid_out(picture, height)
+    body, read = writer.body(frames)
+    plot = {
+        "axes": read,
+        "cuts": _cuts(frames),
+        "height": round(height, 1),
+        "width": round(width, 1),
+        "legend": list(writer.entries),
+    }
+    samples = [(writer.sample(mark), words) for words, mark in writer.entries.items()]
+    return Drawn(picture, label, body, samples, plot)
+
+
+def svg_file(made: Drawn, classes: Mapping[str, str]) -> bytes:
+    """A picture of a page with its legend as a file of its own. Equal pictures give equal bytes."""
+    picture = made.picture
+    width = picture.width_in * POINT
+    height = picture.height_in * POINT
+    samples = {words: sample for sample, words in made.legend}
+    rows = _legend_rows(picture)
+    legend = []
+    for row, labels in enumerate(rows):
+        left, middle = _PAD, height - _PAD - _ROW * (len(rows) - row - 0.5)
+        for label in labels:
+            words = _text(label, _SAMPLE + _AFTER_SAMPLE, 0.36 * _LEGEND_SIZE, "")
+            legend.append(f'<g transform="translate({left:.1f} {middle:.1f})">{samples[label]}{words}</g>')
+            left += _SAMPLE + _AFTER_SAMPLE + text_width(label, _LEGEND_SIZE) + _AFTER_ENTRY
+    drawing = made.body + "".join(legend)
+    used = set(re.findall(r'class="(s\d+)', drawing))
+    style = COMMON_STYLE + style_of({look: name for look, name in classes.items() if name in used})
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}pt" height="{height:g}pt" '
+        f'viewBox="0 0 {width:g} {height:g}"><style>{style}</style>'
+        f'<path fill="#fff" d="m0 0h{width:g}v{height:g}h-{width:g}z"/>{drawing}</svg>\n'
+    ).encode()
+
+
+def alone(picture: Picture) -> bytes:
+    """A picture that stands in no page as a file of its own. Equal pictures give equal bytes."""
+    classes: dict[str, str] = {}
+    return svg_file(drawn(picture, "", 0, classes), classes)
+
+
+def style_of(classes: Mapping[str, str]) -> str:
+    """The style sheet of looks."""
+    return "".join(f".{name}{{{look}}}" for look, name in classes.items())
