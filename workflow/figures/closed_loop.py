@@ -55,8 +55,8 @@ def draw_closed_loop(
     model: Real | None = None,
     with_friction: Sequence[Real] = (),
     settled_s: float | None = None,
-    onto: Panel | None = None,
-) -> Picture | None:
+    onto: tuple[Picture, Panel] | None = None,
+) -> Picture:
     """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
     disturbance.
 
@@ -65,16 +65,17 @@ def draw_closed_loop(
     plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go, the
     step's panel as far as the longest. settled_s: the panels are cut where nothing moves any more, not before
     this time after the step; None: all is shown. The first run is drawn as a line, all of them as the band
-    between their extremes. onto: a panel of another picture in place of a new one, of
-    one row and column.
+    between their extremes. onto: a picture and the panel of it to draw on, in
+    place of a new picture; of one row and column.
     """
     both = (predicted,) if others is None else (predicted, others)
     dt_s = float(time_s[1] - time_s[0])
     friction_s = float(time_s[0]) + dt_s * (max((line.size for line in with_friction), default=1) - 1)
     onset, windows = _windows(time_s, reference, disturbance, labels, both, settled_s, friction_s)
-    picture = None
+    grid: Any
     if onto is not None:
-        grid: Any = np.array([[onto]])
+        picture = onto[0]
+        grid = np.array([[onto[1]]])
     else:
         picture, grid = new_picture(
             2.1 * len(labels) + 0.9, len(labels), len(windows), squeeze=False, sharex="col", sharey="row"
@@ -119,7 +120,7 @@ def draw_closed_loop(
     return picture
 
 
-def _draw_runs(panel: Panel, time_s: Real, runs: Real, machine: str, hold: Mapping[str, Any]) -> None:
+def _draw_runs(panel: Panel, time_s: Real, runs: Real, machine: str, hold: dict[str, Any]) -> None:
     """Runs (R, T) of a machine as a band with the first as a line, those of other plants as a band."""
     count = runs.shape[0]
     if not machine:
@@ -132,7 +133,8 @@ def _draw_runs(panel: Panel, time_s: Real, runs: Real, machine: str, hold: Mappi
             *envelope(time_s, runs), **style.ACHIEVED_BAND, label=f"{machine}: all {count} runs"
         )
     label = f"{machine}: first run" if count > 1 else machine
-    panel.plot(*outline(time_s, runs[0], hold=bool(hold)), **style.ACHIEVED_LINE, **hold, label=label)
+    look: dict[str, Any] = style.ACHIEVED_LINE | hold
+    panel.plot(*outline(time_s, runs[0], hold=bool(hold)), **look, label=label)
 
 
 class _Window(NamedTuple):

@@ -171,7 +171,7 @@ class Axis:
 
     def shares(self, values: Any) -> Real:
         """How far along the axis values lie: 0 at its beginning, 1 at its end."""
-        begin, end = self.even(self.limits())
+        begin, end = (float(value) for value in self.even(self.limits()))
         return np.asarray((self.even(values) - begin) / ((end - begin) or 1.0))
 
 

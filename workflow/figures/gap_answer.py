@@ -48,11 +48,11 @@ def draw_waterfall(found: Diagnosis) -> Picture:
     rough = found.case.model_error
     words, line = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS, gap_style.floor_of(rough)
     picture, (left, right) = new_picture(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
-    for at, (model, value) in enumerate(gaps.items()):
-        left.bars(at, value, 0.6, color=gap_style.MODELS[model]["color"])
+    for place, (model, value) in enumerate(gaps.items()):
+        left.bars(place, value, 0.6, color=gap_style.MODELS[model]["color"])
         digits = ".3g" if rough > 0 else ".3f" if value < 10 else ".1f"
         words_at = {"offset": (0.0, 3.0), "size": 9.5, "color": "#000", "horizontal": "center"}
-        left.words(format(value, digits), at, value, **words_at)
+        left.words(format(value, digits), place, value, **words_at)
     left.x.named = [(k, gap_style.WORDS[model].replace(" ", "\n")) for k, model in enumerate(gaps)]
     left.axhline(floor, **line, zorder=1)
     left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))

@@ -134,7 +134,7 @@ def figure_of(picture: Picture, ax: Any = None) -> Figure:
             )
             first: dict[int, Axes] = {}
             for row, column in np.ndindex(rows, columns):
-                panel = picture.grid[row, column]
+                panel: Any = picture.grid[row, column]
                 axes = figure.add_subplot(
                     grid[row, column], sharex=first.get(id(panel.x)), sharey=first.get(id(panel.y))
                 )
@@ -142,8 +142,8 @@ def figure_of(picture: Picture, ax: Any = None) -> Figure:
                 first.setdefault(id(panel.y), axes)
                 places[row, column] = axes
                 axes.set_visible(panel.visible)
-        for panel in picture.panels:
-            _draw_panel(picture, panel, places[panel.place])
+        for shown in picture.panels:
+            _draw_panel(picture, shown, places[shown.place])
         entries = picture.legend()
         if ax is not None:
             places[0, 0].legend()
@@ -198,7 +198,8 @@ def _draw_panel(picture: Picture, panel: Panel, axes: Axes) -> None:
         of_axis = axes.yaxis if which else axes.xaxis
         _number(of_axis, axis)
         of_axis.set_tick_params(labelsize=panel.tick_size[which])
-        of_axis.set_tick_params(**{"labelleft" if which else "labelbottom": picture.numbered(panel, which)})
+        numbers: dict[str, Any] = {"labelleft" if which else "labelbottom": picture.numbered(panel, which)}
+        of_axis.set_tick_params(**numbers)
     if panel.equal:
         axes.set_aspect("equal")
     if panel.title:

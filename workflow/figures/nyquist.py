@@ -115,7 +115,7 @@ def _closed_loop_grid(panel: Panel) -> None:
     left, right = panel.x.limits()
     low, high = panel.y.limits()
     look: dict[str, Any] = {"color": "#d3d3d3", "ls": ":", "lw": 1.5, "zorder": 0}
-    turn = np.linspace(*np.radians(_GRID_PHASES_DEG[[0, -1]]), 361)
+    turn = np.radians(np.linspace(_GRID_PHASES_DEG[0], _GRID_PHASES_DEG[-1], 361))
     gains = 10 ** (np.linspace(_GRID_GAINS_DB[0], _GRID_GAINS_DB[-1], 361) / 20)
     lines = [(f"{gain:g} dB", 10 ** (gain / 20) * np.exp(1j * turn), -1) for gain in _GRID_GAINS_DB]
     lines += [

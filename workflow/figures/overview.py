@@ -44,7 +44,7 @@ def draw_overview(run: RunView) -> Picture:
         machine=MACHINE["simulated"] if loop.machine == "simulated" else "",
         with_friction=loop.with_friction,
         settled_s=loop.longest_settling_s,
-        onto=step,
+        onto=(picture, step),
     )
     step.set_title("Checked in closed loop")
     return picture

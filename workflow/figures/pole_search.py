@@ -99,7 +99,7 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
 def fill_levels(panel: Panel, x: Real, y: Real, values: Real, levels: Real) -> None:
     """Areas between neighbouring levels (L,) of values (Y, X) over a grid x (X,), y (Y,), in the colours of
     their numbers."""
-    contours = contour_generator(x, y, values, fill_type="ChunkCombinedOffset")
+    contours: Any = contour_generator(x, y, values, fill_type="ChunkCombinedOffset")
     least = 1e-9 * (levels[-1] - levels[0])  # so that a value at the end of all levels is in one
     for number, (low, high) in enumerate(pairwise(levels)):
         (points,), (ends,) = contours.filled(low - least, high + least)

@@ -350,7 +350,8 @@ def _lines_of(points: Real, box: Real) -> Iterator[Real]:
     with np.errstate(invalid="ignore"):
         beyond = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
     # A step whose ends lie beyond the same side is not in the box.
-    drawn_steps = ~np.any(beyond[1:] & beyond[:-1], axis=1)
+    outside: Any = np.any(beyond[1:] & beyond[:-1], axis=1)
+    drawn_steps = ~outside
     finite = np.isfinite(points).all(axis=1)
     drawn_steps &= finite[1:] & finite[:-1]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], drawn_steps, [False]]).astype(int)))
@@ -395,7 +396,8 @@ def _four_a_pixel(points: Real) -> Real:
     firsts = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
     lasts = np.append(firsts[1:], x.size) - 1
     order = np.lexsort((y, pixel))  # sorted by pixel, then by value
-    return points[np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))]
+    kept = np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))
+    return np.asarray(points[kept])
 
 
 def _many(parts: list[Real], *, closed: bool = False) -> str:

@@ -75,7 +75,7 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
     """Powers of ten with marks between them; 1, 2, 5 or even steps over a short range."""
     first = int(np.floor(np.log10(low)))
     last = int(np.ceil(np.log10(high)))
-    decades = 10.0 ** np.arange(first, last + 1)
+    decades = np.asarray(10.0 ** np.arange(first, last + 1), dtype=np.float64)
     nine = (decades[:, None] * np.arange(1, 10)).ravel()
     if high / low < _FEW:
         if high / low < _EVEN:
@@ -86,7 +86,7 @@ def log_ticks(low: float, high: float, most: int) -> Ticks:
         minor = minor[~np.isclose(minor[:, None], places).any(axis=1)]
         return Ticks(places, [f"{value:g}" for value in places], minor)
     stride = max(1, -(-(last - first) // max(most, 1)))
-    places = _inside(10.0 ** np.arange(-(-first // stride) * stride, last + 1, stride), low, high)
+    places = _inside(decades[-first % stride :: stride], low, high)
     minor = np.setdiff1d(_inside(decades if stride > 1 else nine, low, high), places)
     return Ticks(places, [power_of_ten(value) for value in places], minor)
 
