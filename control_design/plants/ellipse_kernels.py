@@ -2,9 +2,10 @@
 
 An ellipse has half axes a >= b >= 0, stands at the origin and has its axes parallel to the coordinate axes;
 callers (`control_design.plants.ellipses`) turn and shift points so that this holds. The nearest and the
-farthest member seen from a point both come to the root of one secular equation (`_secular_root`). `bisected`
+farthest member seen from a point both come to the root of one secular equation (`_secular_root`). `_bisected`
 finds the largest gain of a linear fractional map over an ellipse with them. The functions ending in `of_each`
-are ufuncs: they take arrays (F,) that broadcast. A module of its own, because numba takes a second to import
+take contiguous arrays (F,) of one length. They are no ufuncs of numba, which are linked anew in every process
+(0.05 s each). A module of its own, because numba takes a second to import
 and most who name an ellipse compute with none.
 """
 
@@ -15,10 +16,7 @@ from typing import Any
 import numba
 import numpy as np
 
-from ident.data.arrays import INSIDE
-
-# numba leaves this decorator untyped.
-_elementwise: Any = numba.vectorize
+from ident.data.arrays import COMPILED, INSIDE, ComplexArray, RealArray
 
 # Newton steps of the secular equation, and halvings of the bisection. Newton converges quadratically from a
 # bound within a factor of two (5 to 8 steps); 60 halvings of a positive interval reach double precision.
@@ -118,35 +116,44 @@ def _farthest(point: complex, semi_major: float, semi_minor: float) -> Any:
     return max(distance, vertex_distance) * scale
 
 
-@_elementwise(cache=True)
-def root_of_each(p: float, q: float, c: float, d: float) -> Any:
-    """Root t >= 0 of (p/(c + t))^2 + (q/(d + t))^2 = 1, element by element; see `_secular_root`.
+@numba.njit(**COMPILED)
+def root_of_each(p: RealArray, q: RealArray, c: RealArray, d: RealArray) -> Any:
+    """Root t >= 0 (F,) of (p/(c + t))^2 + (q/(d + t))^2 = 1; see `_secular_root`.
 
-    (F,) arrays or numbers, which broadcast; nothing is checked.
+    Arrays (F,); nothing is checked.
     """
-    return _secular_root(p, q, c, d)
+    found = np.empty(p.size)
+    for k in range(p.size):
+        found[k] = _secular_root(p[k], q[k], c[k], d[k])
+    return found
 
 
-@_elementwise(cache=True)
-def nearest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
-    """Distance from each point to the nearest member of its ellipse; 0 inside.
+@numba.njit(**COMPILED)
+def nearest_of_each(point: ComplexArray, semi_major: RealArray, semi_minor: RealArray) -> Any:
+    """Distance (F,) from each point to the nearest member of its ellipse; 0 inside.
 
     point complex (F,), half axes real (F,), all of one unit; nothing is checked.
     """
-    return _nearest(point, semi_major, semi_minor)
+    found = np.empty(point.size)
+    for k in range(point.size):
+        found[k] = _nearest(point[k], semi_major[k], semi_minor[k])
+    return found
 
 
-@_elementwise(cache=True)
-def farthest_of_each(point: complex, semi_major: float, semi_minor: float) -> Any:
-    """Distance from each point to the farthest member of its ellipse.
+@numba.njit(**COMPILED)
+def farthest_of_each(point: ComplexArray, semi_major: RealArray, semi_minor: RealArray) -> Any:
+    """Distance (F,) from each point to the farthest member of its ellipse.
 
     point complex (F,), half axes real (F,), all of one unit; nothing is checked.
     """
-    return _farthest(point, semi_major, semi_minor)
+    found = np.empty(point.size)
+    for k in range(point.size):
+        found[k] = _farthest(point[k], semi_major[k], semi_minor[k])
+    return found
 
 
-@_elementwise(cache=True)
-def bisected(
+@numba.njit(**INSIDE)
+def _bisected(
     low: float,
     high: float,
     alpha: complex,
@@ -192,3 +199,29 @@ def bisected(
         if high - low <= accuracy * high:
             break
     return high
+
+
+@numba.njit(**COMPILED)
+def bisected_of_each(
+    low: RealArray,
+    high: RealArray,
+    alpha: ComplexArray,
+    beta: ComplexArray,
+    k: ComplexArray,
+    centre: ComplexArray,
+    direction: ComplexArray,
+    semi_major: RealArray,
+    semi_minor: RealArray,
+    accuracy: float,
+) -> Any:
+    """Upper bound (F,) of |alpha G + beta|/|1 + k G| over each ellipse; see `_bisected`.
+
+    Arrays (F,); nothing is checked.
+    """
+    found = np.empty(low.size)
+    for f in range(low.size):
+        found[f] = _bisected(
+            low[f], high[f], alpha[f], beta[f], k[f],
+            centre[f], direction[f], semi_major[f], semi_minor[f], accuracy,
+        )  # fmt: skip
+    return found

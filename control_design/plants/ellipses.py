@@ -246,14 +246,22 @@ class Ellipses:
         return farthest_distance(origin_seen_from_ellipse, self.semi_major, self.semi_minor)
 
 
-def _compiled() -> Any:
-    """Module of the compiled functions. It is imported where one is called, because numba takes a second.
+def _of_each(name: str, *arrays: npt.ArrayLike, after: tuple[float, ...] = ()) -> Real:
+    """What a function of `ellipse_kernels` gives for arrays that broadcast; after: its arguments that are none.
 
-    ImportError where numba is not there.
+    The module is imported where one is called, because numba takes a second. Real arrays of any kind are taken
+    as doubles, complex ones as they are. ImportError where numba is not there; shapes that do not broadcast
+    are numpy's ValueError.
     """
     from control_design.plants import ellipse_kernels
 
-    return ellipse_kernels
+    together = np.broadcast_arrays(*arrays)
+    flat = [
+        np.ascontiguousarray(each, dtype=np.complex128 if np.iscomplexobj(each) else np.float64).ravel()
+        for each in together
+    ]
+    found = getattr(ellipse_kernels, name)(*flat, *after)
+    return np.asarray(found, dtype=np.float64).reshape(together[0].shape)
 
 
 def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
@@ -262,9 +270,7 @@ def secular_root(p: Real, q: Real, c: Real, d: Real) -> Real:
 
     Shapes broadcast. Nothing is checked.
     """
-    # Compiled loops divide first and choose then, so numpy would warn of quotients that are not used.
-    with np.errstate(all="ignore"):
-        return np.asarray(_compiled().root_of_each(p, q, c, d), dtype=np.float64)
+    return _of_each("root_of_each", p, q, c, d)
 
 
 def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
@@ -276,8 +282,7 @@ def nearest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real
 
     All of one unit. Not checked: a >= b >= 0, and that all are finite.
     """
-    with np.errstate(all="ignore"):
-        return np.asarray(_compiled().nearest_of_each(point, semi_major, semi_minor), dtype=np.float64)
+    return _of_each("nearest_of_each", np.asarray(point, dtype=np.complex128), semi_major, semi_minor)
 
 
 def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Real:
@@ -289,8 +294,7 @@ def farthest_distance(point: Complex, semi_major: Real, semi_minor: Real) -> Rea
 
     All of one unit. Not checked: a >= b >= 0.
     """
-    with np.errstate(all="ignore"):
-        return np.asarray(_compiled().farthest_of_each(point, semi_major, semi_minor), dtype=np.float64)
+    return _of_each("farthest_of_each", np.asarray(point, dtype=np.complex128), semi_major, semi_minor)
 
 
 def distance_to_minus_one(k: Complex, ellipses: Ellipses) -> Real:
@@ -379,7 +383,7 @@ def largest_ratio(
     # A little above, so that rounding of the two ends does not begin the bisection with an empty interval.
     high = np.maximum(upper, low) * (1 + 1e-12) + 1e-300
     low = np.minimum(low, high)
+    complex_ones = (np.asarray(each, dtype=np.complex128) for each in (alpha, beta, k))
     shape = (ellipses.centre, ellipses.direction, ellipses.semi_major, ellipses.semi_minor)
-    with np.errstate(all="ignore"):
-        high = _compiled().bisected(low, high, alpha, beta, k, *shape, accuracy)
+    high = _of_each("bisected_of_each", low, high, *complex_ones, *shape, after=(accuracy,))
     return np.asarray(np.where(blocked, np.inf, high), dtype=np.float64)
