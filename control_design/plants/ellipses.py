@@ -247,11 +247,12 @@ class Ellipses:
 
 
 def _of_each(name: str, *arrays: npt.ArrayLike, after: tuple[float, ...] = ()) -> Real:
-    """What a function of `ellipse_kernels` gives for arrays that broadcast; after: its arguments that are none.
+    """What a function of `ellipse_kernels` gives for arrays that broadcast, of their common shape. after: its
+    arguments that are no arrays.
 
-    The module is imported where one is called, because numba takes a second. Real arrays of any kind are taken
-    as doubles, complex ones as they are. ImportError where numba is not there; shapes that do not broadcast
-    are numpy's ValueError.
+    The module is imported where one is called, because numba takes a second. Real arrays of any kind are
+    taken as doubles, complex ones as they are. ImportError where numba is not there; shapes that do not
+    broadcast are numpy's ValueError.
     """
     from control_design.plants import ellipse_kernels
 

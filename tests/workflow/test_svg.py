@@ -1,7 +1,9 @@
 """The writer of SVG: places, paths, numbers, and words that are whole."""
 
+import ast
 import itertools
 import re
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import TextPath
 
+import workflow
 from workflow.figures import style, svg
 from workflow.figures.description import Y, new_picture
 from workflow.figures.ticks import linear_ticks, log_ticks
@@ -280,3 +283,16 @@ def test_bars_begin_where_they_are_said_to():
     found = np.array([[6 * part.min(), 6 * part.max()] for part in share])
     np.testing.assert_allclose(found, [[0, 3], [1, 5], [2, 4]], atol=0.01)
     assert panel.axis(Y) is panel.y
+
+
+def test_one_module_needs_matplotlib():
+    """Pages are drawn without it, and it takes half a second to load."""
+    needing = set()
+    for path in Path(workflow.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            if isinstance(node, ast.ImportFrom):
+                names = [node.module or ""]
+            if any(name.partition(".")[0] == "matplotlib" for name in names):
+                needing.add(path.name)
+    assert needing == {"matplotlib_figure.py"}

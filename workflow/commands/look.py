@@ -28,7 +28,7 @@ def look(
     found = look_at(log, time, time_unit, decimal)
     command = _next(found, options_typed(time_unit, decimal))
     if out is not None:
-        from workflow.report.rendering import render_page  # loads matplotlib: a second
+        from workflow.report.rendering import render_page  # loads all that draws: a second
 
         storage.write_text(
             out,
