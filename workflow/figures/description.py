@@ -16,9 +16,12 @@ import numpy.typing as npt
 
 Real = npt.NDArray[np.float64]
 Look = Mapping[str, Any]
-X, Y = 0, 1
+# The two axes of a panel, as places in pairs.
+X = 0
+Y = 1
 
-WIDTH_IN = 10.0  # a page is 1000 pixels wide: 100 pixels an inch
+# Width of a picture: a page is 1000 pixels wide, and looks right at 100 pixels an inch.
+WIDTH_IN = 10.0
 # Room between data and the ends of an axis that nobody stated, share of the data's range: as of matplotlib.
 _MARGIN = 0.05
 # Where a log axis without any positive value begins and ends; without data there is nothing to choose by.
@@ -26,7 +29,9 @@ _EMPTY_LOG = (0.1, 10.0)
 # Points of a circle: its corners are then less than a hundredth of its radius away from it.
 _CIRCLE_POINTS = 73
 # Layers, as of matplotlib: areas, then lines, then words, each in the order in which they were drawn.
-AREA_LAYER, LINE_LAYER, WORD_LAYER = 1.0, 2.0, 3.0
+AREA_LAYER = 1.0
+LINE_LAYER = 2.0
+WORD_LAYER = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,7 +194,7 @@ class Panel:
         self.title_size = 10.5
         self.title_raised = 0.0  # pt, above words that stand over the panel
         self.labels = ["", ""]
-        self.label_size = 9.5
+        self.label_size = [9.5, 9.5]
         self.tick_size = [9.0, 9.0]
         self.grid_lines = [True, True]
         self.equal = False  # a unit is as long in x as in y

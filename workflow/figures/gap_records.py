@@ -12,7 +12,7 @@ from diagnosis.machine.case import Case
 from plant.modal import linear_arm
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
-from workflow.figures.description import Picture, new_picture, small_multiples
+from workflow.figures.description import Picture, Y, new_picture, small_multiples
 
 _SEGMENT = 512  # samples: 257 lines, more than a panel shows; short records still hold several
 _MODES = 3  # marks of higher ones stand too close
@@ -85,7 +85,7 @@ def draw_residual_traces(found: Diagnosis) -> Picture:
             panel.set_title(title, size=9, bold=False)
         unit = "[% of motion]" if case.model_error > 0 else "over noise [1]"
         row[0].set(ylabel=f"residual\n{unit}")
-        row[0].label_size = 8.5
+        row[0].label_size[Y] = 8.5
     for panel in grid[-1]:
         panel.set(xlabel="time [s]")
     return picture

@@ -10,8 +10,11 @@ from workflow.figures.description import Area, Curve, Look, Mark, Rule, Span
 
 # Dashes and gaps in widths of the line, as of matplotlib.
 _DASHES: dict[str, tuple[float, ...]] = {"--": (3.7, 1.6), "-.": (6.4, 1.6, 1.0, 1.6), ":": (1.0, 1.65)}
-_LINE_WIDTH = 1.5  # pt, where a look says nothing
-_MARKER_SIZE = 6.0  # pt, where a look says nothing
+# Width of a line whose look says nothing of it [pt], as of matplotlib.
+_LINE_WIDTH = 1.5
+# Size of a marker whose look says nothing of it [pt], as of matplotlib.
+_MARKER_SIZE = 6.0
+# Colours that drawings call by name.
 _NAMED_COLOURS = {"white": "#fff", "black": "#000"}
 # Ratio of the inner to the outer radius of a five-pointed star.
 _STAR = 0.381966

@@ -43,9 +43,12 @@ from workflow.figures.description import (
 from workflow.figures.style import decibels
 from workflow.figures.ticks import number, power_of_ten
 
-_PNG_DPI = 160  # 1600 pixels at the width of a page: sharp on screens of high density
-# Entries of a legend stand in columns of equal width: so many inches a letter, and for sample and gap.
-_LETTER_IN, _SAMPLE_IN = 0.08, 0.75
+# 1600 pixels at the width of a page: sharp on screens of high density.
+_PNG_DPI = 160
+# Entries of a legend stand in columns of equal width. Inches that a letter of 9 pt takes at most, on average.
+_LETTER_IN = 0.08
+# Inches for the sample of an entry and the gaps beside it.
+_SAMPLE_IN = 0.75
 
 _RC: Any = {
     "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine
@@ -193,7 +196,7 @@ def _draw_panel(picture: Picture, panel: Panel, axes: Axes) -> None:
         _draw_mark(mark, axes)
     for which, axis in enumerate((panel.x, panel.y)):
         name = "xy"[which]
-        getattr(axes, f"set_{name}label")(drawable(panel.labels[which]), fontsize=panel.label_size)
+        getattr(axes, f"set_{name}label")(drawable(panel.labels[which]), fontsize=panel.label_size[which])
         axes.grid(visible=panel.grid_lines[which], axis=name)  # type: ignore[arg-type]
         of_axis = axes.yaxis if which else axes.xaxis
         _number(of_axis, axis)

@@ -14,11 +14,13 @@ from workflow.figures.ticks import linear_ticks
 from workflow.tasks.results import Intervals
 from workflow.text.formats import share
 
+# Damping ratios whose lines are drawn: from a light mode of metal to an almost aperiodic pair. Chosen.
 _DAMPINGS = (0.02, 0.1, 0.3, 0.6)
 # Of a pole's real part times the period: e^-7 is a thousandth, where a line meets the origin.
 _DECAYED = 7.0
 # Where along its visible part a line bears its value: lines of small damping lie close together.
 _NAMED_AT = {"0.02": 0.85, "0.1": 0.7, "0.3": 0.6}
+# The same of all other lines: in their middle.
 _ELSE_AT = 0.5
 _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
 

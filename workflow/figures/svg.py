@@ -37,18 +37,28 @@ from workflow.figures.description import (
 )
 from workflow.figures.ticks import DECIBEL_STEPS, Ticks, linear_ticks, log_ticks, ticks_of
 
-POINT = 72  # to the inch
-# Room around the words of every panel [pt]: 0.06 inches, as of matplotlib's constrained layout in this house.
+# Units of an SVG to the inch: points, so that sizes of letters are those of print.
+POINT = 72
+# Room around the words of every panel [pt]: 0.06 inches, as in the figures of matplotlib.
 _PAD = 4.32
-# From the edge of a panel to the numbers: a mark of 3.5 pt and as much room [pt].
+# From the edge of a panel to its numbers [pt]: a mark of 3.5 pt and as much room, as of matplotlib.
 _TO_NUMBERS = 7.0
-_MARK, _SMALL_MARK = 3.5, 2.0  # lengths of the marks of an axis [pt]
-_TO_LABEL = 4.0  # from the numbers to the label of an axis [pt]
-_TO_TITLE = 6.0  # from the panel, or what stands above it, to its title [pt]
-_SECOND_SIZE = 8.5  # letters of second axes [pt]
-_LINE = 1.2  # from line to line, in sizes of the letters
-_ASCENT = 0.76  # from the foot of a letter to its head, in sizes of the letters
-_POWER_ROOM = 12.0  # above a panel, for the power of ten of its numbers [pt]
+# Length of a mark that bears a number [pt], as of matplotlib.
+_MARK = 3.5
+# Length of a mark between numbers [pt], as of matplotlib.
+_SMALL_MARK = 2.0
+# From the numbers to the label of an axis [pt], as of matplotlib.
+_TO_LABEL = 4.0
+# From the panel, or what stands above it, to its title [pt], as of matplotlib.
+_TO_TITLE = 6.0
+# Letters of second axes [pt]: a little smaller than those of the first, which are read more often. Chosen.
+_SECOND_SIZE = 8.5
+# From line to line, in sizes of the letters: the usual leading.
+_LINE = 1.2
+# From the foot of a letter to its head, in sizes of the letters: that of DejaVu Sans.
+_ASCENT = 0.76
+# Above a panel, for the power of ten of its numbers [pt]: a line of numbers and the room of a mark.
+_POWER_ROOM = 12.0
 # Letters of DejaVu Sans from the blank to the tilde: widths in hundredths of the size. Verdana is as wide.
 _WIDTHS = (
     32, 40, 46, 84, 64, 95, 78, 27, 39, 39, 50, 84, 32, 36, 32, 34, 64, 64, 64, 64, 64, 64, 64, 64,
@@ -56,9 +66,12 @@ _WIDTHS = (
     60, 79, 69, 63, 61, 73, 68, 99, 69, 61, 69, 39, 34, 39, 84, 50, 50, 61, 63, 55, 63, 62, 35, 63,
     63, 28, 28, 58, 28, 97, 63, 61, 63, 63, 41, 52, 39, 63, 59, 82, 59, 59, 52, 64, 34, 64, 84,
 )  # fmt: skip
-_OTHER_WIDTH = 0.65  # of letters beyond these, in sizes: as of most in the font
-_SUPERSCRIPT_WIDTH = 0.42  # of raised digits, in sizes
-_BOLD = 1.105  # how much wider bold letters are, the mean over these letters
+# Width of letters beyond these, in sizes: as of most in the font.
+_OTHER_WIDTH = 0.65
+# Width of raised digits, in sizes: that of DejaVu Sans.
+_SUPERSCRIPT_WIDTH = 0.42
+# How much wider bold letters are: the mean over the letters above, from the same font.
+_BOLD = 1.105
 # Points of a line that are nearer than this to the line without them are left out [pt]: a seventh of a pixel
 # where a page is 1000 pixels wide, and less than a thousandth of a panel's height. Twice as much saves a
 # tenth of a page.
@@ -66,7 +79,8 @@ _UNSEEN = 0.1
 # The same on a logarithmic axis, where a tenth of a point may be 1 % of the value that the script reads
 # there.
 _UNSEEN_LOG = 0.04
-# How often every second point of a line is looked at; each time leaves at least half of them.
+# How often every second point of a line is looked at; each time leaves at least half of them. Ten leave a
+# thousandth of a straight line, and later ones find little.
 _THINNINGS = 10
 # Lines that run beside a panel at less than this distance [pt] are drawn: half of the widest line of the
 # house.
@@ -74,11 +88,21 @@ _EDGE = 3.0
 # Areas that are smaller than this [pt] in both ways are left out: the line of the house in whose middle they
 # lie hides them.
 _SPECK = 0.4
-_PIXEL = 0.72  # of a page that is 1000 pixels wide [pt]
+# A pixel of a page that is 1000 pixels wide [pt].
+_PIXEL = 0.72
+# Panels are laid out by the numbers that the layout before gave: two are usual, four end what would go on.
+_MOST_LAYOUTS = 4
 # Farther outside of the picture than this [pt] a place is drawn at this distance.
 _FAR = 2e4
-# A legend of a file: height of a row, width of a sample, room after it and after an entry [pt].
-_ROW, _SAMPLE, _AFTER_SAMPLE, _AFTER_ENTRY = 13.0, 18.0, 7.0, 16.0
+# Height of a row in the legend of a file [pt]: letters of 9 pt with room to tell rows apart. Chosen.
+_ROW = 13.0
+# Width of a sample in a legend [pt]: two periods of the longest dashes of the house.
+_SAMPLE = 18.0
+# Room between a sample and its words [pt], as of matplotlib.
+_AFTER_SAMPLE = 7.0
+# Room between an entry of a legend and the next [pt]: clearly more than between words. Chosen.
+_AFTER_ENTRY = 16.0
+# Letters of a legend [pt]: as of the numbers.
 _LEGEND_SIZE = 9.0
 # What all pictures have in common; looks of data are added to it.
 COMMON_STYLE = (
@@ -155,6 +179,11 @@ class _Frame:
     def height(self) -> float:
         return float(self.box[3] - self.box[1])
 
+    @property
+    def numbers(self) -> tuple[list[str], list[str]]:
+        """Words of the numbers of both axes."""
+        return self.x.words, self.y.words
+
     def place(self, which: int, values: Any) -> Real:
         """Where values of an axis lie [pt]."""
         shares = self.panel.axis(which).shares(values)
@@ -183,7 +212,7 @@ class _Frame:
     def label_room(self) -> float:
         """Room for the label of the y axis, beside the numbers [pt]."""
         label = self.panel.labels[Y]
-        return _TO_LABEL + _lines(label) * self.panel.label_size * _LINE if label else 0.0
+        return _TO_LABEL + _lines(label) * self.panel.label_size[Y] * _LINE if label else 0.0
 
     def above(self) -> float:
         """Height of what stands over the panel, but for its title [pt]."""
@@ -200,7 +229,7 @@ class _Frame:
             left, right = 0.0, left
         bottom = self.number_room(X)
         if panel.labels[X]:
-            bottom += _TO_LABEL + panel.label_size * _LINE
+            bottom += _TO_LABEL + panel.label_size[X] * _LINE
         top = self.above()
         if panel.title:
             raised = max(panel.title_raised, top + _TO_TITLE)
@@ -246,28 +275,35 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
     """Panels in what their widest words leave of so high a picture."""
     width = picture.width_in * POINT
     rows, columns = picture.grid.shape
+    before = np.zeros((2, max(rows, columns)))
+    after = np.zeros((2, max(rows, columns)))
+    for panel in picture.panels:
+        row, column = panel.place
+        before[X, column], before[Y, row] = 55.0, 25.0
+        after[X, column], after[Y, row] = 12.0, 25.0
     frames: list[_Frame] = []
-    # First as if all panels were alike, then by the words that this gave.
-    for room in (np.array([55.0, 25.0, 12.0, 25.0]), None):
-        before, after = np.full((2, max(rows, columns)), _PAD), np.full((2, max(rows, columns)), _PAD)
-        labels = np.zeros(columns)  # under each other, beside the widest numbers of the column
-        for panel in picture.panels:
-            row, column = panel.place
-            if room is not None:
-                around = room
-            else:
-                frame = next(frame for frame in frames if frame.panel is panel)
-                around = frame.around()
-                labels[column] = max(labels[column], frame.label_room())
-            before[X, column] = max(before[X, column], around[0] + _PAD)
-            after[X, column] = max(after[X, column], around[2] + _PAD)
-            before[Y, row] = max(before[Y, row], around[1] + _PAD)
-            after[Y, row] = max(after[Y, row], around[3] + _PAD)
-        x = _edges(before[X, :columns] + labels, after[X, :columns], picture.width_ratios, width)
-        y = _edges(before[Y, :rows], after[Y, :rows], picture.height_ratios, height)
+    for _ in range(_MOST_LAYOUTS):
+        x = _edges(before[X, :columns] + _PAD, after[X, :columns] + _PAD, picture.width_ratios, width)
+        y = _edges(before[Y, :rows] + _PAD, after[Y, :rows] + _PAD, picture.height_ratios, height)
+        known = [frame.numbers for frame in frames]
         frames = [
             _framed(picture, panel, x[:, panel.place[1]], y[:, panel.place[0]]) for panel in picture.panels
         ]
+        # Measured again only where a panel has other numbers at its new size.
+        if [frame.numbers for frame in frames] == known:
+            break
+        before[:] = 0.0
+        after[:] = 0.0
+        labels = np.zeros(columns)  # under each other, beside the widest numbers of the column
+        for frame in frames:
+            row, column = frame.panel.place
+            left, top, right, bottom = frame.around()
+            before[X, column] = max(before[X, column], left)
+            before[Y, row] = max(before[Y, row], top)
+            after[X, column] = max(after[X, column], right)
+            after[Y, row] = max(after[Y, row], bottom)
+            labels[column] = max(labels[column], frame.label_room())
+        before[X, :columns] += labels
     return frames
 
 
@@ -549,9 +585,14 @@ class _Writer:
         left, top, right, bottom = frame.box
         if mark.clipped and not (left <= x <= right and top <= y <= bottom):
             return ""
+        side = mark.horizontal
+        if mark.clipped and side == "left" and x + text_width(mark.text, mark.size) > right:
+            # Where there is no room to the right of a line, to its left.
+            x -= 2 * mark.offset[0]
+            side = "right"
         name = "w" if mark.across_x else "u" if mark.across_y else "t"
         look = self.named(f"font-size:{mark.size:g}px;fill:{mark.color}")
-        return f'<g class="{name}">{_text(mark.text, x, y, look, mark.horizontal)}</g>'
+        return f'<g class="{name}">{_text(mark.text, x, y, look, side)}</g>'
 
     def arrow(self, mark: Arrow, clip: str, frame: _Frame) -> str:
         """The head of an arrow, as long as letters are high."""
@@ -605,16 +646,17 @@ class _Writer:
             else:
                 group += _text(ticks.power, left, top - 3.0, "pw", "left")
         label = panel.labels[which]
+        letters = panel.label_size[which]
         if not label:
             return group
-        look = "lb" if panel.label_size == 9.5 else self.named(f"font-size:{panel.label_size:g}px;fill:#000")
+        look = "lb" if letters == 9.5 else self.named(f"font-size:{letters:g}px;fill:#000")
         if which == X:
-            foot = bottom + frame.number_room(X) + _TO_LABEL + _ASCENT * panel.label_size
+            foot = bottom + frame.number_room(X) + _TO_LABEL + _ASCENT * letters
             return group + _text(label, (left + right) / 2, foot, look, "center")
         # Labels of a column stand under each other: beside the widest numbers of all its panels.
         outer = left - self.number_rooms[panel.place[1]] - _TO_LABEL
-        foot = outer - 0.24 * panel.label_size - (_lines(label) - 1) * panel.label_size * _LINE
-        return group + _turned(label, foot, (top + bottom) / 2, look, panel.label_size)
+        foot = outer - 0.24 * letters - (_lines(label) - 1) * letters * _LINE
+        return group + _turned(label, foot, (top + bottom) / 2, look, letters)
 
     def second(self, frame: _Frame, which: int, place: int) -> str:
         """A second axis: Hz above, dB on the right."""

@@ -13,6 +13,7 @@ Real = npt.NDArray[np.float64]
 
 # Steps between numbers that are read easily, times a power of ten: as of matplotlib.
 _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
+# The same of numbers that are whole: 2.5 is none.
 _WHOLE_STEPS = (1.0, 2.0, 5.0, 10.0)
 # Steps of the decibel axis: 3 or 5 dB would not meet the 20 dB of a decade.
 DECIBEL_STEPS = (1.0, 2.0, 4.0, 10.0)
@@ -21,8 +22,11 @@ DECIBEL_STEPS = (1.0, 2.0, 4.0, 10.0)
 _FEW = 60.0
 # Below a factor of 5 even 1, 2, 5 gives fewer than three numbers: numbers stand evenly in the value then.
 _EVEN = 5.0
+# One number alone tells no scale.
+_FEWEST = 2
 # Larger or smaller numbers than 10 to this power are written with their power of ten beside the axis.
 _POWER = 4
+# Digits of powers of ten.
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
@@ -62,6 +66,10 @@ def linear_ticks(low: float, high: float, most: int, steps: tuple[float, ...] = 
     """Numbers at even steps."""
     step = _step(low, high, most, steps)
     places = _multiples(low, high, step)
+    while places.size < _FEWEST and high > low:
+        most += 1
+        step = _step(low, high, most, steps)
+        places = _multiples(low, high, step)
     largest = float(np.max(np.abs(places), initial=0.0))
     exponent = int(np.floor(np.log10(largest) + 1e-9)) if largest > 0 else 0
     if -_POWER < exponent < _POWER:
