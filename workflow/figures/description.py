@@ -16,8 +16,9 @@ import numpy.typing as npt
 
 Real = npt.NDArray[np.float64]
 Look = Mapping[str, Any]
-# The two axes of a panel, as places in pairs.
+# The x axis of a panel, as a place in pairs.
 X = 0
+# The y axis of a panel, as a place in pairs.
 Y = 1
 
 # Width of a picture: a page is 1000 pixels wide, and looks right at 100 pixels an inch.
@@ -30,7 +31,9 @@ _EMPTY_LOG = (0.1, 10.0)
 _CIRCLE_POINTS = 73
 # Layers, as of matplotlib: areas, then lines, then words, each in the order in which they were drawn.
 AREA_LAYER = 1.0
+# As of matplotlib, above areas.
 LINE_LAYER = 2.0
+# As of matplotlib, above everything.
 WORD_LAYER = 3.0
 
 
@@ -164,15 +167,15 @@ class Axis:
 
     def even(self, values: Any) -> Real:
         """Values as lengths in which the axis is even; on a log axis what is not positive lies far below."""
-        values = np.asarray(values, dtype=np.float64)
+        found: Real = np.asarray(values, dtype=np.float64)
         if self.kind == "lin":
-            return values
+            return found
         if self.kind == "log":
-            return np.asarray(np.log10(np.maximum(values, 1e-300)))
-        size = np.abs(values)
+            return np.asarray(np.log10(np.maximum(found, 1e-300)))
+        size = np.abs(found)
         # The linear part is as long as 10/9 of a decade, so that the slope has no jump where it ends.
         beyond = 10 / 9 + np.log10(np.maximum(size, self.kind) / self.kind)
-        return np.asarray(np.where(size <= self.kind, values / self.kind * 10 / 9, np.sign(values) * beyond))
+        return np.asarray(np.where(size <= self.kind, found / self.kind * 10 / 9, np.sign(found) * beyond))
 
     def shares(self, values: Any) -> Real:
         """How far along the axis values lie: 0 at its beginning, 1 at its end."""

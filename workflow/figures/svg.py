@@ -384,11 +384,11 @@ def _lines_of(points: Real, box: Real) -> Iterator[Real]:
     """Parts of a line (N, 2) that are seen in a box (left, top, right, bottom), between points that are no
     numbers."""
     with np.errstate(invalid="ignore"):
-        beyond = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
+        beyond: Any = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
     # A step whose ends lie beyond the same side is not in the box.
     outside: Any = np.any(beyond[1:] & beyond[:-1], axis=1)
     drawn_steps = ~outside
-    finite = np.isfinite(points).all(axis=1)
+    finite: Any = np.isfinite(points).all(axis=1)
     drawn_steps &= finite[1:] & finite[:-1]
     edges = np.flatnonzero(np.diff(np.concatenate([[False], drawn_steps, [False]]).astype(int)))
     for first, last in edges.reshape(-1, 2):
