@@ -131,7 +131,7 @@ def test_no_picture_that_an_interrupt_went_under_in_is_kept(monkeypatch):
     monkeypatch.setattr(interrupts, "_came", signal.SIGTERM)
     picture, _ = new_picture(1.0)
     with pytest.raises(KeyboardInterrupt):
-        saved(picture, "png")
+        saved(picture, ("png",))
 
 
 def test_a_time_limit_ends_a_run_like_an_interrupt(tmp_path, flexlink, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Iterable
 from functools import cache
 from typing import Any
 
@@ -155,15 +156,21 @@ def figure_of(picture: Picture, ax: Any = None) -> Figure:
     return figure
 
 
-def saved(picture: Picture, kind: str) -> bytes:
-    """A picture as a file, pdf or png. Equal pictures give equal bytes."""
-    buffer = io.BytesIO()
-    dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
+def saved(picture: Picture, kinds: Iterable[str]) -> dict[str, bytes]:
+    """A picture as files by their kind, pdf or png. Equal pictures give equal bytes."""
     figure = figure_of(picture)
+    files = {}
     with house_style():
-        figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
+        # Laid out once for all kinds: it takes as long as drawing.
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")
+        for kind in kinds:
+            buffer = io.BytesIO()
+            dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
+            figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
+            files[kind] = buffer.getvalue()
     interrupts.check()  # compiled parts of matplotlib make anything of one
-    return buffer.getvalue()
+    return files
 
 
 def _legend(figure: Figure) -> None:
@@ -217,6 +224,7 @@ def _draw_panel(picture: Picture, panel: Panel, axes: Axes) -> None:
         _decibel_axis(axes)
     if panel.colour_bar:
         axes.minorticks_off()
+        axes.yaxis.tick_right()
 
 
 def _draw_mark(mark: Mark, axes: Axes) -> None:

@@ -57,7 +57,8 @@ def _write(run: RunDirectory, page: RenderedPage, also: Iterable[str]) -> Path:
         from workflow.figures.matplotlib_figure import saved  # half a second to load
 
         for name, made in page.pictures.items():
-            files |= {run.figures_path / f"{name}.{kind}": saved(made.picture, kind) for kind in also}
+            further = saved(made.picture, also)
+            files |= {run.figures_path / f"{name}.{kind}": content for kind, content in further.items()}
     storage.write_together({**files, run.report_path: page.html.encode()})
     for stale in sorted(run.figures_path.iterdir()):
         if stale.suffix in (".svg", ".png", ".pdf") and stale not in files:
