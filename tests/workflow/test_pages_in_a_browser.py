@@ -178,7 +178,7 @@ def test_report_of_a_run(browser, faults_seen, tmp_path):
     run = example.build_run(tmp_path / "run", settings)
     path = write_report(RunResults(run), settings)
     assert faults_seen(path) == []
-    assert path.stat().st_size < 1_000_000
+    assert path.stat().st_size < 500_000
     # Two channels of one made-up model say the same of themselves.
     settings = example.config(channels=1)
     path = write_report(RunResults(example.build_run(tmp_path / "one", settings)), settings)

@@ -87,7 +87,7 @@ def test_page_and_pictures_are_written(drawn):
     text = drawn.report_path.read_text(encoding="utf-8")
     page = Page(text)
     assert sum(tag == "figure" for tag, _ in page.tags) == len(names)
-    assert len(text) < 1_000_000
+    assert len(text) < 500_000
 
 
 def is_one_file(text: str) -> None:

@@ -78,7 +78,7 @@ _BOLD = 1.105
 _UNSEEN = 0.1
 # The same on a logarithmic axis, where a tenth of a point may be 1 % of the value that the script reads
 # there.
-_UNSEEN_LOG = 0.04
+_UNSEEN_LOG = 0.05
 # How often every second point of a line is looked at; each time leaves at least half of them. Ten leave a
 # thousandth of a straight line, and later ones find little.
 _THINNINGS = 10
