@@ -444,9 +444,11 @@ def with_equivalent_command(records: Sequence[Record], timing: CommandTiming) ->
     changed = []
     for index, record in enumerate(records):
         if timing.rows_per_command > 1:
-            # Records that the timing has not seen, as of a validation, begin at their first row, also where
-            # their command changes at another one: their phase is not looked for.
-            start = timing.first_row[index] if index < len(timing.first_row) else 0
+            if index < len(timing.first_row):
+                start = timing.first_row[index]
+            else:
+                # A record that the timing has not seen, as of a validation, has a phase of its own.
+                start = _phase(_changes(record), timing.rows_per_command)
             record = _every(record, start, timing.rows_per_command)
         if timing.taken != HELD:
             record = replace(record, input=filtered(record.input, timing.taken))

@@ -215,9 +215,9 @@ def _searched(
             end = selection.with_real(selection.run(end_in_motion))
             structure = search.data.structure
 
-    # A single record of which the first stretch was searched is not told from a whole one here: its poles
-    # and coefficients are then those of the stretch.
-    if len(part) < len(records) or in_mid_record:
+    # A part may be one record as well, of which the first stretch was searched.
+    n_searched = sum(record.n_samples for record in part)
+    if n_searched < sum(record.n_samples for record in records):
         search_on_all = PoleSearch(prepare_outputs(records, structure), options)
         end = search_on_all.descend(end.poles, "final polish")
         search_on_all.minima[:0] = search.minima

@@ -225,9 +225,13 @@ class Simulator:
     ) -> Real:
         """Quantities (T, Y) of these names of one record, as sensors read them but without noise.
 
-        names : of `plant.rig.Output`; another one is a KeyError. Otherwise like `run`, and faster: only what
-        is asked for is made.
+        names : of `plant.rig.Output`. Otherwise like `run`, and faster: only what is asked for is made.
+
+        Raises ValueError for another name, and as `run`.
         """
+        unknown = [name for name in names if name not in _OBSERVED]
+        if unknown:
+            raise ValueError(f"no sensor is called {unknown[0]!r}; expected names out of {list(_OBSERVED)}")
         voltage = _signal("voltage_V", voltage_V, None)
         columns = [_OBSERVED[name] for name in names]
         observed = self._observed(columns, voltage, hub_torque_Nm, None, start)

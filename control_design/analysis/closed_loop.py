@@ -873,8 +873,12 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
     Raises
     ------
     ValueError
-        The reference is not a step: it stays at zero, or has more than one level after the change. An output
-        with nan is not refused and its numbers mean nothing: nan lies outside of no band.
+        The reference is not a step: it stays at zero, or has more than one level after the change.
+
+    Notes
+    -----
+    An output of nan, as of a simulation that ran away, is inside of no band: it does not settle, and
+    overshoot, undershoot and steady error are nan.
     """
     reference = trajectory.reference
     measured = trajectory.measured
@@ -898,8 +902,8 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
     if rise_begins is not None and rise_ends is not None:
         rise_time_s = rise_ends - rise_begins
 
-    # Settled one sample after the last one outside the band.
-    outside = np.flatnonzero(np.abs(progress - 1.0) > settling_band)
+    # Settled one sample after the last one outside the band. Written with "not", so that nan is outside.
+    outside = np.flatnonzero(~(np.abs(progress - 1.0) <= settling_band))
     settling_time_s: float | None
     if outside.size == 0:
         settling_time_s = 0.0
@@ -914,8 +918,8 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
     return StepMetrics(
         step_size=size,
         rise_time_s=rise_time_s,
-        overshoot_percent=100.0 * max(0.0, excess),
-        undershoot_percent=100.0 * max(0.0, -lowest),
+        overshoot_percent=100.0 * float(np.maximum(0.0, excess)),
+        undershoot_percent=100.0 * float(np.maximum(0.0, -lowest)),
         settling_time_s=settling_time_s,
         steady_error=float(np.mean(reference[-tail:] - measured[-tail:])),
         peak_command=float(np.max(np.abs(trajectory.command))),

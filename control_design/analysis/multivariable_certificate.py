@@ -39,6 +39,8 @@ from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import ChannelWeights, MultivariableSpecification, gram
 from ident.data.shown import Shown
 
+# Relative difference of two sampling times that counts as none: rounding of decimal numbers.
+_SAME_PERIOD = 1e-9
 # Pieces, at most, into which the frequencies of one requirement are cut: a limit of work, as each takes the
 # eigenvalues of a matrix of twice the loop's states. Chosen; with a tenth of it no test of this module moves.
 _MOST_PIECES = 3000
@@ -280,8 +282,8 @@ def certify_multivariable(
     else:
         listed = tuple(plants)
     for plant in listed:
-        # Sampling times are the same within 1e-5, and 1e-8 s: numpy's own tolerances.
-        if controller.D.shape != (plant.inputs, plant.outputs) or not np.isclose(controller.dt_s, plant.dt_s):
+        same_period = np.isclose(controller.dt_s, plant.dt_s, rtol=_SAME_PERIOD, atol=0)
+        if controller.D.shape != (plant.inputs, plant.outputs) or not same_period:
             raise ValueError(
                 f"plant {plant.name!r} needs a controller with D ({plant.inputs}, {plant.outputs}) at dt "
                 f"{plant.dt_s}; got {controller.D.shape} at {controller.dt_s}"

@@ -246,10 +246,9 @@ def _number(document: Mapping[str, Any], name: str) -> float:
 
 
 def _count(document: Mapping[str, Any], name: str) -> int:
-    """Whole number of a field, at least 0. Raises ValueError for anything else, OverflowError for
-    infinity."""
+    """Whole number of a field, at least 0. Raises ValueError for anything else, infinity included."""
     value = _number(document, name)
-    if not (value >= 0 and value == int(value)):
+    if not (value >= 0 and value.is_integer()):
         raise ValueError(f"the field '{name}' must be a whole number, at least 0; got {value}")
     return int(value)
 

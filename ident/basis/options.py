@@ -164,8 +164,7 @@ class IdentOptions(Settings):
     def _consistent(self) -> IdentOptions:
         """These settings, which do not contradict one another.
 
-        Raises ValueError where two do, or a known pole is on the wrong side of the unit circle;
-        ZeroDivisionError for an unstable pole at zero.
+        Raises ValueError where two do, or a known pole is on the wrong side of the unit circle.
         """
         for low, high in (
             ("omega_min_rad_s", "omega_max_rad_s"),
@@ -180,6 +179,12 @@ class IdentOptions(Settings):
             is_stated = lowest is not None or highest is not None
             if self.coordinates == "raw" and is_stated:
                 raise ValueError(f"{low} and {high} need coordinates = 'log'")
+        for re, im in self.unstable_poles:
+            if re == 0 and im == 0:
+                raise ValueError(
+                    "unstable_poles has 0, which is inside the unit circle; expected |z| above 1: name a known "
+                    "pole inside the circle in fixed_poles, or leave it out"
+                )
         # Raises ValueError where a known pole is on the wrong side of the unit circle.
         self.fixed()
         self._refuse_impossible_relative_degree()
@@ -229,8 +234,8 @@ class IdentOptions(Settings):
     def fixed(self) -> Poles:
         """Fixed poles of the basis: zeros of the integrators, known poles, mirror images of unstable ones.
 
-        In that order within each type. Raises ValueError if one is not inside the circle, ZeroDivisionError
-        as `unstable`: both are found when the settings are made.
+        In that order within each type. Raises ValueError if one is not inside the circle, which is found when
+        the settings are made.
 
         Each integrator adds a pole at z = 0. Its filter z/(z - 1) puts a zero there; with the pole the
         numerator is as free as with the integrator among the poles.
@@ -244,7 +249,7 @@ class IdentOptions(Settings):
     def unstable(self) -> Poles:
         """Mirror images 1 / conj(p) of the unstable poles p, inside the circle.
 
-        Raises ValueError if |p| is not above 1, ZeroDivisionError for p = 0.
+        Raises ValueError if |p| is not above 1; p = 0 was refused when the settings were made.
         """
         real = [1 / re for re, im in self.unstable_poles if im == 0]
         pairs = [1 / complex(re, -im) for re, im in self.unstable_poles if im != 0]

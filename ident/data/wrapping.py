@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ident.data.arrays import IntArray, RealArray
+from ident.data.arrays import BoolArray, IntArray, RealArray
 
 
 def _usual_periods() -> tuple[float, ...]:
@@ -84,6 +84,11 @@ MOTION_STEPS = 12.0
 # wrap it is smaller by far more, of a jump that is no wrap it grows. Twice this, no gain at all, takes steps
 # with a single outlier for wraps.
 SMOOTHER = 0.5
+# Across a wrap the unwrapped readings go on with a step of at most so many times the longest usual one: the
+# period may be wrong by two steps where it is read off the range, and one more is the motion's own. An outlier
+# leaves what it is away from its neighbours, less the range. Twice this judges no signal of the tests
+# differently.
+SEAM_STEPS = 3.0
 # A step of more than this share of a period may go either way: half is the limit, where both are as long.
 NEARLY_HALF = 0.4
 # A speed that changes by less than this share of a period per sample leaves little doubt: a turn taken the
@@ -130,7 +135,7 @@ def wraps_at(values: RealArray) -> float:
     Notes
     -----
     Readings that wrap jump by nearly their whole range, seldom by part of it, and go on smoothly once
-    unwrapped. Signals that are seldom between their ends (switching, dropping out, or a swing about the place
+    unwrapped; a single sample that jumps and comes back is an outlier. Signals that are seldom between their ends (switching, dropping out, or a swing about the place
     where the readings wrap) have to pass a stricter test. A sawtooth passes as well; readings that never
     come near both ends are not seen.
     """
@@ -160,6 +165,10 @@ def wraps_at(values: RealArray) -> float:
     else:
         period = float(f"{span:.6g}")
     going_on = np.unwrap(values, period=period)
+    longest_usual = float(step_share[~jumps].max(initial=0.0)) * span
+    longest_seam = float(np.abs(np.diff(going_on))[jumps].max())
+    if _only_single_samples(jumps) or longest_seam > SEAM_STEPS * max(longest_usual, 1e-3 * span):
+        return 0.0
 
     # The middle 60 % of the range (`SELDOM_BETWEEN`).
     low = float(values.min())
@@ -186,6 +195,17 @@ def wraps_at(values: RealArray) -> float:
     roughness = np.std(np.diff(values, 2))
     roughness_unwrapped = np.std(np.diff(going_on, 2))
     return period if roughness_unwrapped <= SMOOTHER * roughness else 0.0
+
+
+def _only_single_samples(jumps: BoolArray) -> bool:
+    """Whether a signal is away from its longest stretch for single samples only: outliers, no wraps.
+
+    jumps (T - 1,): the steps that divide it into stretches, which are alternately usual and away.
+    """
+    stretches = np.split(np.arange(jumps.size + 1), np.flatnonzero(jumps) + 1)
+    sizes = np.array([stretch.size for stretch in stretches])
+    away = sizes[(1 + int(sizes.argmax())) % 2 :: 2]
+    return bool(np.all(away == 1))
 
 
 def timer_period(stamps: RealArray) -> float:

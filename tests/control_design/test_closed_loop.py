@@ -1,5 +1,7 @@
 """Time domain against python-control's feedback of the same functions; limits, quantisation, metrics."""
 
+from dataclasses import replace
+
 import control
 import numpy as np
 import pytest
@@ -196,3 +198,14 @@ def test_sensitivity_that_cannot_be_measured_is_refused(changes, words):
     settings = {"rms": 0.1, "band_rad_s": (1.0, 100.0), "period_samples": 200, **changes}
     with pytest.raises(ValueError, match=words):
         measure_sensitivity(_GAIN, LinearMachine(hub_arm()), np.random.default_rng(1), **settings)
+
+
+@pytest.mark.parametrize("from_sample", [0, 30, 99])
+def test_an_output_that_is_no_number_does_not_settle(from_sample):
+    output = np.ones(100)
+    run = simulate(_controller(), LinearMachine(hub_arm()), np.ones(100))
+    output[from_sample:] = np.nan
+    metrics = step_metrics(replace(run, output=output[:, None]))
+    assert metrics.settling_time_s is None
+    assert np.isnan(metrics.overshoot_percent)
+    assert np.isnan(metrics.undershoot_percent)

@@ -224,3 +224,9 @@ def test_a_ball_on_its_own_frequencies_is_certified_there_only():
     assert verdict.frequencies == 80
     assert not verdict.proved
     assert "own frequencies" in verdict.obstacle
+
+
+def test_a_controller_of_another_period_is_refused_however_short_the_period_is():
+    law = given(PUBLISHED["order six"]())
+    with pytest.raises(ValueError, match="at dt"):
+        certify_multivariable(replace(law, dt_s=law.dt_s * (1 + 1e-6)), plant_t(1.0), specification_t(6))

@@ -275,3 +275,19 @@ def test_ellipses_of_an_unknown_period_hold_the_response_of_each(integrators):
     assert not np.any(ellipses.contains(late)[(omega > 50) & (omega < 400)])
     known = replace(timing, possible=())
     assert with_unknown_timing(narrow, known) is narrow
+
+
+@pytest.mark.parametrize("first", [0, 1, 2, 3])
+def test_a_record_that_was_not_seen_is_used_from_the_row_at_which_its_command_changes(first):
+    rng = np.random.default_rng(first)
+    seen = np.repeat(rng.standard_normal(200), 4)
+    unseen = np.repeat(rng.standard_normal(200), 4)[(4 - first) % 4 :]
+    records = [
+        Record("log", u[:, None], np.cumsum(u)[:, None] * 1e-3, STEP_S, ("u",), ("y",))
+        for u in (seen, unseen)
+    ]
+    timing = CommandTiming(
+        TimingSource.REPEATS, STEP_S, period_s=4 * STEP_S, rows_per_command=4, first_row=(0,)
+    )
+    _, used = with_equivalent_command(records, timing)
+    np.testing.assert_array_equal(used.input[:, 0], unseen[first::4])

@@ -127,6 +127,7 @@ def without(name):
         (changed(poles_real=[1.5]), "inside the unit circle"),
         (changed(poles_pairs=[0.5, 0.1]), "rows"),
         (changed(integrators=1.5), "whole number"),
+        (changed(integrators=np.inf), "whole number"),
         (changed(input_name=3), "'input_name' must be text"),
         (changed(D=[[7.0]]), "'D' is not the state matrix"),
         (changed(A=[[1.0]]), "'A' is not the state matrix"),

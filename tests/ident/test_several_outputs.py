@@ -171,3 +171,15 @@ def test_a_refusal_names_in_one_line_what_cannot_be_fitted(spoil, options, fact)
     with pytest.raises(ValueError, match=fact) as refusal:
         identify_mimo(spoil(record(structure(), 0)), IdentOptions(**options))
     assert "\n" not in str(refusal.value)
+
+
+def test_one_long_record_of_which_the_start_was_searched_is_fitted_as_a_whole():
+    log = record(structure(), seed=8)
+    options = {"n_real": 1, "n_pairs": 2, "estimate_initial_state": False}
+    searched = identify_mimo([log], IdentOptions(**options, search_samples=600))
+    whole = identify_mimo([log], IdentOptions(**options))
+    assert len(searched.residuals[0]) == log.n_samples
+    np.testing.assert_allclose(searched.rss, whole.rss, rtol=1e-6)
+    np.testing.assert_allclose(
+        searched.model.frequency_response(OMEGA), whole.model.frequency_response(OMEGA), rtol=1e-3
+    )

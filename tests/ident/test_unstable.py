@@ -112,6 +112,8 @@ def test_an_unstable_pole_without_its_image_and_free_runs_are_refused():
         model(REAL).simulate(np.ones(5))
     with pytest.raises(ValueError, match=r"1\.11111"):
         IdentOptions(unstable_poles=((0.9, 0.0),))
+    with pytest.raises(ValueError, match="unstable_poles has 0, which is inside the unit circle"):
+        IdentOptions(unstable_poles=[0])
     with pytest.raises(ValueError, match="relative_degree"):
         identify([pendulum(0, 500)], IdentOptions(unstable_poles=((1.1, 0),), relative_degree=2))
 

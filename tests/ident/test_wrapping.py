@@ -167,3 +167,14 @@ def test_a_record_says_it_and_unwraps_on_request_before_it_scales():
 def test_a_period_that_cannot_be_is_refused(unwrap, words):
     with pytest.raises(ValueError, match=words):
         Record.from_file(table(), ["u"], ["enc"], time="t", unwrap=unwrap)
+
+
+@pytest.mark.parametrize("amplitude", [0.02, 1.0, 300.0])
+@pytest.mark.parametrize("times", [5.0, 6.5, 8.0])
+@pytest.mark.parametrize("rows", [(701,), (701, 2500), (1310, 1311)], ids=["one", "two", "in a row"])
+def test_outliers_of_a_few_amplitudes_are_no_wraps(amplitude, times, rows):
+    rng = np.random.default_rng(3)
+    motion = amplitude * (np.sin(0.01 * K) + 0.001 * rng.standard_normal(K.size))
+    motion[list(rows)] = times * amplitude
+    assert wraps_at(motion) == 0
+    assert wraps_at(-motion) == 0

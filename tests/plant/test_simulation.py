@@ -161,3 +161,8 @@ def test_a_sampled_arm_refuses_bad_input():
         SampledArm(RIG).advance(np.nan)
     with pytest.raises(ValueError, match="inf N m"):
         SampledArm(RIG).advance(0.0, np.inf)
+
+
+def test_a_sensor_that_there_is_not_is_named():
+    with pytest.raises(ValueError, match="no sensor is called 'elbow'.*hub_angle_rad"):
+        SampledArm(RIG).measured(["hub_angle_rad", "elbow"], VOLTAGE)
