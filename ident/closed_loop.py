@@ -67,15 +67,15 @@ class TwoStage:
     fit_percent : tuple of float
         Of each record, 100 (1 - |u - u_hat| / |u - mean u|), of several inputs with the root mean square of
         this ratio over them (deviations about means).
-    plant : GobfModel or MimoModel
-        G0.
+    plant : GobfModel, MimoModel or None
+        G0; None where the loop's own responses took its place (`ident.recorded_loop`).
     enough_percent : float
         Below this fit of a record there is a warning.
     """
 
     records: tuple[Record, ...]
     fit_percent: tuple[float, ...]
-    plant: GobfModel | MimoModel
+    plant: GobfModel | MimoModel | None
     enough_percent: float = EXPLAINED_PERCENT
 
     @property
@@ -134,15 +134,15 @@ def two_stage(
     Noise at the plant's input needs a noise model of high order (`EmbeddingOptions.max_ar_order`).
     """
     options = options or IdentOptions()
-    reference_to_input = [_reference_to_input(record) for record in records]
+    to_input = [reference_to_input(record) for record in records]
     fixed = options.fixed()
     refuse_few_lines(records)
 
     # Stage one: what the reference does not explain of each input.
-    poles = quick_poles(reference_to_input, options)
+    poles = quick_poles(to_input, options)
     loop_poles = GobfModel(poles, np.zeros(poles.order), records[0].dt_s, feedthrough=1.0)
     unexplained = []
-    for loop_record in reference_to_input:
+    for loop_record in to_input:
         loop = tangent([loop_record], loop_poles, FIRST_STAGE)
         # With a start and an offset of its own: a log may begin in motion, and at any operating point.
         unexplained.append(fit_on_fresh_data(loop, loop_record).residual)
@@ -350,7 +350,7 @@ def _opened(records: Sequence[Record], unexplained: Sequence[RealArray], plant: 
     return opened
 
 
-def _reference_to_input(record: Record) -> Record:
+def reference_to_input(record: Record) -> Record:
     """Record whose input is the reference and whose output is the input, both (T, 1).
 
     Raises ValueError where a record has not exactly one of each.

@@ -185,6 +185,9 @@ def _tells_period(columns: _Columns, structure: _Structure, law: RecordedLaw) ->
         eighth = columns.least_residual(structure, 8, parity)
         if second is None or fourth is None or eighth is None:
             return False
+        if second == 0:
+            # A law without memory repeats itself at any rows: a faster one would have left nothing, too.
+            return False
         # What half a step would leave: by the fall from fourth to second rows, and by its growth since the
         # fall from eighth to fourth ones.
         fall = max(fourth, law.rounding) / second

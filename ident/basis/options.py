@@ -182,8 +182,8 @@ class IdentOptions(Settings):
         for re, im in self.unstable_poles:
             if re == 0 and im == 0:
                 raise ValueError(
-                    "unstable_poles has 0, which is inside the unit circle; expected |z| above 1: name a known "
-                    "pole inside the circle in fixed_poles, or leave it out"
+                    "unstable_poles has 0, which is inside the unit circle; expected |z| above 1: name a "
+                    "known pole inside the circle in fixed_poles, or leave it out"
                 )
         # Raises ValueError where a known pole is on the wrong side of the unit circle.
         self.fixed()

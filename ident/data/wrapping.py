@@ -85,8 +85,8 @@ MOTION_STEPS = 12.0
 # with a single outlier for wraps.
 SMOOTHER = 0.5
 # Across a wrap the unwrapped readings go on with a step of at most so many times the longest usual one: the
-# period may be wrong by two steps where it is read off the range, and one more is the motion's own. An outlier
-# leaves what it is away from its neighbours, less the range. Twice this judges no signal of the tests
+# period may be wrong by two steps where it is read off the range, and one more is the motion's own. An
+# outlier leaves what it is away from its neighbours, less the range. Twice this judges no signal of the tests
 # differently.
 SEAM_STEPS = 3.0
 # A step of more than this share of a period may go either way: half is the limit, where both are as long.
@@ -135,9 +135,9 @@ def wraps_at(values: RealArray) -> float:
     Notes
     -----
     Readings that wrap jump by nearly their whole range, seldom by part of it, and go on smoothly once
-    unwrapped; a single sample that jumps and comes back is an outlier. Signals that are seldom between their ends (switching, dropping out, or a swing about the place
-    where the readings wrap) have to pass a stricter test. A sawtooth passes as well; readings that never
-    come near both ends are not seen.
+    unwrapped; a single sample that jumps and comes back is an outlier. Signals that are seldom between their
+    ends (switching, dropping out, or a swing about the place where the readings wrap) have to pass a stricter
+    test. A sawtooth passes as well; readings that never come near both ends are not seen.
     """
     span = float(np.ptp(values)) if values.size >= FEWEST_READINGS else 0.0
     if not span > 0 or counts_rows(values):

@@ -164,5 +164,5 @@ def test_a_sampled_arm_refuses_bad_input():
 
 
 def test_a_sensor_that_there_is_not_is_named():
-    with pytest.raises(ValueError, match="no sensor is called 'elbow'.*hub_angle_rad"):
+    with pytest.raises(ValueError, match=r"no sensor is called 'elbow'.*hub_angle_rad"):
         SampledArm(RIG).measured(["hub_angle_rad", "elbow"], VOLTAGE)

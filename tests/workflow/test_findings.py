@@ -53,6 +53,7 @@ OTHERWISE = {
     "REPAIRED": [{"missing": 0}],
     "SKIPPED_ROWS": [{"rows": 1}],
     "CONTROLLER_PERIOD": [{"reference": ""}, {"repeats": True}],
+    "TWO_STAGE": [{"least_in_loop_percent": 84.2, "most_in_loop_percent": 90.1}],
     "WRAPS": [{"name": "hub angle", "period": 2 * 3.141592653589793}],
     "NUISANCE": [{"needed": False}],
     "INTEGRATORS": [{"accepted": 0}, {"refused": False}],

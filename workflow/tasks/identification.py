@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -26,6 +26,8 @@ from ident.friction import (
     refuse_unseen_shaft,
 )
 from ident.one_input import identify
+from ident.recorded_law import RecordedLaw
+from ident.recorded_loop import fit_in_loop, opened_by_loop
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.search.order_selection import Progress
 from ident.stabilisation import stabilisation
@@ -113,8 +115,19 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             measured = records.fitted(channel)
             loop = config.closed_loop_data if in_loop else None
             units = scale.get(channel.input, 1.0) / scale.get(channel.output, 1.0)
+            # The law is that of the output that is fed back.
+            timing = records.timing if k == config.control_index else None
             channels.append(
-                identify_channel(channel, measured, unseen, loop, report, friction=known, units=units)
+                identify_channel(
+                    channel,
+                    measured,
+                    unseen,
+                    loop,
+                    report,
+                    friction=known,
+                    units=units,
+                    law=None if timing is None else timing.law,
+                )
             )
     return IdentifyResult(tuple(channels), friction)
 
@@ -148,12 +161,14 @@ def identify_channel(
     friction: FrictionFit | None = None,
     with_plot: bool = True,
     units: float = 1.0,
+    law: RecordedLaw | None = None,
 ) -> IdentifiedChannel:
     """One channel from records: what `flexlink run` and `flexlink identify` do.
 
     measured: SISO, as recorded; unseen: others, with their roles; loop: how to use logs made in closed loop,
     None for others; friction: of the shaft that the output is the position of; units: as of
-    `with_stated_controller`. Raises ValueError, one line, where the logs cannot carry it.
+    `with_stated_controller`; law: that repeats the command of these records, where one is known. Raises
+    ValueError, one line, where the logs cannot carry it.
     """
     options, given = _searched_around(channel, measured[0].dt_s), None
     # The arm with friction was fitted without delay, and a closed loop looks like one.
@@ -210,6 +225,12 @@ def identify_channel(
     controlled = loop.controlled
     ways = [("two_stage", moving), ("direct", True), ("indirect", controlled)]
     explained = None
+    filtered = channel.increments or channel.band_rad_s is not None
+    by_reference = moving and not filtered and loop.method in ("auto", "two_stage")
+    if by_reference and law is not None and law.on_error is not None:
+        found_in_loop = _in_recorded_loop(fitted, measured, options, law)
+        if found_in_loop is not None:
+            return found_in_loop
     for way in [way for way, open_ in ways if open_] if loop.method == "auto" else [loop.method]:
         if way == "direct":
             found = fitted(None)
@@ -225,6 +246,31 @@ def identify_channel(
             return fitted(opened, finding(kind, **opened.finding.values))
     assert given is not None
     raise ValueError(said("loop_refused", given.values, controlled))
+
+
+def _in_recorded_loop(
+    fitted: Callable[[TwoStage, Finding], IdentifiedChannel],
+    measured: Sequence[Record],
+    options: IdentOptions,
+    law: RecordedLaw,
+) -> IdentifiedChannel | None:
+    """The channel identified from records that the loop of a known law opens, with what a free run in that
+    loop explains of each; None where the reference explains too little of the command, or the model of the
+    motion.
+
+    fitted: the identification of opened records; law: of the error, `on_error`.
+    """
+    opened = opened_by_loop(measured, law, options)
+    if min(opened.fit_percent) < EXPLAINED_PERCENT:
+        return None
+    found = fitted(opened, opened.finding)
+    if found.model.feedthrough:
+        return found
+    percent = [fit_in_loop(found.model, record, law).fit_percent for record in measured]
+    if min(percent) < EXPLAINED_PERCENT:
+        return None
+    explained = {"least_in_loop_percent": min(percent), "most_in_loop_percent": max(percent)}
+    return replace(found, closed_loop=finding(FindingKind.TWO_STAGE, **opened.finding.values, **explained))
 
 
 def with_stated_controller(

@@ -84,6 +84,7 @@ def identify_points(stage: StageInput) -> PointModels:
         with naming(f"operating point {name!r}"):
             if any(record.reference is not None for record in records):
                 stages = two_stage_several(records, asked, start=start, progress=report)
+                assert stages.plant is not None
                 records, start = list(stages.records), stages.plant.poles
                 remarks = stages.finding, *stages.warnings
             one = identify_mimo(records, asked, start=start, progress=report)

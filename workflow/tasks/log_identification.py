@@ -82,6 +82,7 @@ def identify_records(
             update,
             friction=friction,
             with_plot=with_plot,
+            law=None if timing is None else timing.law,
         )
     with naming("identify"), progress.stage("uncertainty"):
         rng = stage_rng(RunSection().seed, "uncertainty", channel.label)
