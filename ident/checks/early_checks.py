@@ -35,8 +35,12 @@ from ident.data.wrapping import spikes_in, wraps_at
 FEWEST_SAMPLES = 2 * WHITE_LAGS
 
 # Relative to its motion: a column that differs by no more from a multiple of another one is its copy. Text
-# logs have six digits or more; the best servo follows its reference a hundred times worse, say 1e-4.
-_COPY_ERROR = 1e-6
+# logs have six digits or more, of which rounding leaves 2e-6 of a motion about a level of its own size; the
+# best servo follows its reference ten times worse, say 1e-4.
+_COPY_ERROR = 1e-5
+# Rows by which a copy may be late: as a value that went over a bus or through a buffer. Chosen: a tenth of a
+# second at 500 Hz; twice as many take twice as long, 0.1 s for a log of 100 000 rows.
+_LATEST_COPY = 50
 
 # Readings of an output that takes fewer different values are doubted: so few steps of a sensor hide what a
 # light mode does. As in `clipped_share`, which takes a signal of fewer levels for one of few levels by
@@ -247,7 +251,8 @@ def resting_output(records: Sequence[Record]) -> str:
 
 
 def copied_column(records: Sequence[Record]) -> str:
-    """The complaint that the output is the input or a reference again, times a number, row by row; or "".
+    """The complaint that the output is the input or a reference again, times a number, or ""; also some rows
+    later.
 
     About the first such record; a column that stands still is nobody's copy.
     """
@@ -260,13 +265,30 @@ def copied_column(records: Sequence[Record]) -> str:
                 for signal, name in zip(record.reference.T, record.reference_names, strict=True)
             ]
         for role, signal, name in other_columns:
-            if _is_copy(output, signal):
+            late = _copied_after(output, signal)
+            if late is not None:
+                when = "sample by sample"
+                if late:
+                    when = "a row later" if late == 1 else f"{late} rows later"
                 return (
                     f"{record.label}: output column '{record.output_names[0]}' is the {role} column '{name}' "
-                    "again, sample by sample, so no machine shows in it; name the measured column with "
+                    f"again, {when}, so no machine shows in it; name the measured column with "
                     "--output NAME (output)"
                 )
     return ""
+
+
+def _copied_after(signal: RealArray, other: RealArray) -> int | None:
+    """Rows, up to `_LATEST_COPY`, after which a signal (T,) is another one (T,) times a number; None where it
+    is no copy.
+
+    The rows that are compared move: others are copies of anything.
+    """
+    for late in range(min(_LATEST_COPY, signal.size // 2) + 1):
+        later = signal[late:]
+        if np.ptp(later) > 0 and _is_copy(later, other[: other.size - late]):
+            return late
+    return None
 
 
 def _is_copy(signal: RealArray, other: RealArray) -> bool:

@@ -69,6 +69,7 @@ class FindingKind(Enum):
     UNIT_CONVERTED = auto()
     UNIT_OF_LOOP = auto()
     EXCHANGED = auto()
+    OPPOSITE = auto()
     UNIT_OF_REFERENCE = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()

@@ -790,7 +790,8 @@ def contradicted_by_loop(
     Returns
     -------
     tuple of Finding
-        Empty where nothing is contradicted. EXCHANGED, or UNIT_OF_LOOP for each of `_CONFUSIONS` that fits;
+        Empty where nothing is contradicted. EXCHANGED, OPPOSITE where the output moves against its
+        reference, or UNIT_OF_LOOP for each of `_CONFUSIONS` that fits;
         the value `options` is what to type, `times` how many times the output is its reference.
 
     Notes
@@ -825,6 +826,11 @@ def contradicted_by_loop(
                 options=options,
             ),
         )
+
+    # A loop that follows makes its output move with the reference.
+    if followed_times(reference, -output) is not None:
+        options = scaled_by(output_name, -scale.get(output_name, 1.0), output_unit)
+        return (finding(FindingKind.OPPOSITE, reference=reference_name, output=output_name, options=options),)
 
     # The reference is in the wrong unit where the output's header says that of its numbers, or each its own;
     # else the output is.

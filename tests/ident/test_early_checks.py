@@ -1,12 +1,14 @@
 """Logs that their columns alone show to be hopeless or doubtful; nothing is said of good ones."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
 
 from ident import Record
 from ident.checks import early_checks
-from ident.checks.early_checks import early_doubts, refuse_hopeless
+from ident.checks.early_checks import copied_column, early_doubts, refuse_hopeless
 from ident.data.finding import FindingKind
 
 N = 3000
@@ -199,3 +201,24 @@ def test_what_may_be_meant_is_doubted():
     few = record(signals, y=np.round(np.clip(signals["y"] / signals["y"].std(), -2, 2)))
     assert [doubt.kind for doubt in early_doubts([few])] == [FindingKind.FEW_READINGS]
     assert early_doubts([few])[0].values["count"] == 5
+
+
+@pytest.mark.parametrize(
+    ("late", "when"), [(0, "sample by sample"), (1, "a row later"), (40, "40 rows later")]
+)
+@pytest.mark.parametrize(("times", "level"), [(1.0, 0.0), (2.0, 1.0), (-57.3, 300.0)])
+def test_a_reference_that_was_logged_as_the_output_is_told_however_late(late, when, times, level):
+    rng = np.random.default_rng(5)
+    reference = np.cumsum(rng.standard_normal(3000))
+    output = times * np.r_[np.full(late, reference[0]), reference[: 3000 - late]] + level
+    # Six digits, as a text log has them.
+    digits = [float(f"{value:.6g}") for value in output]
+    command = rng.standard_normal(3000)
+    record = Record(
+        "log", command[:, None], np.array(digits)[:, None], 0.002, ("u",), ("y",),
+        reference=reference[:, None], reference_names=("r",),
+    )  # fmt: skip
+    assert f"'y' is the reference column 'r' again, {when}" in copied_column([record])
+    # A servo that follows to a thousandth is none.
+    near = replace(record, output=record.output * (1 + 1e-3 * rng.standard_normal((3000, 1))))
+    assert copied_column([near]) == ""

@@ -89,7 +89,8 @@ def test_a_rate_is_its_quantity_over_its_time():
         (0.9 * 1e3, ("m", "m"), "--scale y=0.001 --unit y=m"),
         (1e-3, ("mm", "mm"), "--scale y=1000 --unit y=mm"),
         (1e-3, ("mm", "m"), "--scale r=0.001"),
-        *[(gain, ("rad", "rad"), None) for gain in (1.0, 0.3, 20.0, 100.0, -180 / np.pi)],
+        *[(gain, ("rad", "rad"), None) for gain in (1.0, 0.3, 20.0, 100.0)],
+        *[(-gain, ("rad", "rad"), "--scale y=-1 --unit y=rad") for gain in (1.0, 0.3, 180 / np.pi)],
     ],
 )
 def test_an_output_that_follows_but_for_a_unit(gain, units, options):

@@ -27,6 +27,7 @@ _SAID_AT_ONCE = frozenset(
         FindingKind.TIME_UNIT,
         FindingKind.UNIT_OF_LOOP,
         FindingKind.EXCHANGED,
+        FindingKind.OPPOSITE,
         FindingKind.UNIT_OF_REFERENCE,
         FindingKind.UNIT_CONTRADICTED,
     }
