@@ -41,6 +41,7 @@ from workflow.text.templates import RunSummary, environment, rows_of
 if TYPE_CHECKING:
     from workflow.config.run_config import RunConfig
     from workflow.tasks.draft import Draft
+    from workflow.tasks.results import IdentifiedChannel
 
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
@@ -167,11 +168,25 @@ def decided(
             if not spread or min(band.median_radius_percent for band in spread[0].bands) > 100 * TOLD:
                 raise
         results, at = RunResults(run), config.control_index
+        if found.refused:
+            found = replace(found, refused=found.refused + _best_linear(results.identify.channels[at]))
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
     if typed:
         draft = replace(draft, specification=with_typed(draft.specification, typed))
     found = replace(found, draft=draft, before=found.draft, typed=frozenset(typed or ()))
     return (*written(found, file), found)
+
+
+def _best_linear(channel: IdentifiedChannel) -> str:
+    """What the model without friction explains of the logs that made the loop, and its modes: the end of a
+    sentence that says why no friction is identified; "" where no free run in the loop was made."""
+    values = {} if channel.closed_loop is None else channel.closed_loop.values
+    if "least_in_loop_percent" not in values:
+        return ""
+    modes = [f"{mode.omega_rad_s / (2 * np.pi):.3g}" for mode in channel.modes if channel.is_mode(mode)]
+    least, most = values["least_in_loop_percent"], values["most_in_loop_percent"]
+    named = f", with modes at {', '.join(modes)} Hz" if modes else ", without a mode"
+    return f"; a linear model explains {least:.0f} to {most:.0f} % in a free run in the loop{named}"
 
 
 def drafted(

@@ -15,6 +15,7 @@ from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import fed_back, independence_test
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import EXPLAINED_PERCENT, TwoStage, two_stage, with_controller
+from ident.data.arrays import clipped_share
 from ident.data.finding import Finding, FindingKind, distinct, finding
 from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments, settling_time_s
@@ -255,11 +256,14 @@ def _in_recorded_loop(
     law: RecordedLaw,
 ) -> IdentifiedChannel | None:
     """The channel identified from records that the loop of a known law opens, with what a free run in that
-    loop explains of each; None where the reference explains too little of the command, or the model of the
-    motion.
+    loop explains of each; None where a command was limited, the reference explains too little of the command,
+    or the model of the motion.
 
     fitted: the identification of opened records; law: of the error, `on_error`.
     """
+    # A command that stands at a limit is not the one that the law asked for.
+    if any(record.cut or clipped_share(record.input[:, 0]) > 0 for record in measured):
+        return None
     opened = opened_by_loop(measured, law, options)
     if min(opened.fit_percent) < EXPLAINED_PERCENT:
         return None

@@ -22,6 +22,7 @@ from ident.data.distortion import distortion_of
 from ident.data.finding import FindingKind, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
+from ident.data.roles import is_position
 from ident.data.signal_filter import increments
 from ident.friction import (
     BehindFriction,
@@ -159,18 +160,20 @@ def uncertainty_of(
         linear_poles=linear_poles,
         tests=tests,
     )
+    # Friction is identified with a position; who records a speed is not told to record another signal.
+    position = is_position(result.output, "".join(measured[0].output_units))
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
-        refuse_unexplained(result, found.agreement, friction)
+        refuse_unexplained(result, found.agreement, friction, position=position)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and result.closed_loop is not None and not white
     advice = residual_advice(
         *tests,
         noise_order=found.noise_order,
-        friction=friction is None and band is None and not result.increments and not rubs,
+        friction=friction is None and band is None and not result.increments and not rubs and position,
         observer=observer and at_shaft,
     )
     if rubs:
-        advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output))
+        advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output, speed=not position))
     return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
 
 
@@ -227,9 +230,11 @@ def refuse_unexplained(
     result: IdentifiedChannel,
     agreement: NominalAgreement,
     friction: FrictionFit | None,
+    *,
+    position: bool = True,
 ) -> None:
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified."""
+    of it means anything. friction: of the fit, None where none was identified; position: of the output."""
     found = result.identification
     best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
     why = ""
@@ -240,7 +245,7 @@ def refuse_unexplained(
         times = found.noise_std / friction.noise_std
         why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     if why:
-        raise ValueError(said("unexplained_logs", result.output, why, friction is not None))
+        raise ValueError(said("unexplained_logs", result.output, why, friction is not None or not position))
 
 
 def posterior_of(
