@@ -184,9 +184,10 @@ def _best_linear(channel: IdentifiedChannel) -> str:
     if "least_in_loop_percent" not in values:
         return ""
     modes = [f"{mode.omega_rad_s / (2 * np.pi):.3g}" for mode in channel.modes if channel.is_mode(mode)]
-    least, most = values["least_in_loop_percent"], values["most_in_loop_percent"]
+    least, most = f"{values['least_in_loop_percent']:.0f}", f"{values['most_in_loop_percent']:.0f}"
+    share = least if least == most else f"{least} to {most}"
     named = f", with modes at {', '.join(modes)} Hz" if modes else ", without a mode"
-    return f"; a linear model explains {least:.0f} to {most:.0f} % in a free run in the loop{named}"
+    return f"; a linear model explains {share} % in a free run in the loop{named}"
 
 
 def drafted(
