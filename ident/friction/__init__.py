@@ -2,13 +2,10 @@
 
 from ident.friction.amplitude import EquivalentFriction, at_amplitude, equivalent_friction
 from ident.friction.arm import FrictionLaw
+from ident.friction.behind import identify_behind
+from ident.friction.command_causes import recorded_in_loop, with_commands_in_time
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
-from ident.friction.in_loop import (
-    identify_behind,
-    recorded_in_loop,
-    with_commands_in_time,
-)
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 
 __all__ = [

@@ -20,7 +20,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure, filter_input, front_response
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, kernel_array, real_rows
 from ident.data.record import Record
-from ident.friction.kernel import STEPS, STRIDES, ArmSteps, step_through
+from ident.friction.kernel import STRIDES, ArmSteps, step_through, steps_of
 
 # A pole at zero is a delay, which no motion in continuous time has: the fastest rate that is stepped, as a
 # pole z. Chosen; it is gone within a sample.
@@ -109,7 +109,7 @@ class SteppedArm:
     weights: ComplexArray
 
     @classmethod
-    def of(cls, poles: Poles, structure: Structure, dt_s: float) -> SteppedArm:
+    def of(cls, poles: Poles, structure: Structure, dt_s: float, *, doubled: bool = True) -> SteppedArm:
         """States of an arm on given poles, and their weights.
 
         Parameters
@@ -118,6 +118,8 @@ class SteppedArm:
             Of the arm, sampled at dt_s, each once; mirror images of unstable ones among them.
         structure : Structure
         dt_s : float
+        doubled : bool
+            Each pole twice. Otherwise once: half of the states, for an arm whose poles a fit moves by itself.
 
         Returns
         -------
@@ -144,11 +146,14 @@ class SteppedArm:
         # Of the mirror image of an unstable pole one is that pole itself.
         unstable = np.concatenate([structure.unstable.real, structure.unstable.pairs])
         images = np.isin(np.concatenate([poles.real, poles.pairs]), unstable)
-        doubled = np.column_stack([np.where(images, -single.conj(), single), single]).ravel()
-        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), doubled])
-        # The second state of a pole is driven by its first one, but for mirror images.
-        second = np.column_stack([np.zeros(single.size, np.bool_), ~images]).ravel()
-        chain = np.concatenate([np.zeros(structure.integrators, np.bool_), second])
+        of_poles = np.where(images, -single.conj(), single)
+        of_chain = np.zeros(single.size, np.bool_)
+        if doubled:
+            # The second state of a pole is driven by its first one, but for mirror images.
+            of_poles = np.column_stack([of_poles, single]).ravel()
+            of_chain = np.column_stack([of_chain, ~images]).ravel()
+        rates = np.concatenate([np.zeros(structure.integrators, np.complex128), of_poles])
+        chain = np.concatenate([np.zeros(structure.integrators, np.bool_), of_chain])
 
         # Coefficients of both forms agree where responses do: they span the same space. Frequencies in
         # radians a sample, close to each other where the integrator and slow poles are.
@@ -163,7 +168,8 @@ class SteppedArm:
         columns = np.hstack([(states + conjugates) / 2, 1j * (states - conjugates)[:, twofold] / 2])
         front = front_response(omega, dt_s, structure.integrators, 0)
         front = front / all_pass_response(structure.unstable, z)
-        basis = basis_response(poles.doubled(), z) * front[:, None]
+        basis_poles = poles.doubled() if doubled else poles
+        basis = basis_response(basis_poles, z) * front[:, None]
 
         # Every frequency counts alike, and every state: both differ by decades.
         scale = 1 / np.linalg.norm(basis, axis=1)[:, None]
@@ -174,6 +180,21 @@ class SteppedArm:
         weights = solved[: rates.size].astype(np.complex128)
         weights[twofold] += 1j * solved[rates.size :]
         return cls(poles, structure, dt_s, rates, chain, weights)
+
+    def continuous_response(self, omega_rad_s: RealArray) -> ComplexArray:
+        """Responses (F, P) of the position to the effort in continuous time, of a unit of each coefficient,
+        at omega_rad_s (F,), which is not zero where the arm integrates."""
+        s = 1j * omega_rad_s
+        states = np.empty((s.size, self.rates.size), np.complex128)
+        conjugates = np.empty_like(states)
+        for j, rate in enumerate(self.rates):
+            states[:, j] = 1 / (s - rate)
+            conjugates[:, j] = 1 / (s - rate.conj())
+            if self.chain[j]:
+                states[:, j] *= states[:, j - 1]
+                conjugates[:, j] *= conjugates[:, j - 1]
+        # The position is the real part of the sum, so that a pair stands for itself and its conjugate.
+        return np.asarray((states @ self.weights + conjugates @ self.weights.conj()) / 2)
 
     @property
     def swings(self) -> BoolArray:
@@ -207,8 +228,12 @@ class SteppedArm:
     @cached_property
     def _powers(self) -> RealArray:
         """Transition matrices (S + 1, M + 1, M + 1) after no step, and after each step of a stride."""
-        step = self.over(self.dt_s / STEPS)
-        return np.array([np.linalg.matrix_power(step, k) for k in range(STEPS // STRIDES + 1)])
+        n_steps = steps_of(self.dt_s)
+        step = self.over(self.dt_s / (STRIDES * n_steps))
+        powers = [np.eye(len(step))]
+        for _ in range(n_steps):
+            powers.append(powers[-1] @ step)
+        return np.array(powers)
 
     def stepped(self, weights: ComplexArray) -> ArmSteps:
         """Matrices by which the kernels step an arm, for weights (N,) of its states in the position."""

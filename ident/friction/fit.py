@@ -6,7 +6,7 @@ arm on its poles, each taken twice, are one least-squares problem (Gauss-Newton)
 search of `ident.one_input` on the records with the friction taken off; both are repeated until the residual
 no longer falls. How much the level differs between records is estimated, and at least a thousandth. What this
 does not explain, friction that falls with speed (Stribeck) or at the load among it, an observer follows
-(`ident.friction.in_loop`).
+(`ident.friction.estimator`).
 
 Neglected: a level that depends on position or load; records start at rest.
 """
@@ -24,6 +24,8 @@ from ident.checks.plausible_modes import LARGEST_DAMPING, LIGHT
 from ident.checks.residual_tests import whiteness_test
 from ident.data.record import Record
 from ident.friction.arm import PRESLIDING, FrictionLaw
+from ident.friction.command_causes import BY_CHANCE, recorded_in_loop
+from ident.friction.estimator import fit_friction_in_loop
 from ident.friction.gauss_newton import (
     WORTH,
     FrictionFit,
@@ -32,7 +34,6 @@ from ident.friction.gauss_newton import (
     simulated_rss,
     started,
 )
-from ident.friction.in_loop import BY_CHANCE, fit_friction_in_loop, recorded_in_loop
 from ident.friction.inverse_dynamics import presliding_of, with_measured_direction
 from ident.one_input import untested_model
 from ident.search.order_selection import Progress
@@ -75,7 +76,7 @@ def fit_friction(
     ----------
     records : sequence of Record
         One input, and the position of the shaft that the friction acts on as the one output; at rest at their
-        first sample, unless made in a loop (`ident.friction.in_loop`).
+        first sample, unless made in a loop (`ident.friction.estimator`).
     options : IdentOptions, optional
         Of the search for the arm's poles; integrators at most 1.
     free : bool

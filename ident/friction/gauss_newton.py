@@ -4,7 +4,7 @@ The simulation of `ident.friction.arm` is differentiated with respect to the coe
 doubled poles and to the parameters of the friction's law; the poles themselves stay. `descended` steps a free
 run from a start (`started`) as long as its residual falls, `with_covariance` says what the records leave
 open. `FrictionFit` holds the result and makes of a record its motion, its friction, and the record without
-it, also where an observer follows the log (`ident.friction.in_loop`). A vector of law parameters is (level,
+it, also where an observer follows the log (`ident.friction.estimator`). A vector of law parameters is (level,
 log presliding) or (level, log presliding, excess, log fall): logarithms stand at odd places.
 """
 
@@ -38,7 +38,7 @@ _REPEATS = 1e-3
 # Gauss-Newton steps at most. Chosen; they end where the residual no longer falls.
 _STEPS = 8
 # A step, and its parts where the whole does not lower the residual.
-LENGTHS = (1.0, 0.5, 0.25, 0.1)
+_LENGTHS = (1.0, 0.5, 0.25, 0.1)
 # Least level after a step, as a share of the level before. Chosen: one step may not lose the friction.
 _LEAST_LEVEL_SHARE = 0.6
 # Largest step of a logarithm: a factor of e. Beyond that the linearised friction is another law.
@@ -54,7 +54,9 @@ _CHANGE = 1e-6
 _CHANGE_OF_LEVEL = 2e-3
 # of logarithms,
 CHANGE_OF_LOG = 0.02
-# and of the level beyond a spring, whose load stands or slips. All three chosen.
+# of the drive's lag, relative to it,
+_CHANGE_OF_LAG = 1e-3
+# and of the level beyond a spring, whose load stands or slips. All four chosen.
 _CHANGE_BEYOND = 0.05
 # Smallest singular value that counts, as a share of the largest. Rounding of doubles.
 _RANK = 1e-12
@@ -106,8 +108,8 @@ class FrictionFit:
     centre : float
         From where positions of an arm that does not integrate are told, output units.
     lag : float
-        Of the drive, in samples: the command reaches the shaft through 1 / (1 + lag (1 - q^-1)), the friction
-        does not.
+        Of the drive, in samples: the command reaches the shaft through 1 / (1 + lag s), s in 1 / samples
+        (`lag_filter`), the friction does not.
     """
 
     law: FrictionLaw
@@ -127,7 +129,7 @@ class FrictionFit:
 
     @property
     def observed(self) -> bool:
-        """An observer follows the records (`ident.friction.in_loop`): those of a loop, and what no free run
+        """An observer follows the records (`ident.friction.estimator`): those of a loop, and what no free run
         explains."""
         return self.correction is not None
 
@@ -213,12 +215,13 @@ class FrictionFit:
         return np.asarray(residual - residual.mean())
 
     def behind_drive(self, record: Record) -> Record:
-        """A record with what the drive's lag makes of its input, which starts steady."""
+        """A record with what the drive's lag makes of its input, which starts steady: the mean over each
+        sample."""
         if not self.lag:
             return record
-        pole = self.lag / (1 + self.lag)
+        numerator, denominator = lag_filter(self.lag)
         start = record.input[0]
-        return replace(record, input=start + lfilter([1 - pole], [1, -pole], record.input - start, axis=0))
+        return replace(record, input=start + lfilter(numerator, denominator, record.input - start, axis=0))
 
     def forced(self, record: Record) -> Record:
         """A record with the force on a linear arm as its input: command behind the drive less friction.
@@ -240,7 +243,8 @@ class FrictionFit:
             The friction is not finite.
         """
         friction = self._friction(record)
-        through_drive = friction + self.lag * np.diff(friction, prepend=friction[0])
+        # 1 + lag s, by central differences: to second order what the drive's lag takes away again.
+        through_drive = friction + self.lag * np.gradient(friction)
         return less_friction(record, through_drive, self.arm.structure.input_delay_samples)
 
     def _friction(self, record: Record) -> RealArray:
@@ -255,7 +259,34 @@ class FrictionFit:
 
     def drive_response(self, omega_rad_s: RealArray) -> ComplexArray:
         """Frequency response (F,) of the drive's lag, without unit, at omega_rad_s (F,)."""
-        return np.asarray(1 / (1 + self.lag * (1 - np.exp(-1j * omega_rad_s * self.arm.dt_s))))
+        if not self.lag:
+            return np.ones(omega_rad_s.size, np.complex128)
+        numerator, denominator = lag_filter(self.lag)
+        later = np.exp(-1j * omega_rad_s * self.arm.dt_s)
+        over = denominator[0] + denominator[1] * later
+        return np.asarray((numerator[0] + numerator[1] * later) / over)
+
+
+def lag_steps(lag_samples: float) -> RealArray:
+    """Pole p of a drive's lag, and share c of a sample by which its mean stays with its state: (2,).
+
+    A held command u reaches the arm through 1 / (1 + lag s), s in 1 / samples. Its state x moves to
+    p x + (1 - p) u in a sample, p = exp(-1 / lag), and has the mean u - c (u - x) over it, c = lag (1 - p).
+    Both are zero without a lag (`lag_samples` = 0).
+    """
+    if not lag_samples > 0:
+        return np.zeros(2)
+    pole = float(np.exp(-1 / lag_samples))
+    return np.array([pole, lag_samples * (1 - pole)])
+
+
+def lag_filter(lag_samples: float) -> tuple[RealArray, RealArray]:
+    """Numerator (2,) and denominator (2,), in q^-1, of the mean over each sample behind a drive's lag.
+
+    Of `lag_steps`, (1 - c + (c - p) q^-1) / (1 - p q^-1); `lag_samples` at least zero.
+    """
+    pole, share = lag_steps(lag_samples).tolist()
+    return np.array([1 - share, share - pole]), np.array([1.0, -pole])
 
 
 def parameters_of(law: FrictionLaw) -> RealArray:
@@ -406,10 +437,10 @@ def driven_by_law(fit: FrictionFit, record: Record) -> RealArray:
             column = column + (fit.force_beyond(record, fit.beyond, law) - force_beyond) / size
         columns.append(column)
     if fit.lag:
-        # More lag takes away what the command, behind the drive twice, changes by in a sample.
-        twice = fit.behind_drive(fit.behind_drive(record)).input[:, 0]
-        faster = np.diff(twice, prepend=record.input[0])
-        columns.append(filter_input(faster, 0, structure.input_delay_samples))
+        # More lag moves the arm as friction does that takes away what it changes of the command.
+        slower = replace(fit, lag=(1 + _CHANGE_OF_LAG) * fit.lag).behind_drive(record).input[:, 0]
+        lost = (fit.behind_drive(record).input[:, 0] - slower) / (_CHANGE_OF_LAG * fit.lag)
+        columns.append(filter_input(lost, 0, structure.input_delay_samples))
     if structure.integrators:
         columns.append(np.ones(friction.size))
     if fit.spring is not None:
@@ -500,7 +531,7 @@ def descended(
         solution = least_squares(blocks, targets, trust * noise * known)
         noise = np.sqrt(solution.residual_rss / n)
         # The last round only makes the equations that the covariance is read from.
-        lengths = LENGTHS if steps_left else ()
+        lengths = _LENGTHS if steps_left else ()
         for length in lengths:
             step = length * solution.change
             lowest = max(_LEAST_LEVEL_SHARE * fit.level, least_level)

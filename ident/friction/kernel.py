@@ -5,9 +5,10 @@ The arm is linear in real states, driven by drive - friction (`ArmSteps`).
 
 Friction is an elastic element whose force is limited: to level + excess exp(-|v| / fall) at the speed v
 before a step (Stribeck), reached after a deflection by `presliding`; law is (level, presliding, excess,
-fall). The mean force over a step follows from the deflection in the middle of it (implicit). A sample has 32
-steps: with a pre-sliding of ten microradians and samples of 5 ms the position is right to a hundredth of a
-milliradian. Half a sample of slipping in one direction is taken at once.
+fall). The mean force over a step follows from the deflection in the middle of it (implicit). Steps are as
+long in every log (`steps_of`), a 32nd of a sample of 5 ms: with a pre-sliding of ten microradians the
+position is right to a hundredth of a milliradian. Half a sample of slipping in one direction is taken at
+once.
 
 The friction is told as the held force that moves a slow arm just as far: its mean plus (M of the sample
 before - M of the sample after) / 2, M the first moment of the force about the middle of a sample.
@@ -24,17 +25,29 @@ from ident.data.arrays import COMPILED, INSIDE
 
 # Strides of a sample: half a sample of slipping is taken at once.
 STRIDES = 2
-# Steps of a stride. With 32 steps of a sample the position is right to a hundredth of a milliradian (module's
-# docstring); twice as many take twice the time.
-_STEPS = 16
-# Steps of a sample.
-STEPS = STRIDES * _STEPS
-# Steps of a sample of the load behind a spring. Chosen: its swing is slower than a shaft's stop.
-_LOAD_STEPS = 8
+# Length of a step, s: the position is right to a hundredth of a milliradian then (module's docstring); half
+# of it takes twice the time.
+_STEP_S = 5e-3 / 32
+# Steps of a stride at least: a turn within a sample is still seen.
+_FEWEST_STEPS = 4
+# At most: logs slower than 200 Hz have longer steps, and take no more time a sample.
+_MOST_STEPS = 16
+# Length of a step of the load behind a spring, s. Chosen: its swing is slower than a shaft's stop.
+_LOAD_STEP_S = 5e-3 / 8
+# Steps of the load in a sample at least, as those of the shaft.
+_FEWEST_LOAD_STEPS = 2
+# At most, as those of the shaft.
+_MOST_LOAD_STEPS = 8
 # Speed, in units of `fall`, from which on the excess is gone: e^-8 of it is left, 3e-4.
 _EXCESS_GONE = 8.0
 # Smallest normal double: a level or pulse of zero must not be divided by.
 _TINY = np.finfo(np.float64).tiny
+
+
+def steps_of(dt_s: float) -> int:
+    """Steps of a stride in a sample of dt_s, s."""
+    steps = int(np.ceil(dt_s / (STRIDES * _STEP_S)))
+    return min(max(steps, _FEWEST_STEPS), _MOST_STEPS)
 
 
 class ArmSteps(NamedTuple):
@@ -77,6 +90,8 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
         Level, presliding, excess, fall.
     """
     n = state.size
+    n_steps = arm.pulse.size
+    n_in_sample = STRIDES * n_steps
     # What a unit of effort adds to the position in one step.
     gain = max(arm.pulse[0], _TINY)
     level = law[0]
@@ -89,7 +104,7 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
     breakaway = max(level + excess, _TINY)
     stiffness = breakaway / presliding
     limit = level
-    steps_per_s = STEPS / dt_s
+    steps_per_s = n_in_sample / dt_s
     largest_deflection = max(limit, _TINY) / stiffness
     # Stiffness of element and arm in series over half a step: the step is implicit.
     soft = stiffness / (1 + 0.5 * stiffness * gain)
@@ -100,7 +115,7 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
     for stride in range(STRIDES):
         # Positions that the arm would have without friction, from the state on.
         pulses = 0.0
-        for i in range(_STEPS):
+        for i in range(n_steps):
             pulses += arm.pulse[i]
             free[i] = pulses * drive
             for j in range(n):
@@ -111,52 +126,52 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
         constant = excess == 0 or abs(speed) > _EXCESS_GONE * fall
         if constant and abs(deflection) >= max(level, _TINY) / stiffness:
             force = level if deflection > 0 else -level
-            end = free[_STEPS - 1] - pulses * force
+            end = free[n_steps - 1] - pulses * force
             speed = arm.slope[n] * (drive - force)
             start_speed = speed
             for i in range(n):
                 start_speed += arm.slope[i] * state[i]
-                free[_STEPS + i] = arm.held[i] * (drive - force)
+                free[n_steps + i] = arm.held[i] * (drive - force)
                 for j in range(n):
-                    free[_STEPS + i] += arm.stride[i, j] * state[j]
-                speed += arm.slope[i] * free[_STEPS + i]
+                    free[n_steps + i] += arm.stride[i, j] * state[j]
+                speed += arm.slope[i] * free[n_steps + i]
             still_constant = excess == 0 or abs(speed) > _EXCESS_GONE * fall
             if (end - position) * deflection > 0 and speed * deflection > 0 and still_constant:
                 for j in range(n):  # state[:] = ... compiles for two seconds
-                    state[j] = free[_STEPS + j]
+                    state[j] = free[n_steps + j]
                 position = end
-                total += _STEPS * force
-                moment += _STEPS * force * (_STEPS * (stride + 0.5) - 0.5 * STEPS)
+                total += n_steps * force
+                moment += n_steps * force * (n_steps * (stride + 0.5) - 0.5 * n_in_sample)
                 continue
             speed = start_speed
 
         # Otherwise step by step: each force moves the positions and the final state that follow it.
         for i in range(n):
-            free[_STEPS + i] = arm.held[i] * drive
+            free[n_steps + i] = arm.held[i] * drive
             for j in range(n):
-                free[_STEPS + i] += arm.stride[i, j] * state[j]
-        for step in range(_STEPS):
+                free[n_steps + i] += arm.stride[i, j] * state[j]
+        for step in range(n_steps):
             if excess != 0:
                 limit = max(level + excess * np.exp(abs(speed) * fading), 0.0)
                 largest_deflection = yields * max(limit, _TINY)
             force = soft * (deflection + 0.5 * (free[step] - position))
             force = min(max(force, -limit), limit)
             total += force
-            moment += force * (_STEPS * stride + step + 0.5 - 0.5 * STEPS)
+            moment += force * (n_steps * stride + step + 0.5 - 0.5 * n_in_sample)
             end = free[step] - gain * force
             deflection = min(max(deflection + end - position, -largest_deflection), largest_deflection)
             speed = (end - position) * steps_per_s
             position = end
-            for i in range(step + 1, _STEPS):
+            for i in range(step + 1, n_steps):
                 free[i] -= arm.pulse[i - step] * force
             for j in range(n):
-                free[_STEPS + j] -= arm.pushes[step, j] * force
+                free[n_steps + j] -= arm.pushes[step, j] * force
         for j in range(n):
-            state[j] = free[_STEPS + j]
+            state[j] = free[n_steps + j]
     shaft[0] = position
     shaft[1] = deflection
     shaft[2] = speed
-    return total / STEPS, moment / STEPS**2
+    return total / n_in_sample, moment / n_in_sample**2
 
 
 @numba.njit(**COMPILED)
@@ -180,7 +195,7 @@ def step_through(
     moments = np.empty(drive.size)
     state = np.zeros(n)
     shaft = np.zeros(3)
-    free = np.empty(_STEPS + n)
+    free = np.empty(arm.pulse.size + n)
     for k in range(drive.size):
         position[k] = shaft[0]
         if correction.size:
@@ -214,9 +229,12 @@ def hold_load(load: Any, start: float, end: float, spring: Any, dt_s: float) -> 
     -----
     Each step is half a drift, a kick in the middle, half a drift.
     """
-    step_s = dt_s / _LOAD_STEPS
+    n_steps = min(max(int(np.ceil(dt_s / _LOAD_STEP_S)), _FEWEST_LOAD_STEPS), _MOST_LOAD_STEPS)
+    step_s = dt_s / n_steps
     soft = spring[0] ** 2
     damp = 2 * spring[1] * spring[0]
+    # The damper's force is that of the speed in the middle of a step.
+    halved = 1 / (1 + 0.5 * damp * step_s)
     level = spring[2]
     excess = spring[3]
     fall = spring[4]
@@ -226,28 +244,41 @@ def hold_load(load: Any, start: float, end: float, spring: Any, dt_s: float) -> 
     held_speed = load[3]
     motor_speed = (end - start) / dt_s
     total = 0.0
-    for step in range(_LOAD_STEPS):
+    for step in range(n_steps):
         place += 0.5 * step_s * speed
         held_place += 0.5 * step_s * held_speed
         twist = start + (step + 0.5) * step_s * motor_speed - place
-        # Friction takes away speed, at most all of it: then the load stands and pulls back what the spring
-        # pulls.
-        free_speed = speed + step_s * (soft * twist + damp * (motor_speed - speed))
+        # What the spring pulls, as an acceleration, and what friction takes of it.
+        pull = halved * (soft * twist + damp * (motor_speed - speed))
         breakaway = 1.0 if excess == 0 else 1 + excess * np.exp(-abs(speed) / fall)
-        slipping = max(abs(free_speed) - step_s * level * breakaway, 0.0)
-        force = np.sign(free_speed) * (
-            (abs(free_speed) - slipping) / (step_s * level) if level > 0 else breakaway
-        )
-        speed = np.sign(free_speed) * slipping
-        held_speed += step_s * (force - soft * held_place - damp * held_speed)
-        total += soft * held_place + damp * held_speed
+        resists = halved * level * breakaway
+        way = np.sign(speed)
+        slips_s = step_s
+        if way * (speed + step_s * pull) < step_s * resists:
+            # The load stops within the step: a turn counts when it happens, not with the step.
+            slips_s = way * speed / max(resists - way * pull, _TINY)
+        rests_s = step_s - slips_s
+        # Then it stands and pulls back what the spring pulls, or is pulled off the other way.
+        back = np.sign(pull)
+        over = max(abs(pull) - resists, 0.0)
+        if slips_s == step_s:
+            speed += step_s * (pull - way * resists)
+        else:
+            speed = back * over * rests_s
+        if level > 0:
+            force = (way * resists * slips_s + (pull - back * over) * rests_s) / (step_s * halved * level)
+        else:
+            force = breakaway * np.sign(speed)
+        change = step_s * halved * (force - soft * held_place - damp * held_speed)
+        total += soft * held_place + damp * (held_speed + 0.5 * change)
+        held_speed += change
         place += 0.5 * step_s * speed
         held_place += 0.5 * step_s * held_speed
     load[0] = place
     load[1] = speed
     load[2] = held_place
     load[3] = held_speed
-    return total / _LOAD_STEPS
+    return total / n_steps
 
 
 @numba.njit(**COMPILED)
@@ -272,7 +303,7 @@ def loop_through(
     steps: Any,
     delay: int,
     input_delay: int,
-    lag: float,
+    lag: Any,
     arm: ArmSteps,
     dt_s: float,
     law_of_friction: Any,
@@ -299,8 +330,9 @@ def loop_through(
         Of measurement and command, 0 for none.
     delay, input_delay : int
         Samples until a command is given to the arm, and until it acts.
-    lag : float
-        Of the drive between both, in samples.
+    lag : ndarray, shape (2,)
+        Of the drive between both: pole of its state, and share of a sample by which its mean over the sample
+        stays with the state (`ident.friction.gauss_newton.lag_filter`); zeros for none.
     arm : ArmSteps
     dt_s : float
     law_of_friction : ndarray, shape (4,)
@@ -317,11 +349,11 @@ def loop_through(
     x = np.zeros(order)
     later = np.zeros(order)
     shaft = np.zeros(3)
-    free = np.empty(_STEPS + arm.held.size)
+    free = np.empty(arm.pulse.size + arm.held.size)
     last = 0.0
     load = np.zeros(4)
     load_force = 0.0
-    applied = 0.0
+    driven = 0.0
     queue = np.zeros(delay + 1)
     waiting = np.zeros(input_delay + 1)
     for k in range(reference.size):
@@ -352,7 +384,9 @@ def loop_through(
         command[k] = u
         limited[k] = last != wanted
         waiting[k % (input_delay + 1)] = u
-        applied += (waiting[(k + 1) % (input_delay + 1)] - applied) / (1 + lag)
+        given = waiting[(k + 1) % (input_delay + 1)]
+        applied = given - lag[1] * (given - driven)
+        driven = given - lag[0] * (given - driven)
 
         # The arm, and the load behind it.
         before = shaft[0]

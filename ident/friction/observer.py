@@ -11,10 +11,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import solve_discrete_are
 from scipy.signal import sosfilt, zpk2sos
 
 from ident.data.arrays import ComplexArray, RealArray
@@ -25,16 +23,18 @@ from ident.friction.inverse_dynamics import noise_of
 
 # Ratios of force to noise of the position that are tried first, in units of rms command per noise: from an
 # observer slower than the arm to one of the last two samples. Chosen; eleven in five decades, factors of 3.2.
-_RATIOS = np.geomspace(1e-4, 10, 11)
-# Factors about the ratio of an earlier observer that are tried afterwards: arm and friction have changed a
-# little since, and repeated calls may walk further.
-NEARBY = np.array([0.5, 1.0, 2.0])
+_RATIOS = np.geomspace(1e-5, 1, 11)
 # Share of the force's variance that each state takes by itself, so that equal poles have a filter, too.
 # Chosen: far above rounding, far below the force.
 _OWN_SHARE = 1e-9
 # Smallest weight of a state, as a share of the largest, by which states are scaled. Chosen: it only keeps a
 # state that the force does not reach from a division by zero.
 _SMALLEST_WEIGHT = 1e-12
+# Doublings of the time over which a covariance is told, at most: 2^50 samples are longer than any arm's
+# memory.
+_MOST_DOUBLINGS = 50
+# Change of the covariance in a doubling, as a share of it, at which it is steady. Rounding of doubles.
+_STEADY = 1e-13
 # An observer that has forgotten its start to this has settled. Chosen.
 _FORGOTTEN = 1e-3
 # Largest slowest pole of an observer for which the settling is computed: at 1 its logarithm is zero.
@@ -63,7 +63,7 @@ def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> Com
 
     Raises
     ------
-    ValueError or LinAlgError
+    ValueError
         The Riccati equation has no solution.
     """
     a, b, c = _real_form(arm, coefficients)
@@ -73,7 +73,7 @@ def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> Com
     b = b / size
     c = c * size
     noise = ratio**2 * (np.outer(b, b) + _OWN_SHARE * np.eye(b.size))
-    p = solve_discrete_are(a.T, c[:, None], noise, np.ones((1, 1)))
+    p = _steady_covariance(a, c, noise)
     gain = size * (p @ c) / (c @ p @ c + 1)
 
     # Real parts come first, then the imaginary parts of states that swing.
@@ -83,6 +83,56 @@ def correction_of(arm: SteppedArm, coefficients: RealArray, ratio: float) -> Com
     correction[first] = gain[:n_first]
     correction[first & arm.swings] += 1j * gain[n_first:]
     return correction
+
+
+def _steady_covariance(a: RealArray, c: RealArray, noise: RealArray) -> RealArray:
+    """Steady covariance P (M, M) of what a Kalman filter predicts of the states.
+
+    Parameters
+    ----------
+    a : ndarray, shape (M, M)
+        Transition of the states.
+    c : ndarray, shape (M,)
+        Of the states onto the measured position, whose noise has variance 1.
+    noise : ndarray, shape (M, M)
+        Covariance of what drives the states in a sample.
+
+    Returns
+    -------
+    ndarray, shape (M, M)
+        P = a (P - P c c' P / (c' P c + 1)) a' + noise.
+
+    Raises
+    ------
+    ValueError
+        The doublings do not end.
+
+    Notes
+    -----
+    Structured doubling: after k rounds covariance and transition are those over 2^k samples (Chu, Fan, Lin
+    and Wang, International Journal of Control 77(8), 2004). Near cancelling states, where an ordered Schur
+    form has no finite solution, it still has one.
+    """
+    transition = a.T
+    gain = np.outer(c, c)
+    covariance = noise
+    unit = np.eye(c.size)
+    for _ in range(_MOST_DOUBLINGS):
+        with np.errstate(over="ignore", invalid="ignore"):
+            try:
+                solved = np.linalg.solve(unit + gain @ covariance, np.hstack([transition, gain]))
+            except np.linalg.LinAlgError:
+                break
+            onward = solved[:, : c.size]
+            added = transition.T @ covariance @ onward
+            gain = gain + transition @ solved[:, c.size :] @ transition.T
+            transition = transition @ onward
+        if not np.all(np.isfinite(added)):
+            break
+        covariance = covariance + 0.5 * (added + added.T)
+        if np.abs(added).max() <= _STEADY * np.abs(covariance).max():
+            return covariance
+    raise ValueError("no steady observer follows this arm")
 
 
 def _real_form(arm: SteppedArm, coefficients: RealArray) -> tuple[RealArray, RealArray, RealArray]:
@@ -139,53 +189,47 @@ class ObserverFilter:
         )
 
 
-@lru_cache(maxsize=64)
-def prediction_errors(fit: FrictionFit, records: tuple[Record, ...]) -> float:
-    """Sum of squares of the prediction errors (output units squared), without the start of each record.
-
-    Infinite where the simulation is lost. Answers of recent fits are remembered: steps compare one fit many
-    times.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        residuals = [fit.residual(record) for record in records]
-        total = sum(float(np.sum(part[part.size // _START :] ** 2)) for part in residuals)
-    return total if np.isfinite(total) else np.inf
+def command_per_noise(records: Sequence[Record]) -> float:
+    """Rms command over the noise of the position, units of the input per output unit: a force that no command
+    exceeds beside that noise is the largest `FrictionFit.ratio` which means anything."""
+    noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
+    rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
+    return float(rms / noise)
 
 
-def observed(fit: FrictionFit, records: Sequence[Record], nearby: RealArray = NEARBY) -> FrictionFit:
-    """A fit with the observer that predicts its records best.
+def observed(fit: FrictionFit, records: Sequence[Record]) -> FrictionFit:
+    """A fit with the observer that predicts its records best, among some ratios of force to noise.
 
     Parameters
     ----------
     fit : FrictionFit
-        Without an observer all ratios of force to noise are tried, with one those near its own.
     records : sequence of Record
-    nearby : ndarray, shape (K,)
-        Ratios that are tried, as shares of the ratio of the observer that the fit has.
 
     Returns
     -------
     FrictionFit
+        A start: the ratio is a parameter of the descent that follows (`ident.friction.descent`).
 
     Raises
     ------
     LostError
         No observer follows the records.
     """
-    noise = np.sqrt(np.mean([noise_of(record.output[:, 0]) ** 2 for record in records]))
-    rms = np.sqrt(np.mean([np.mean(record.input**2) for record in records]))
-    ratios = _RATIOS * rms / noise if fit.correction is None else fit.ratio * nearby
     best = None
     least_errors = np.inf
-    for ratio in ratios:
-        with suppress(ValueError, np.linalg.LinAlgError):
+    for ratio in _RATIOS * command_per_noise(records):
+        with suppress(ValueError):
             correction = correction_of(fit.arm, fit.coefficients, float(ratio))
             candidate = replace(fit, correction=correction, ratio=float(ratio))
-            errors = prediction_errors(candidate, tuple(records))
+            errors = 0.0
+            with np.errstate(over="ignore", invalid="ignore"):
+                for record in records:
+                    residual = candidate.residual(record)
+                    errors += float(np.sum(residual[residual.size // _START :] ** 2))
             # The first one stands even where its errors are infinite: the fit may still step out of there.
             if best is None or errors < least_errors:
                 best = candidate
-                least_errors = errors
+                least_errors = errors if np.isfinite(errors) else np.inf
     if best is None:
         raise LostError
     return best

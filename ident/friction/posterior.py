@@ -28,8 +28,8 @@ from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
-from ident.friction.in_loop import ROUNDS, heterogeneity
 from ident.friction.inverse_dynamics import smoothed, speed_classes
+from ident.friction.widths import heterogeneity
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
 from ident.uncertainty.embedding_rows import Beside
@@ -65,6 +65,8 @@ _FASTEST_FURTHER = 3
 _ABOVE_MODES = 1.1
 # Largest change of the logarithm of a decay rate in a round: a factor of e.
 _LARGEST_LOG_STEP = 1
+# Rounds in which real poles are moved, at most. Chosen: they end where none is outside its interval.
+_ROUNDS = 6
 # Powers of s that a part of the friction may look like: stiffness, damping, inertia.
 _FORCES = 3
 
@@ -196,7 +198,7 @@ def _behind_observed(
     # Viscous and dry friction trade: a pole moved far beyond its interval would turn the tangent round below
     # the data. So real poles are moved, and the regression is repeated, until each is within its interval.
     classes = [speed_classes(record) for record in records]
-    for rounds_left in reversed(range(ROUNDS)):
+    for rounds_left in reversed(range(_ROUNDS)):
         response, change, factor = tangent_beside(
             frictionless,
             replace(model, poles=poles),

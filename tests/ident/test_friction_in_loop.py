@@ -17,8 +17,8 @@ from ident.data.arrays import RealArray, real_rows
 from ident.data.record import Record
 from ident.friction import FrictionFit, fit_friction, identify_behind, without_friction
 from ident.friction.arm import FrictionLaw
+from ident.friction.command_causes import recorded_in_loop, with_commands_in_time
 from ident.friction.gauss_newton import LostError, least_squares
-from ident.friction.in_loop import recorded_in_loop, with_commands_in_time
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
 from ident.friction.posterior import of_force
 from ident.friction.spring import Spring

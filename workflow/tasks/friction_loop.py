@@ -27,6 +27,7 @@ from control_design.specification import GIVES_WAY, Specification
 from ident.data.arrays import RealArray, kernel_array
 from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
+from ident.friction.gauss_newton import lag_steps
 from ident.friction.kernel import loop_through
 from ident.resampling import resampled_friction
 from workflow.tasks.loop_sensitivity import (
@@ -113,7 +114,7 @@ class FrictionLoop:
             np.array([self.measurement_step, self.command_step]),
             law.computational_delay_samples,
             arm.structure.input_delay_samples,
-            self.found.lag,
+            lag_steps(self.found.lag),
             arm.stepped(weights),
             arm.dt_s,
             self.friction.array,
