@@ -11,6 +11,7 @@ distance from z = 1, so that slow poles keep their digits. Neglected: rounding.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +58,7 @@ class FrequencyIntervals:
     half_width: Real
     dt_s: float
 
-    @property
+    @cached_property
     def z_minus_1(self) -> Complex:
         """e^{j omega dt} - 1 at the centres, (F,) complex, without the cancellation near omega = 0.
 

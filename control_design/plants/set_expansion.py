@@ -2,10 +2,10 @@
 
 The ellipse at omega is {centre + sum_q x_q generator_q : x real, |x| <= 1}, the generators scaled to the
 level. For a posterior over coefficients of basis functions, centre and generators are rational with known
-poles, so they expand on whole intervals (`posterior_expansion`); a stated uncertainty brings its own
-expansion. A response known on its own frequencies only needs an assumption between them: straight lines
-(`own_grid_set`, and `StraightBetween` for who asks at single frequencies). `expandable` chooses among these
-for a channel.
+poles, so they expand on whole intervals (`posterior_expansion`), to second order until they are summed, as
+their coefficients may nearly cancel; a stated uncertainty brings its own expansion. A response known on its
+own frequencies only needs an assumption between them: straight lines (`own_grid_set`, and `StraightBetween`
+for who asks at single frequencies). `expandable` chooses among these for a channel.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
+from control_design.plants import second_order
 from control_design.plants.ellipses import Boolean, Complex, Real, quotient, radius_of
 from control_design.plants.first_order import FirstOrder, FrequencyIntervals, RationalResponse
 from control_design.plants.plant_set import PlantChannel, UncertainPlant
+from control_design.plants.second_order import SecondOrder
 from ident.basis.functions import block_parameters
 from ident.basis.poles import Poles
 from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
@@ -179,15 +181,15 @@ def posterior_expansion(
 
     Notes
     -----
-    Every column of the response is rational, so it expands factor by factor. Neglected: rounding.
+    Every column of the response is rational, so it expands factor by factor (`plants.second_order`).
+    Neglected: rounding.
     """
-    value, slope, remainder = _columns(posterior, intervals)
+    columns = _columns(posterior, intervals)
     factor = np.array(posterior.covariance_factor)
     mean = np.array(posterior.mean)
-    half_width = intervals.half_width
-    centre = FirstOrder(value @ mean, slope @ mean, remainder @ np.abs(mean), half_width)
-    factor_size = np.linalg.norm(factor, axis=1)
-    generators = FirstOrder(value @ factor, slope @ factor, remainder @ factor_size, half_width)
+    centre = _combined(columns, mean[:, None], intervals.half_width)
+    centre = replace(centre, value=centre.value[:, 0], slope=centre.slope[:, 0])
+    generators = _combined(columns, factor, intervals.half_width)
     # Integrators and delay are common to all columns: 1/(1 - z^-1)^i z^-d = z^(i - d)/(z - 1)^i.
     common = intervals.shift(posterior.integrators - posterior.input_delay_samples)
     common = common.times(intervals.cleared(cleared - posterior.integrators))
@@ -199,8 +201,38 @@ def posterior_expansion(
     return common.times(centre), common.times(generators)
 
 
-def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tuple[Complex, Complex, Real]:
-    """Value, slope and remainder, (F, P) each, of the response's columns on F intervals.
+class _Columns(NamedTuple):
+    """Expansions of P functions to second order on F intervals: (F, P) each, as of `SecondOrder`."""
+
+    value: Complex
+    slope: Complex
+    curvature: Complex
+    remainder: Real
+
+
+def _combined(columns: _Columns, coefficients: Real, half_width: Real) -> FirstOrder:
+    """Sums (F, Q) of P columns times coefficients (P, Q), to first order on intervals of half_width (F,).
+
+    Values, slopes and curvatures are summed with their signs, so that what cancels does; what the curvature
+    adds at the ends counts as remainder.
+
+    Shapes that do not fit are numpy's ValueError.
+    """
+    n_intervals = half_width.size
+    # Real and imaginary parts one below the other: a product of real matrices takes half the time.
+    parts = (columns.value, columns.slope, columns.curvature)
+    rows = np.concatenate([part for each in parts for part in (each.real, each.imag)])
+    sums = (rows @ coefficients).reshape(3, 2, n_intervals, coefficients.shape[1])
+    value = sums[0, 0] + 1j * sums[0, 1]
+    slope = sums[1, 0] + 1j * sums[1, 1]
+    curvature = np.sqrt(np.einsum("kfq,kfq->f", sums[2], sums[2]))
+    coefficient_size = np.linalg.norm(coefficients, axis=1)
+    remainder = 0.5 * half_width**2 * curvature + columns.remainder @ coefficient_size
+    return FirstOrder(value, slope, remainder, half_width)
+
+
+def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> _Columns:
+    """Expansions (F, P) of the response's columns on F intervals.
 
     There is one column for each coefficient of the posterior (as in `ResponsePosterior.frequency_rows`):
     basis functions of real poles and of pairs, the feedthrough, lags of the impulse response and, for an
@@ -210,27 +242,28 @@ def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tup
     posterior: `poles`, `has_feedthrough`, `fir_length`, `unstable` and `mean` (P,) are read; it has checked
     itself.
     """
-    columns: list[FirstOrder] = []
+    columns: list[SecondOrder] = []
     # Each basis function is a section of its own pole behind the all-passes of the poles before it.
-    all_pass = intervals.constant(1.0)
+    all_pass = second_order.constant(intervals, 1.0)
     parameters = block_parameters(posterior.poles).tolist()
     for real_pole, (_, gain, _, _) in zip(posterior.poles.real, parameters, strict=False):
-        driven = all_pass.times(intervals.pole(complex(real_pole - 1.0)))
+        driven = all_pass.times(second_order.pole(intervals, complex(real_pole - 1.0)))
         columns.append(driven.scaled(gain))
         all_pass = driven.times(_reflected_zero(complex(real_pole), intervals))
     # A pair has two functions: one with a zero at beta, and one without, orthogonal to it.
     pair_parameters = parameters[posterior.poles.real.size :]
     for pair, (_, beta, gain, gain_ratio) in zip(posterior.poles.pairs, pair_parameters, strict=True):
-        driven = all_pass.times(intervals.pole(pair - 1.0))
-        driven = driven.times(intervals.pole(pair.conjugate() - 1.0))
-        columns.append(driven.times(intervals.zero(complex(beta - 1.0))).scaled(gain))
+        driven = all_pass.times(second_order.pole(intervals, pair - 1.0))
+        driven = driven.times(second_order.pole(intervals, pair.conjugate() - 1.0))
+        zero = second_order.linear(intervals, complex(1.0 - beta), 1.0)
+        columns.append(driven.times(zero).scaled(gain))
         columns.append(driven.scaled(gain * gain_ratio))
         all_pass = driven.times(_reflected_zero(pair, intervals))
         all_pass = all_pass.times(_reflected_zero(pair.conjugate(), intervals))
     if posterior.has_feedthrough:
-        columns.append(intervals.constant(1.0))
+        columns.append(second_order.constant(intervals, 1.0))
     for lag in range(1, posterior.fir_length + 1):
-        columns.append(intervals.shift(-lag))
+        columns.append(second_order.shift(intervals, -lag))
     # The derivative of (stable part)/B by an unstable pole is -(stable part)/B times that of log B.
     if posterior.unstable.order:
         coefficients = posterior.mean.tolist()
@@ -238,14 +271,15 @@ def _columns(posterior: ResponsePosterior, intervals: FrequencyIntervals) -> tup
         minus_mean = reduce(add, weighted)
         for slope in _log_all_pass_slopes(posterior.unstable, intervals):
             columns.append(minus_mean.times(slope))
-    return (
+    return _Columns(
         np.stack([column.value for column in columns], axis=1),
         np.stack([column.slope for column in columns], axis=1),
+        np.stack([column.curvature for column in columns], axis=1),
         np.stack([column.remainder for column in columns], axis=1),
     )
 
 
-def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list[FirstOrder]:
+def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list[SecondOrder]:
     """Derivatives (F,) of log B by each parameter of the unstable poles, B their all-pass.
 
     unstable : Poles, held as their mirror images inside the circle. A real pole is one parameter; a pair is
@@ -254,14 +288,15 @@ def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list
     Not checked: a pole at 0 has no mirror image (ZeroDivisionError).
     """
 
-    def slope(p: complex) -> FirstOrder:
+    def slope(p: complex) -> SecondOrder:
         """Derivative of log B by p, which stands in z - p and in 1 - p z: 1/(z - p) - z/(1 - p z).
 
         ZeroDivisionError for p = 0.
         """
         # -z / (1 - p z) = 1/p + 1/p^2 / (z - 1/p)
-        mirrored = intervals.constant(1 / p) + intervals.pole(1 / p - 1.0).scaled(1 / p**2)
-        return intervals.pole(p - 1.0) + mirrored
+        mirrored_pole = second_order.pole(intervals, 1 / p - 1.0).scaled(1 / p**2)
+        mirrored = second_order.constant(intervals, 1 / p) + mirrored_pole
+        return second_order.pole(intervals, p - 1.0) + mirrored
 
     slopes = [slope(complex(real_pole)) for real_pole in unstable.real.tolist()]
     for pair in unstable.pairs.tolist():
@@ -272,14 +307,13 @@ def _log_all_pass_slopes(unstable: Poles, intervals: FrequencyIntervals) -> list
     return slopes
 
 
-def _reflected_zero(p: complex, intervals: FrequencyIntervals) -> FirstOrder:
+def _reflected_zero(p: complex, intervals: FrequencyIntervals) -> SecondOrder:
     """Expansion (F,) of 1 - conj(p) z, the numerator of an all-pass with the pole p.
 
     p: one complex number, not checked.
     """
     q = p.conjugate()
-    factor = intervals.zero(0.0).scaled(-q)
-    return FirstOrder(factor.value + (1.0 - q), factor.slope, factor.remainder, factor.half_width)
+    return second_order.linear(intervals, 1.0 - q, -q)
 
 
 def _in_range(grid: Real, low: Real, high: Real) -> Boolean:
