@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -28,7 +28,12 @@ from pydantic import Field, model_validator
 from control_design.controllers.biquads import SOLVER_SLACK, Cascade, SectionKind
 from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import lowest_rad_s
-from control_design.plants.plant_set import PlantChannel, UncertainPlant, count_integrators
+from control_design.plants.plant_set import (
+    Mode,
+    UncertainPlant,
+    count_integrators,
+    frequency_response,
+)
 from control_design.plants.weights import (
     RationalWeight,
     bandwidth_weight,
@@ -54,6 +59,9 @@ from control_design.specification.structure import (
     refuse_sampling,
 )
 from ident.data.settings import Settings
+
+if TYPE_CHECKING:
+    import control
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -589,26 +597,30 @@ class ModePeak(WeightedRequirement):
             band = (lowest_rad_s / _BAND_OF_MODE, lowest_rad_s * _BAND_OF_MODE)
         # Above Nyquist there is no response to take a peak of.
         band_end = min(band[1], plant.nyquist_rad_s)
-        open_loop_peak = _nominal_peak(plant.damped, band[0], band_end)
+        damped = plant.damped
+        open_loop_peak = _nominal_peak(damped.nominal, damped.modes, band[0], band_end)
         weight = constant_weight(1.0 / (spec.mode_peak_ratio * open_loop_peak))
         return cls(weight, band, channel=plant.performance)
 
 
-# Kept for the last 32 channels and bands: every grid of a synthesis asks for the requirements of its plant.
+# Kept for the last 32 models and bands: every grid of a synthesis asks for the requirements of its plant, and
+# a certificate for those of the plant at some twenty levels of its ellipses.
 @lru_cache(maxsize=32)
-def _nominal_peak(channel: PlantChannel, low_rad_s: float, high_rad_s: float) -> float:
-    """Largest nominal gain |Gp| of a channel in a band, on a grid that is finer around its modes.
+def _nominal_peak(
+    nominal: control.StateSpace, modes: tuple[Mode, ...], low_rad_s: float, high_rad_s: float
+) -> float:
+    """Largest gain of a channel's nominal in a band, on a grid that is finer around its modes.
 
     low_rad_s, high_rad_s: ends of the band, 0 < low < high, not checked: an empty band is numpy's ValueError,
     a band with an integrator's pole gives a huge value. Units of output per input.
     """
     omega = np.geomspace(low_rad_s, high_rad_s, _POINTS_OF_PEAK)
-    for mode in channel.modes:
+    for mode in modes:
         half_width = max(mode.zeta, _LEAST_DAMPING) * mode.omega_rad_s
         offsets = np.sinh(np.linspace(-_REACH_OF_MODE, _REACH_OF_MODE, _POINTS_OF_MODE))
         omega = np.append(omega, mode.omega_rad_s + half_width * offsets)
     is_in_band = np.logical_and(omega >= low_rad_s, omega <= high_rad_s)
-    response = channel.nominal_response(np.unique(omega[is_in_band]))
+    response = frequency_response(nominal, np.unique(omega[is_in_band]))
     return float(np.max(np.abs(response)))
 
 

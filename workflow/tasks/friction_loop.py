@@ -132,7 +132,13 @@ class FrictionLoop:
         run = self.run(np.pad(step if given is None else given, (0, held), mode="edge"))
         return replace(run, reference=np.pad(step, (0, held), mode="edge"))
 
-    def settling(self, step: RealArray, given: RealArray | None = None) -> SettlingRange:
+    def settling(
+        self,
+        step: RealArray,
+        given: RealArray | None = None,
+        *,
+        answer: ClosedLoopTrajectory | None = None,
+    ) -> SettlingRange:
         """Settling times over the sizes of a step, of half to twice this one (T,).
 
         Parameters
@@ -141,6 +147,8 @@ class FrictionLoop:
             The reference, in units of the output.
         given : (T,) array, optional
             What a reference filter makes of it.
+        answer : ClosedLoopTrajectory, optional
+            What `answer` gives for this step, where the caller has it: it is not run again.
 
         Notes
         -----
@@ -151,6 +159,8 @@ class FrictionLoop:
         dt_s = self.controller.dt_s
 
         def settling_time_s(share: float) -> float | None:
+            if share == 1.0 and answer is not None:
+                return step_metrics(answer).settling_time_s
             return step_metrics(self.answer(share * step, share * given)).settling_time_s
 
         shares = STEP_SHARES.tolist()
@@ -327,7 +337,7 @@ def check_friction(
         error_at_rest=error_at_rest,
         error_interval=_around(error_at_rest, found),
         step=step_metrics(run),
-        settling=fitted.settling(reference, given),
+        settling=fitted.settling(reference, given, answer=run),
         watched_s=error.size * controller.dt_s,
         left=float(np.max(error[error.size // 2 :])),
         output=run.measured[: _shown_samples(run, reference.size)],
@@ -365,7 +375,7 @@ def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> d
     answer = recorded.answer(step)
     return {
         "recorded": step_metrics(answer),
-        "recorded_settling": recorded.settling(step),
+        "recorded_settling": recorded.settling(step, answer=answer),
         "recorded_output": answer.measured[: step.size],
         "errors": errors,
     }
