@@ -91,6 +91,8 @@ def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     """
     # A misspelt key is also a missing one: the unknown key is what the reader can act on, so it goes first.
     details = sorted(error.errors(include_url=False), key=lambda detail: detail["type"] != "extra_forbidden")
+    # A list whose entries are refused is also too short: what encloses another complaint follows from it.
+    details = [detail for detail in details if not _encloses_another(detail, details)]
     if len(details) > 1 and all(detail["type"] == "missing" for detail in details):
         keys = [_walk(model, detail["loc"]).key for detail in details]
         return "missing keys " + ", ".join(keys)
@@ -98,6 +100,12 @@ def first_complaint(model: type[BaseModel], error: ValidationError) -> str:
     if len(details) > 1:
         complaint += f" (and {len(details) - 1} more)"
     return complaint
+
+
+def _encloses_another(detail: ErrorDetails, details: Sequence[ErrorDetails]) -> bool:
+    """Whether a complaint is about a place within which another of the complaints lies."""
+    place = detail["loc"]
+    return any(len(other["loc"]) > len(place) and other["loc"][: len(place)] == place for other in details)
 
 
 def meant(word: str, known: Sequence[str], what: str) -> str:

@@ -46,6 +46,29 @@ def test_own_data_needs_a_dozen_lines(tmp_path):
     assert config.input_files == [tmp_path / "log.csv"]
 
 
+def test_a_kept_configuration_states_the_same_from_anywhere(tmp_path, monkeypatch):
+    commented = MINIMAL.replace('"log.csv"', '"log.csv"  # of Monday')
+    (tmp_path / "log.csv").write_text("")
+    (tmp_path / "arm.toml").write_text(commented)
+    config, text = load_config(tmp_path / "arm.toml")
+    assert text == commented.replace("log.csv", str(tmp_path / "log.csv"))
+    (tmp_path / "elsewhere").mkdir()
+    kept = tmp_path / "elsewhere" / "config.toml"
+    kept.write_text(text)
+    assert load_config(kept) == (config, text)
+    # A variable of the environment is absolute by what it stands for.
+    monkeypatch.setenv("LOGS", str(tmp_path))
+    kept.write_text(MINIMAL.replace("log.csv", "${LOGS}/log.csv"))
+    assert load_config(kept) == (config, kept.read_text())
+
+
+def test_several_missing_logs_are_counted_once_each(tmp_path):
+    more = '[[source.records]]\npath = "b.csv"\n[[source.records]]\npath = "c.csv"\n[[channels]]'
+    (tmp_path / "arm.toml").write_text(MINIMAL.replace("[[channels]]", more))
+    with pytest.raises(InputError, match=r"records\[0\]\.path: no such file: .*log\.csv \(and 2 more\)$"):
+        load_config(tmp_path / "arm.toml")
+
+
 def test_document_round_trip_survives_a_moved_log(tmp_path):
     config = minimal(tmp_path)
     (tmp_path / "log.csv").unlink()

@@ -15,7 +15,7 @@ from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record
 from workflow.commands.init import decided
 from workflow.config.joints_config import AnyConfig, JointsConfig, load_any, load_simulation
-from workflow.config.run_config import FileSource, SimulatedSource, built_in_config
+from workflow.config.run_config import FileSource, SimulatedSource, built_in_config, with_absolute_paths
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
@@ -100,7 +100,7 @@ def run_from_files(
             return run_pipeline(
                 drafted,
                 place,
-                config_text=text,
+                config_text=with_absolute_paths(text, drafted),
                 called="logs",
                 page=page_of(drafted),
                 resume=resume,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from importlib import resources
 from itertools import combinations
@@ -18,7 +19,7 @@ from plant.experiment_plan import ExperimentPlan
 from workflow.config.design_options import AchievableOptions, CertificateOptions, ReferenceFilterSettings
 from workflow.config.log_reading import LogReading, TimeUnit
 from workflow.config.rig_settings import EffectTable, Excitation, Multisine, RigChoice
-from workflow.config.settings import InputPath, Section, check, repeated
+from workflow.config.settings import InputPath, Section, check, expand, repeated
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
 from workflow.engine.documents import read_toml
 
@@ -527,9 +528,73 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
 
 
 def loaded(kind: type[RunT], path: Path) -> tuple[RunT, str]:
-    """The same of another kind of run."""
+    """The same of another kind of run.
+
+    Returns
+    -------
+    config : RunT
+    text : str
+        As it was written, with absolute paths, so that it states the same wherever it is kept.
+
+    Raises
+    ------
+    InputError
+        As of `load_config`.
+    """
     text, document = read_toml(path)
-    return check(kind, document, source=str(path), context={"base": path.absolute().parent}), text
+    config = check(kind, document, source=str(path), context={"base": path.absolute().parent})
+    # Byte for byte where no path is relative.
+    if not _state_absolute_paths(document, config):
+        return config, text
+    return config, with_absolute_paths(text, config)
+
+
+def with_absolute_paths(text: str, config: AnyRun) -> str:
+    """The text of a configuration, which states the same wherever it is kept then. Comments stay."""
+    written = tomlkit.parse(text)
+    _state_absolute_paths(written, config)
+    return tomlkit.dumps(written)
+
+
+def _state_absolute_paths(stated: Any, found: Any) -> bool:
+    """Write absolute paths into a parsed document.
+
+    Parameters
+    ----------
+    stated : Any
+        Tables and lists as parsed; changed in place.
+    found : Any
+        What was read from them: settings, mappings and tuples.
+
+    Returns
+    -------
+    bool
+        Whether a path was changed. Those with variables of the environment stay where these make them
+        absolute.
+    """
+    pairs: list[tuple[Any, Any]]
+    if isinstance(stated, Mapping):
+        pairs = [(key, _part(found, key)) for key in stated]
+    elif isinstance(stated, list) and isinstance(found, tuple | list) and len(stated) == len(found):
+        # Of another length it is made from what is stated: records of a plan.
+        pairs = list(enumerate(found))
+    else:
+        return False
+    is_changed = False
+    for key, part in pairs:
+        value = stated[key]
+        if isinstance(part, Path) and isinstance(value, str):
+            if not os.path.isabs(expand(value)):
+                stated[key] = str(part)
+                is_changed = True
+        elif _state_absolute_paths(value, part):
+            is_changed = True
+    return is_changed
+
+
+def _part(found: Any, key: str) -> Any:
+    """What settings or a mapping have under a key; None where they have no such key."""
+    return found.get(key) if isinstance(found, Mapping) else getattr(found, key, None)
 
 
 def built_in_config() -> tuple[RunConfig, str]:

@@ -1,6 +1,6 @@
 """One run = one directory, written stage by stage, resumable after a kill at any point.
 
-    config.toml      the user's file, byte for byte
+    config.toml      the user's file, relative paths made absolute, so that a copy of it runs from anywhere
     config.json      what it states, checked, with absolute paths; a resumed run is compared with this
     manifest.json    versions, seed, SHA-256 of config and of every input file, timings, status
     stages/<name>.npz | .json
