@@ -448,8 +448,8 @@ class Specification(Settings):
             if abs(plant.dt_s - wanted_s) > _SAME_PERIOD * wanted_s:
                 raise SpecificationError(
                     f"controller_dt_s = {wanted_s:.6g} s, but plant {plant.name!r} is sampled every "
-                    f"{plant.dt_s:.6g} s: leave controller_dt_s out, or give it to flexlink run, which "
-                    "brings the arm to this rate"
+                    f"{plant.dt_s:.6g} s: leave controller_dt_s out, or give it to flexlink run "
+                    f"(--from RUN --controller-dt-s {wanted_s:.6g}), which brings the arm to this rate"
                 )
 
     def check_against(self, plants: Sequence[UncertainPlant]) -> None:

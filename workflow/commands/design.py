@@ -86,6 +86,12 @@ def load_asked(
     specification = (file if len(paths) > 1 else asked).specification
     if specification is None:
         raise InputError(f"{named}: no specification for all: give --spec FILE")
+    # What no controller of these plants' rate can have is a mistake in the file, not a result.
+    stated_in = named if file.specification is None else file.name
+    with naming(f"{stated_in}: specification"):
+        plants = [source.plant for source in sources]
+        specification.refuse_other_rate(plants)
+        specification.refuse_sampling(plants[0].dt_s)
     logged = [source.logged for source in sources if source.logged is not None]
     if len({(one.error, one.command) for one in logged}) > 1:
         raise InputError(f"{named}: the runs scale their columns differently: no controller fits all")

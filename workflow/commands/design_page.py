@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,8 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     RunResults,
 )
-from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import PLANT, STAGES
+from workflow.tasks.summary import title_of
 
 # Sections of a run's configuration that a design file states in their place.
 _OF_DESIGN_FILE = ("synthesis", "certificate", "achievable_performance", "reference_filter")
@@ -86,11 +87,14 @@ def write_design_page(
     InputError
         A stage of the run is missing or damaged, or the page cannot be written.
     """
-    from workflow.report.pages import REPORT  # loads what draws: a second
+    from workflow.report.pages import write_report  # loads what draws: a second
 
     design, certify, achievable, prefilter = designed
     changed: dict[str, Any] = {name: getattr(asked, name) for name in _OF_DESIGN_FILE}
-    shown = config.model_copy(update={**changed, "specification": specification})
+    earlier = RunDirectory.open(source)
+    headline = f"{page.name}: a design for the run {title_of(config, earlier)}"
+    about = config.run.model_copy(update={"title": headline})
+    shown = config.model_copy(update={**changed, "specification": specification, "run": about})
     not_run = ClosedLoopResult(skipped="flexlink design does not simulate it; flexlink run --from does")
     results = {
         "design": design,
@@ -99,12 +103,9 @@ def write_design_page(
         "reference_filter": prefilter,
         "closed_loop": not_run,
     }
-    earlier = RunDirectory.open(source)
     inputs = earlier.manifest()["inputs"]
     with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
-        # Named as the run, which is the page's headline.
-        run = RunDirectory(Path(folder) / source.resolve().name)
-        run.path.mkdir()
+        run = RunDirectory(Path(folder))
         run.begin_run(
             config_text=shown.to_toml(), config=shown.to_document(), seed=shown.run.seed, inputs=inputs
         )
@@ -114,5 +115,5 @@ def write_design_page(
         for stage in STAGES:
             if stage.name in results:
                 run.save_stage(stage.name, results[stage.name], stage_input_hash(stage, shown, run, inputs))
-        REPORT.run(StageInput(shown, RunResults(run), progress))
+        write_report(RunResults(run), shown, partial(progress.update, "report"), is_design=True)
         storage.write_bytes(page, run.report_path.read_bytes())

@@ -28,10 +28,13 @@ def write_report(
     config: AnyConfig,
     progress: Callable[[float, str], None] | None = None,
     also: Iterable[str] = (),
+    *,
+    is_design: bool = False,
 ) -> Path:
     """Draw every picture into `figures/`, and write `report.html`: all of them or none.
 
-    also: kinds of file beside SVG, pdf or png. Pictures of an earlier report that this run no longer has are
+    also: kinds of file beside SVG, pdf or png. is_design: the page will not stand among the run's files, and
+    names none of them. Pictures of an earlier report that this run no longer has are
     removed. Returns the path of the page. Raises InputError when a stage the report cannot do without is
     missing, or the disk refuses.
     """
@@ -44,6 +47,7 @@ def write_report(
         run=view(config, results, run.manifest()),
         study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
         certified=summarise(results, config).certified,
+        is_design=is_design,
     )
     return _write(run, page, also)
 

@@ -55,10 +55,10 @@ def make_records(stage: StageInput) -> RecordsResult:
     if timing is not None:
         timed = with_equivalent_command(timed, timing)
     if isinstance(stage.config, RunConfig) and stage.config.specification.controller_dt_s is not None:
-        with naming("specification"):
+        with naming(f"{stage.called}: specification"):
             ratio_of(timed[0].dt_s, stage.config.specification.controller_dt_s)
     if isinstance(stage.config, RunConfig):
-        with naming("specification"):
+        with naming(f"{stage.called}: specification"):
             stage.config.specification.refuse_sampling(timed[0].dt_s)
     records = list[RunRecord]()
     for about, record in zip(entries, timed, strict=True):
