@@ -426,7 +426,7 @@ def test_the_page_by_keyboard(server, browser):
     browser.go(server.url)
     designed(browser, 1)
     assert text(browser, "headline") == "Certified"
-    assert browser.ask("document.querySelectorAll('.panels svg').length") == 9
+    assert browser.ask("document.querySelectorAll('.panels svg[role=img]').length") == 9
     first = browser.ask("document.querySelector('.panels .nominal').getAttribute('d')")
     stated = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
     browser.ask("document.getElementById('c-effort_limit').focus()")
@@ -437,7 +437,7 @@ def test_the_page_by_keyboard(server, browser):
     moved = browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')")
     assert float(moved) < 0.6 * float(stated)
     assert browser.ask("document.querySelector('.panels .nominal').getAttribute('d')") != first
-    assert browser.ask("document.querySelectorAll('.panels .pinned').length") >= 6
+    assert browser.ask("document.querySelectorAll('.panels .curve.pinned').length") >= 6
     assert browser.ask("Number(document.body.dataset.scaled)") > 0
     browser.press("u")
     assert browser.ask("document.getElementById('c-effort_limit').getAttribute('aria-valuetext')") == stated
@@ -477,6 +477,18 @@ def test_controls_are_made_of_the_specification(session):
     assert known["controller_order"]["unasked"] == "auto"
     assert not {"mode_band_rad_s", "confidence"} & known.keys()  # of pairs, and of stated discs
     assert 1 <= int(dict(session.design({"controller_order": "auto"})["numbers"])["controller order"]) <= 12
+
+
+def test_what_follows_from_a_structure_is_said_and_not_set(folder, tmp_path):
+    asked = tmp_path / "pid.toml"
+    asked.write_text('structure = "pid"\nbandwidth_rad_s = 2.0\nlow_pass = { frequency_hz = 4.0 }\n')
+    session = TuningSession([folder / "arm.json"], read_design_file(asked), tmp_path / "out", 1)
+    of = {one["name"]: one.get("set_by_structure", {}) for one in session.settings()}
+    assert of["controller_order"]["pid"] == "structure pid has order 4"
+    assert of["controller_order"]["pi"] == "structure pi has order 3"
+    assert of["integrator"]["pd"] == "structure pd has no integrator"
+    assert "biquads" not in of["integrator"]
+    assert not of["bandwidth_rad_s"]
 
 
 def test_a_plant_of_its_own_grid_has_curves_on_it(session):

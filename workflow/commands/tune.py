@@ -71,7 +71,8 @@ class TuneServer(ThreadingHTTPServer):
 
     def page(self, nonce: str) -> str:
         session = self.session
-        settings = json.dumps(session.settings()).replace("<", "\\u003c")
+        settings = _of_script(session.settings())
+        unit = session.output_unit
         return (
             environment()
             .get_template("tune.html.j2")
@@ -85,11 +86,18 @@ class TuneServer(ThreadingHTTPServer):
                     if isinstance(value, dict | tuple)
                 ],
                 step=session.step_words,
+                step_size=session.step_size,
+                unit=_of_script(f" [{unit}]" if unit else ""),
                 filtered=session.filter is not None,
                 out=session.out,
                 name=next(name for k in count(1) if not (session.out / (name := f"tuned-{k}")).exists()),
             )
         )
+
+
+def _of_script(value: Any) -> str:
+    """A value as JSON that may stand in a script of a page: no tag begins or ends in it."""
+    return json.dumps(value).replace("<", "\\u003c")
 
 
 class _Request(BaseHTTPRequestHandler):

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import lru_cache, reduce
 from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import control
 import numpy as np
@@ -28,6 +28,7 @@ from control_design.plants.ellipses import Real
 from control_design.plants.frequency_grid import checked_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, modes_of
 from control_design.specification import GIVES_WAY, Specification, SpecificationError
+from control_design.specification.structure import order_of_structure
 from control_design.synthesis.synthesis import synthesise_near
 from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
@@ -67,6 +68,12 @@ _ENDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiveM
 Handler = Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
+_Structure = Literal["p", "pi", "pd", "pid"]
+_STRUCTURES: tuple[_Structure, ...] = get_args(_Structure)
+# Settings that follow from one of these structures.
+_SET_BY_STRUCTURE = ("controller_order", "integrator")
+
+
 class SupersededError(Exception):
     """A newer design was asked for."""
 
@@ -87,16 +94,17 @@ class TuningSession:
         self.drawable = all(level_can_change(plant) for plant in self._plants)
         self._last = None if found is None else found.design.controller
         # Overshoot, settling time and command are those of the run's reference step, through its filter.
-        self._step_size, self.filter = 1.0, None
+        self.step_size, self.filter = 1.0, None
         self._friction: FrictionStep | None = None
         if found is not None and found.run.stage_file("closed_loop") and found.closed_loop.check is not None:
-            self._step_size = found.closed_loop.check.reference_step
+            self.step_size = found.closed_loop.check.reference_step
             self.filter = found.reference_filter.filter
             friction = found.identify.friction
             if friction is not None and isinstance(sources[0].config, RunConfig):
                 steps = converter_steps(sources[0].config.closed_loop)
-                self._friction = FrictionStep(friction, self._step_size, steps)
-        self.step_words = si(self._step_size, self._units[1] or "in the unit of the output", 4)
+                self._friction = FrictionStep(friction, self.step_size, steps)
+        self.output_unit = self._units[1]
+        self.step_words = si(self.step_size, self.output_unit or "in the unit of the output", 4)
         self._newest, self._designing = 0, threading.Lock()
 
     # -- settings --------------------------------------------------------------------------------------------
@@ -107,6 +115,12 @@ class TuningSession:
         for limit in GIVES_WAY.values():
             del fields[limit]
         found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
+        for one in found:
+            if one is not None and one["name"] in _SET_BY_STRUCTURE:
+                one["set_by_structure"] = {
+                    structure: _words_of_structure(self.specification, structure, one["name"])
+                    for structure in _STRUCTURES
+                }
         if self.drawable:
             words = "confidence of each ellipse: share of the probability inside"
             about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
@@ -121,7 +135,7 @@ class TuningSession:
         document = self.specification.model_dump(mode="json", exclude_unset=True) | stated
         if document.get("structure", "biquads") != "biquads":
             # The page has a slider and a switch for what follows from such a structure.
-            for key in ("controller_order", "integrator"):
+            for key in _SET_BY_STRUCTURE:
                 document.pop(key, None)
         specification = check(Specification, document, source="settings")
         plants = self._plants if level is None else [at_level(plant, level) for plant in self._plants]
@@ -289,7 +303,7 @@ class TuningSession:
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
             y = nominal.measured
             # The step until it hardly moves: beyond its settling to 2 %.
-            away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self._step_size)
+            away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self.step_size)
             shown = min(y.size, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
             curves.append(
                 {
@@ -314,14 +328,14 @@ class TuningSession:
         """The reference step (T,) as long as the loop on the nominal model needs, through the run's filter if
         it has one."""
         radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
-        step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self._step_size)
+        step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self.step_size)
         return step if self.filter is None else self.filter.filtered(step)
 
     def _steps(self, law: Controller, plant: UncertainPlant) -> list[ClosedLoopTrajectory]:
         """The reference step on the nominal model, and on models drawn from the posterior where there is one;
         as a run predicts it (`workflow.tasks.closed_loop`)."""
         given = self._given(law, plant)
-        step = np.full(given.size, self._step_size)
+        step = np.full(given.size, self.step_size)
         models = [plant.nominal]
         if isinstance(plant.uncertainty, ResponsePosterior):
             models = _models(plant.uncertainty, self.seed)
@@ -387,6 +401,15 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
         "im": short(line.imag),
         "ellipses": [[short(one.real), short(one.imag)] for one in outline],
     }
+
+
+def _words_of_structure(specification: Specification, structure: _Structure, key: str) -> str:
+    """What a structure has in place of a setting, "structure pid has order 4", with the notches and low-pass
+    of the specification; key: one of `_SET_BY_STRUCTURE`."""
+    if key == "integrator":
+        return f"structure {structure} has {'an' if structure in ('pi', 'pid') else 'no'} integrator"
+    of_structure = specification.model_copy(update={"structure": structure})
+    return f"structure {structure} has order {order_of_structure(of_structure)}"
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:

@@ -39,7 +39,7 @@ for (const one of SETTINGS) {
     controls[one.name] = one.kind === "switch" ? {get: () => box.checked, set: v => box.checked = v}
       : {get: () => box.value, set: v => box.value = v};
     controls[one.name].set(one.value);
-    box.addEventListener("change", () => design());
+    box.addEventListener("change", () => { follow(); design(); });
     continue;
   }
   const whole = one.kind === "count", top = one.le ?? one.lt, bottom = one.ge ?? one.gt ?? 0;
@@ -73,8 +73,17 @@ for (const one of SETTINGS) {
   });
   asked.addEventListener("change", () => design());
 }
+// What follows from a structure is said, not set.
+const follow = () => {
+  for (const one of SETTINGS.filter(one => one.set_by_structure)) {
+    const words = one.set_by_structure[controls.structure.get()] ?? "", row = $("c-" + one.name).closest(".control");
+    for (const input of row.querySelectorAll("input, select")) input.disabled = !!words;
+    (row.querySelector("small") ?? make("small", row)).textContent = words;
+  }
+};
+follow();
 const settings = () => Object.fromEntries(Object.entries(controls).map(([name, one]) => [name, one.get()]));
-const restore = values => Object.entries(values).forEach(([name, v]) => controls[name].set(v));
+const restore = values => { Object.entries(values).forEach(([name, v]) => controls[name].set(v)); follow(); };
 
 // -- designs --
 let shown = null, pinned = null, past = [], number = 0, busy = 0, timer = 0, waiting = false, scaling = false;
@@ -203,10 +212,19 @@ const numbers = () => {
       make("td", row, words, {"data-head": head});
   }
 };
-// One panel: x and y as [low, high, log]; returns places and the group for curves, cut at the frame.
-const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords, even = false) => {
+// Samples of lines with their words: [[look, words], ...].
+const keys = (box, samples) => {
+  for (const [look, words] of samples) {
+    const entry = make("span", box);
+    draw("path", draw("svg", entry, {viewBox: "0 0 26 9", "aria-hidden": "true"}), {class: look, d: "M0 5H26"});
+    entry.append(words);
+  }
+};
+// One panel: x and y as [low, high, log]; returns places and the group for curves, cut at the frame. key: of its own lines.
+const panel = (title, [xl, xh, xlog], [yl, yh, ylog], xwords, even = false, key = []) => {
   const box = make("div", $("panels"));
   make("h2", box, title);
+  keys(make("p", box, "", {class: "key"}), key);
   const w = Math.max(box.clientWidth, 240), h = 225, [l, r, t, b] = [46, 8, 8, 34], name = "clip" + $("panels").childElementCount;
   if (even) [xl, xh] = [-1, 1].map(side => (xl + xh) / 2 + side * (yh - yl) * (w - l - r) / (h - t - b) / 2);
   const svg = draw("svg", box, {viewBox: `0 0 ${w} ${h}`, role: "img", "aria-label": title});
@@ -261,7 +279,8 @@ const views = (plant, other) => {
     if (other) draw("path", group, {class: "curve pinned", d: path(other.bode.x, other.bode["loop" + suffix], x, y)});
     draw("path", group, {class: "curve nominal", d: path(bode.x, bode["loop" + suffix], x, y)});
   }
-  const [x, y, group] = panel("Poles (×) and zeros (○) in z: loop, controller, plant", [-1.2, 1.2, false], [-1.15, 1.15, false], "real part", true);
+  const [x, y, group] = panel("Poles (×) and zeros (○) in z: imaginary over real part", [-1.2, 1.2, false], [-1.15, 1.15, false], "real part", true,
+    [["worst", "closed loop"], ["nominal", "controller"], ["dotted", "plant"], ["pinned", "unit circle"]]);
   const turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
   draw("path", group, {class: "curve pinned", d: path(turn.map(Math.cos), turn.map(Math.sin), x, y)});
   for (const [name, [re, im]] of Object.entries(plant.roots)) {
@@ -288,7 +307,7 @@ const panels = () => {
     for (const kind of ["worst", "nominal", "limit"]) draw("path", group, {class: "curve " + kind, d: path(one.x, one[kind], x, y)});
   });
   views(plant, other);
-  const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses", [-2.6, 1.8, false], [-size, size / 2, false], "real part", true);
+  const size = 2.2, [nx, ny, group] = panel("Nyquist: K G and its ellipses, imaginary over real part", [-2.6, 1.8, false], [-size, size / 2, false], "real part", true);
   const radius = controls.modulus_margin?.get() ?? 0, turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
   draw("path", group, {class: "curve limit", d: path(turn.map(v => radius * Math.cos(v) - 1), turn.map(v => radius * Math.sin(v)), nx, ny)});
   for (const [re, im] of plant.nyquist.ellipses) draw("path", group, {class: "band", d: path(re, im, nx, ny) + "Z"});
@@ -298,24 +317,22 @@ const panels = () => {
   const step = plant.step;
   if (step.end) {
     const all = [...step.nominal.y, ...step.samples.flatMap(one => one.y), 0], end = step.end;
-    const [x, y, inside] = panel("Step of the reference, models from the posterior", [0, end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
+    const [x, y, inside] = panel("Step of the reference, models from the posterior" + UNIT, [0, end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
     for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(one.x, one.y, x, y)});
     if (other?.step.end) draw("path", inside, {class: "curve pinned", d: path(other.step.nominal.x, other.step.nominal.y, x, y)});
     draw("path", inside, {class: "curve nominal", d: path(step.nominal.x, step.nominal.y, x, y)});
   }
   if (step.friction.length) {
     const all = [...step.nominal.y, ...step.friction.flatMap(one => one.y), 0];
-    const [x, y, inside] = panel("Step with dry friction: dashed without, solid with feed-forward", [0, step.end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
+    const [x, y, inside] = panel("Step with dry friction" + UNIT, [0, step.end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]", false,
+      [["limit", "without feed-forward"], ["nominal", "with feed-forward"], ["worst thin", "nominal, no friction"], ["pinned", "reference"]]);
+    draw("path", inside, {class: "curve pinned", d: `M${x(0)} ${y(STEP)}H${x(step.end)}`});
     draw("path", inside, {class: "curve thin", d: path(step.nominal.x, step.nominal.y, x, y)});
     step.friction.forEach((one, k) => draw("path", inside, {class: k ? "curve nominal" : "curve limit", d: path(one.x, one.y, x, y)}));
   }
   scrollTo(scrollX, top);
 };
-for (const [look, words] of [["nominal", "nominal"], ["worst", "largest over the ellipses"], ["limit", "specification"], ["pinned", "pinned design (largest over the ellipses; nominal loop and step)"]]) {
-  const entry = make("span", $("key"));
-  draw("path", draw("svg", entry, {viewBox: "0 0 26 9", "aria-hidden": "true"}), {class: look, d: "M0 5H26"});
-  entry.append(words);
-}
+keys($("key"), [["nominal", "nominal"], ["worst", "largest over the ellipses"], ["limit", "specification"], ["pinned", "pinned design (largest over the ellipses; nominal loop and step)"]]);
 addEventListener("resize", () => shown && panels());
 run();
 })();
