@@ -43,7 +43,7 @@ from workflow.engine.errors import (
     one_line,
 )
 from workflow.engine.threads import one_thread
-from workflow.field_options import SETTINGS, completed, option_name, with_fields
+from workflow.field_options import NONE, SETTINGS, completed, option_name, with_fields
 
 if TYPE_CHECKING:
     from workflow.commands.logs import Reading
@@ -782,8 +782,8 @@ def _reading(given: Mapping[str, Any]) -> Reading:
 
 
 def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
-    """Keys of [specification] as options state them, each within its range. Raises InputError naming the
-    option."""
+    """Keys of [specification] as options state them, each within its range; None of what is not to be asked.
+    Raises InputError naming the option."""
     if not typed:  # the settings are slow to load
         return {}
     from pydantic import create_model
@@ -791,7 +791,7 @@ def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
     from control_design.specification import Specification
     from workflow.config.settings import Section
 
-    found = dict(typed)
+    found = {name: None if value == NONE else value for name, value in typed.items()}
     order = found.get("controller_order")
     if isinstance(order, str) and order.isdigit():  # a number, or "auto"
         found["controller_order"] = int(order)

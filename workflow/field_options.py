@@ -36,6 +36,8 @@ _NAMES = {
     "lowest_bandwidth_rad_s": "--lowest-bandwidth",
     "controller_order": "--order",
 }
+# What is typed for a key of [specification] in place of a number: it is not asked.
+NONE = "none"
 _BY_COLUMN = "COLUMN=VALUE (repeatable): "
 
 
@@ -74,7 +76,10 @@ def completed(function: Callable[..., Any]) -> Callable[..., Any]:
     parameters = [each.replace(annotation=hints[each.name]) for each in own]
     for place, names in function.of_fields.items():  # type: ignore[attr-defined]
         fields = resolve_name(SETTINGS[place]).model_fields
-        parameters += [_parameter(name, fields[name.rpartition(".")[2]]) for name in names]
+        may_be_none = place == "specification"
+        parameters += [
+            _parameter(name, fields[name.rpartition(".")[2]], may_be_none=may_be_none) for name in names
+        ]
 
     @wraps(function)
     def called(**given: Any) -> Any:
@@ -94,11 +99,25 @@ def option_name(key: str) -> str:
     return {**_NAMES, **OPTIONS["identify"]}.get(key, f"--{key.replace('_', '-')}")
 
 
-def _parameter(key: str, field: FieldInfo) -> inspect.Parameter:
+def _number_or_none(text: str) -> float | str:
+    """A number, or `NONE` as it is. Raises BadParameter for any other word."""
+    if text == NONE:
+        return NONE
+    try:
+        return float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not a valid float, nor none") from None
+
+
+def _parameter(key: str, field: FieldInfo, *, may_be_none: bool = False) -> inspect.Parameter:
+    """Option for a field; may_be_none: an optional number takes the word none as well."""
     kind = _kind(field.annotation)
     words = (_BY_COLUMN if _is_mapping(field.annotation) else "") + described(field)
     form = "<float> <float>" if get_origin(kind) is tuple else None
-    said = typer.Option(option_name(key), help=words[0].upper() + words[1:], metavar=form)
+    parser = None
+    if may_be_none and kind is float and type(None) in get_args(field.annotation):
+        form, parser = "<float>|none", _number_or_none
+    said = typer.Option(option_name(key), help=words[0].upper() + words[1:], metavar=form, parser=parser)
     return inspect.Parameter(
         key.replace(".", "_"),
         inspect.Parameter.KEYWORD_ONLY,

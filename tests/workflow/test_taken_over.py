@@ -45,8 +45,10 @@ def test_a_changed_bandwidth_gives_the_numbers_of_a_fresh_run(fast_run, tmp_path
 
 def test_nothing_changed_leaves_the_page_to_be_drawn(fast_run, tmp_path, plain_page):  # noqa: F811
     watch = Watch()
-    changed_to(fast_run[0], tmp_path / "same", watch)
+    summary = changed_to(fast_run[0], tmp_path / "same", watch)
     assert watch.made == ["report"]
+    (stages,) = summary.to_document()["taken_over"].values()
+    assert stages == watch.taken_up
 
 
 def test_a_killed_run_is_taken_as_far_as_it_goes(fast_run, tmp_path, plain_page):  # noqa: F811
@@ -57,8 +59,12 @@ def test_a_killed_run_is_taken_as_far_as_it_goes(fast_run, tmp_path, plain_page)
             path.unlink()
     damaged = killed / "stages" / "reference_filter.json"
     damaged.write_text(damaged.read_text().replace(" ", "  ", 1)[:-20])
-    watch = Watch()
+    watch = Said()
     changed_to(killed, tmp_path / "new", watch)
+    missing = (
+        f"of {killed}/stages certify, closed_loop are missing and reference_filter is damaged: done again"
+    )
+    assert watch.notes[0] == missing
     assert watch.made[:2] == ["certify", "reference_filter"]
     assert set(watch.taken_up) == {*PLANT, "design", "achievable_performance"}
 
@@ -105,6 +111,9 @@ def test_what_cannot_be_a_start_is_refused_in_one_line(refused, fast_run, tmp_pa
     assert "--bandwidth: input should be greater than 0" in refused(
         "run", "--from", run, "--bandwidth", "-1", "--out", "new"
     )
+    assert "'some' is not a valid float, nor none" in refused("run", "--from", run, "--effort-limit", "some")
+    both = "--from", run, "--out", "new", "--resume", "--bandwidth", "3"
+    assert "give one of the two" in refused("run", *both)
     assert "--bandwidth: write it into" in refused("run", "--config", FAST_ARM, "--bandwidth", "2")
     assert "needs a larger bandwidth_rad_s" in refused(
         "run", "--from", run, "--lowest-bandwidth", "50", "--out", "new"
@@ -128,6 +137,14 @@ def test_a_design_for_a_run_has_its_page(flexlink, refused, fast_run, tmp_path, 
     text = page.read_text()
     assert "Certified, but the closed loop was not simulated" in text
     assert "Identification" in text
+    # The page is about the design, and names no files of the run as its own.
+    assert "<h1>design.html: a design for the run " in text
+    assert "python-control" not in text
+    assert "Beside this page" not in text
+    slower = tmp_path / "slower.toml"
+    slower.write_text(asked.read_text() + "controller_dt_s = 0.02\n")
+    words = refused("design", fast_run[0], "--spec", slower)
+    assert f"{slower}: specification: controller_dt_s = 0.02 s, but plant" in words
     model = fast_run[0] / "model.json"
     words = refused("design", model, "--spec", asked, "--report", page)
     assert "a page shows one run's records and model: give one run directory" in words
@@ -140,6 +157,10 @@ def test_a_typed_value_is_hard_and_leaves_the_rest_as_it_was():
     typed = with_typed(drafted, {"effort_limit": 3.0})
     assert typed == {key: typed[key] for key in drafted if key != "highest_effort_limit"}
     assert (typed["effort_limit"], typed["lowest_bandwidth_rad_s"]) == (3.0, 1.0)
+    # None leaves a key out, what it might give way to, and what shapes it.
+    shaped = {**drafted, "effort_rolloff_rad_s": 100.0}
+    free = with_typed(shaped, {"effort_limit": None})
+    assert free == {key: shaped[key] for key in shaped if "effort" not in key}
     # A limit that is typed beside it stays one.
     both = {"effort_limit": 3.0, "highest_effort_limit": 4.0}
     assert with_typed(drafted, both) == drafted | both

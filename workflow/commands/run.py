@@ -72,6 +72,8 @@ def run_from_files(
         One line.
     """
     typed = dict(typed or {})
+    if resume and earlier_path is not None:
+        raise InputError("--from begins a new run; --resume continues the one at --out: give one of the two")
     if logs and config_path is not None:
         raise InputError("give logs or --config FILE, which names its logs, not both")
     if (resume or replace) and out is None:
@@ -81,7 +83,7 @@ def run_from_files(
     if typed and (resume or config_path is not None):
         where = config_path or "the configuration of a new run"
         raise InputError(f"{option_name(min(typed))}: write it into {where}, under [specification]")
-    earlier = None if earlier_path is None else _earlier(earlier_path, out, logs, resume=resume)
+    earlier = None if earlier_path is None else _earlier(earlier_path, out, logs)
     if logs:
         place = out if out is not None else default_directory(logs[0].stem)
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
@@ -123,7 +125,8 @@ def run_from_files(
 
         called = str(earlier.path)
         config = config_with_typed(any_config_of(earlier), typed, called)
-        changes = ", ".join(f"{key} = {value}" for key, value in typed.items()) or "nothing changed"
+        values = {key: "none" if value is None else value for key, value in typed.items()}
+        changes = ", ".join(f"{key} = {value}" for key, value in values.items()) or "nothing changed"
         text = f"# As {path_as_typed(earlier.path / 'config.toml')}, {changes}\n\n{config.to_toml()}"
     elif resume and out is not None and (out / "manifest.json").is_file():
         from workflow.tasks.pipeline import any_config_of
@@ -162,7 +165,7 @@ def run_from_files(
     )
 
 
-def _earlier(path: Path, out: Path | None, logs: Sequence[Path], *, resume: bool) -> RunDirectory:
+def _earlier(path: Path, out: Path | None, logs: Sequence[Path]) -> RunDirectory:
     """The run that --from names.
 
     Parameters
@@ -171,8 +174,6 @@ def _earlier(path: Path, out: Path | None, logs: Sequence[Path], *, resume: bool
         Of the earlier run, and of the new one where it is stated.
     logs : sequence of Path
         Of the new run; empty where its configuration names them.
-    resume : bool
-        A run that is resumed begins with its own stages.
 
     Raises
     ------
@@ -181,8 +182,6 @@ def _earlier(path: Path, out: Path | None, logs: Sequence[Path], *, resume: bool
     """
     earlier = RunDirectory.open(path)
     earlier.config_document()  # refused where it is damaged
-    if resume:
-        raise InputError("--from begins a new run; --resume continues the one at --out: give one of the two")
     if out is not None and out.exists() and out.resolve() == path.resolve():
         raise InputError(f"--out {out}: the run of --from, which stays as it is; choose another --out")
     if logs:

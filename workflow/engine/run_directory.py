@@ -178,6 +178,26 @@ class RunDirectory(Store):
         except InputError:
             return False  # damaged from outside
 
+    def taken_over(self) -> dict[str, list[str]]:
+        """Stages that came from other runs, by the run that each came from. Raises InputError: see
+        `manifest`."""
+        by_origin: dict[str, list[str]] = {}
+        for name, entry in self.manifest()["stages"].items():
+            if entry.get("taken_over_from"):
+                by_origin.setdefault(entry["taken_over_from"], []).append(name)
+        return by_origin
+
+    def lost_stages(self) -> dict[str, str]:
+        """Finished stages whose files are not as they were written, with what has become of them: "missing"
+        or "damaged". Raises InputError: see `manifest`."""
+        lost = {}
+        for name, entry in self.manifest()["stages"].items():
+            if self.stage_file(name) is None:
+                lost[name] = "missing"
+            elif not self.is_done(name, entry["input_sha256"]):
+                lost[name] = "damaged"
+        return lost
+
     def take_over(self, name: str, input_hash: str, earlier: Iterable[RunDirectory]) -> RunDirectory | None:
         """The run that has a stage made from exactly this input, whose file is in this run afterwards.
 

@@ -19,7 +19,7 @@ def with_typed(specification: Mapping[str, Any], typed: Mapping[str, Any]) -> di
     specification : mapping of str to value
         As it is stated, JSON-able.
     typed : mapping of str to value
-        Keys of `Specification`; not checked here.
+        Keys of `Specification`; not checked here. None: the key is left out.
 
     Returns
     -------
@@ -27,7 +27,12 @@ def with_typed(specification: Mapping[str, Any], typed: Mapping[str, Any]) -> di
         A copy in the same order, new keys at the end. A typed value takes along what the key may give way to
         (`GIVES_WAY`): who types one value means that value.
     """
-    changed = {**specification, **typed}
+    changed = {key: value for key, value in {**specification, **typed}.items() if value is not None}
+    # What only shapes a requirement goes with it.
+    if "effort_limit" not in changed:
+        changed.pop("effort_rolloff_rad_s", None)
+    if "mode_peak_ratio" not in changed and "mode_damping" not in changed:
+        changed.pop("mode_band_rad_s", None)
     for key, limit in GIVES_WAY.items():
         if key in typed and limit not in typed:
             changed.pop(limit, None)

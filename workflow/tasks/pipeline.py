@@ -69,8 +69,8 @@ def run_pipeline(
     if earlier is not None:
         nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
         first_is_there = first_is_there or not nothing_because
-        if nothing_because and begun is None:
-            progress.note(f"nothing of {earlier.path} is taken over: {nothing_because}")
+        if begun is None:
+            _say_what_cannot_be_taken_over(earlier, nothing_because, progress)
     if not (resume and existed) and not first_is_there:
         started = time.monotonic()
         with threadpool_limits(1):
@@ -146,8 +146,7 @@ def identify_only(
         given.progress.plan([(stage.name, stage.expected_s) for stage in stages])
         if earlier is not None:
             nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
-            if nothing_because:
-                given.progress.note(f"nothing of {earlier.path} is taken over: {nothing_because}")
+            _say_what_cannot_be_taken_over(earlier, nothing_because, given.progress)
         for stage in stages:
             _perform(stage, given, inputs, earlier=earlier)
 
@@ -258,7 +257,10 @@ def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: 
     """
     earlier.refuse_other_inputs(inputs)
     first = stages_for(config, STAGES)[0]
-    if earlier.is_done(first.name, stage_input_hash(first, config, earlier, inputs)):
+    first_hash = stage_input_hash(first, config, earlier, inputs)
+    # Also of a file that is lost since: made again it is the same, and so are the stages after it.
+    noted = earlier.manifest()["stages"].get(first.name, {})
+    if noted.get("input_sha256") == first_hash or earlier.is_done(first.name, first_hash):
         return ""
     if earlier.stage_file(first.name) is None:
         return "it ended before its first stage was done"
@@ -267,13 +269,29 @@ def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: 
     return "its records were read with other settings"
 
 
+def _say_what_cannot_be_taken_over(earlier: RunDirectory, nothing_because: str, progress: Progress) -> None:
+    """One line where nothing of an earlier run can be taken over, for a reason, or where files of its
+    finished stages are missing or damaged."""
+    if nothing_because:
+        progress.note(f"nothing of {earlier.path} is taken over: {nothing_because}")
+        return
+    lost = earlier.lost_stages()
+    # The page is drawn again in any case.
+    lost.pop("report", None)
+    by_state: dict[str, list[str]] = {}
+    for name, state in lost.items():
+        by_state.setdefault(state, []).append(name)
+    if by_state:
+        words = [
+            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {state}"
+            for state, names in by_state.items()
+        ]
+        progress.note(f"of {earlier.path}/stages {' and '.join(words)}: done again")
+
+
 def _say_what_was_taken_over(run: RunDirectory, progress: Progress) -> None:
     """Name the stages that came from another run, once for each such run."""
-    by_origin: dict[str, list[str]] = {}
-    for name, entry in run.manifest()["stages"].items():
-        if entry.get("taken_over_from"):
-            by_origin.setdefault(entry["taken_over_from"], []).append(name)
-    for origin, names in by_origin.items():
+    for origin, names in run.taken_over().items():
         progress.note(f"taken over from {origin}, whose inputs are the same: {', '.join(names)}")
 
 

@@ -49,6 +49,7 @@ def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
         certified=results.certify.certified and settles,
         verdict=verdict,
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
+        taken_over=results.run.taken_over(),
     )
 
 

@@ -94,7 +94,8 @@ class RunSummary:
 
     `certified` is False when the specification is missed or the certificate fails; the verdict then says by
     how much and at which frequencies. None: nothing was to be certified. brief: what a terminal shows of
-    `sections` unless all is asked for; everything where there is none.
+    `sections` unless all is asked for; everything where there is none. taken_over: stages of a run
+    that came from other runs, by the run; None: no run.
     """
 
     title: str
@@ -104,6 +105,7 @@ class RunSummary:
     verdict: str = ""
     report_path: str | None = None
     brief: Sequence[TableSection] = ()
+    taken_over: Mapping[str, Sequence[str]] | None = None
 
     def to_document(self) -> dict[str, Any]:
         """JSON-able."""
@@ -112,6 +114,7 @@ class RunSummary:
             **({} if self.certified is None else {"certified": self.certified}),
             "verdict": self.verdict,
             "report": self.report_path,
+            **({} if self.taken_over is None else {"taken_over": self.taken_over}),
             "numbers": dict(self.numbers),
             "table": [
                 {"section": section.title, "label": row.label, "value": row.value}
