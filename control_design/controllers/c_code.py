@@ -84,7 +84,7 @@ def c_header(controller: Controller, prefix: str = "controller", number: Number 
     constants = ""
     numbers = engineers_numbers(controller)
     if numbers is not None:
-        comment = "".join(f"     {name}: {values}\n" for name, values in numbers.rows()).rstrip()
+        comment = "".join(f"     {name}: {_ascii(values)}\n" for name, values in numbers.rows()).rstrip()
         lines = []
         for name, value in numbers.constants().items():
             lines.append(f"#define {prefix.upper()}_{name} {value!r}")

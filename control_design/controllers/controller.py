@@ -59,6 +59,8 @@ class Controller(Law):
         Joins u before it is limited; for one loop only.
     signals : str
         Columns and units of error and command, in words.
+    gain_unit : str
+        Unit of command over error, "V/rad"; "" where it is not known.
 
     Raises
     ------
@@ -79,6 +81,7 @@ class Controller(Law):
     name: str = "controller"
     feedforward: FrictionFeedforward | None = None
     signals: str = field(default="", metadata={"since": 8})
+    gain_unit: str = field(default="", metadata={"since": 11})
 
     def __post_init__(self) -> None:
         """Check limits and delay, and find the anti-windup gain where none is stated (ValueError, see the
@@ -278,8 +281,8 @@ class Controller(Law):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Self:
-        """Controller that `to_dict` wrote; a file may lack feed-forward, signals and `named_systems`. Raises
-        ValueError for what is no such file, naming the key."""
+        """Controller that `to_dict` wrote; a file may lack feed-forward, signals, unit and `named_systems`.
+        Raises ValueError for what is no such file, naming the key."""
         values = data.get("feedforward")
         feedforward = None
         if values is not None:
@@ -289,7 +292,7 @@ class Controller(Law):
                 raise ValueError(
                     f"feedforward needs level, width, lag_s, excess and fall; got {values!r:.80}"
                 ) from error
-        return super().from_dict({"signals": "", **data, "feedforward": feedforward})
+        return super().from_dict({"signals": "", "gain_unit": "", **data, "feedforward": feedforward})
 
     def stepper(self) -> ControllerStepper:
         """A running instance of the controller, at rest; each call gives another one."""

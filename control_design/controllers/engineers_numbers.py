@@ -26,7 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from control_design.controllers.law import Law
-from control_design.controllers.parts import Structure, frequency_of_corner, width_of_damping
+from control_design.controllers.parts import (
+    DERIVATIVE_RATIOS,
+    NOTCH_DAMPING,
+    Structure,
+    frequency_of_corner,
+    width_of_damping,
+)
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import count_integrators
 
@@ -56,6 +62,9 @@ _SAME_FREQUENCY = 1e-6
 _NEAR = 2.0
 # Imaginary part over modulus from which on a root is one of a pair.
 _COMPLEX = 1e-9
+# Ratio up to which a number counts as ended at its lower limit: descents end within their tolerance of it.
+# Chosen.
+_AT_LIMIT = 1.0 + 1e-4
 # Least quotient; keeps logarithms finite.
 _TINY = 1e-300
 
@@ -160,6 +169,8 @@ class ControllerNumbers:
         What is none of these; by frequency.
     response_error : float
         Largest relative difference to the controller's response, at most `LARGEST_ERROR`.
+    gain_unit : str
+        Unit of Kp and gain, "V/rad", of the command over that of the error; "": not known.
     """
 
     dt_s: float
@@ -170,6 +181,7 @@ class ControllerNumbers:
     low_passes: tuple[LowPassNumbers, ...] = ()
     factors: tuple[FactorNumbers, ...] = ()
     response_error: float = field(default=0.0, compare=False)
+    gain_unit: str = field(default="", compare=False)
 
     @property
     def structure(self) -> str:
@@ -269,17 +281,24 @@ class ControllerNumbers:
         """Name and values of each factor in plain ASCII, for a terminal, a table or a comment."""
         rows = []
         if self.pid is not None:
-            values = [f"Kp = {self.pid.kp:.5g}"]
+            values = [f"Kp = {self.pid.kp:.5g} {self.gain_unit}".rstrip()]
             for name, seconds in (("Ti", self.pid.ti_s), ("Td", self.pid.td_s), ("Tf", self.pid.tf_s)):
                 if seconds is not None:
                     values.append(f"{name} = {seconds:.5g} s")
+            td_s, tf_s = self.pid.td_s, self.pid.tf_s
+            if td_s is not None and tf_s and td_s <= DERIVATIVE_RATIOS[0] * tf_s * _AT_LIMIT:
+                values.append(f"Td/Tf at the least of a free one, {DERIVATIVE_RATIOS[0]:g}")
             rows.append((self.pid.structure.upper(), ", ".join(values)))
         else:
             integral = {0: "", 1: " over s"}.get(self.integrators, f" over s^{self.integrators}")
-            rows.append(("gain", f"{self.gain:.5g}{integral}"))
+            gain = f"{self.gain:.5g} {self.gain_unit}".rstrip()
+            rows.append(("gain", f"{gain}{integral}"))
         for notch in self.notches:
             middle = f"{notch.frequency_hz:.5g} Hz, {notch.depth_db:.4g} dB deep"
-            width = f"{notch.width_hz:.4g} Hz wide (damping {notch.damping:.4g})"
+            least = ""
+            if notch.damping <= NOTCH_DAMPING[0] * _AT_LIMIT:
+                least = ", the least of a free one"
+            width = f"{notch.width_hz:.4g} Hz wide (damping {notch.damping:.4g}{least})"
             rows.append(("notch", f"{middle}, {width}"))
         for low_pass in self.low_passes:
             words = f"{low_pass.frequency_hz:.5g} Hz, order {low_pass.order}"
@@ -386,7 +405,12 @@ def engineers_numbers(controller: Law) -> ControllerNumbers | None:
         return None
     values = {name: getattr(found, name) for name in ("dt_s", "pid", "gain", "integrators", "notches")}
     return ControllerNumbers(
-        **values, low_passes=found.low_passes, factors=found.factors, response_error=error
+        **values,
+        low_passes=found.low_passes,
+        factors=found.factors,
+        response_error=error,
+        # Laws without machine signals, as multivariable ones, state no unit.
+        gain_unit=getattr(controller, "gain_unit", ""),
     )
 
 

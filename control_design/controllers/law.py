@@ -193,8 +193,9 @@ class Law:
         feedforward = values.pop("feedforward", None)
         if feedforward is not None:
             values["feedforward"] = vars(feedforward)
-        if not values.get("signals"):
-            values.pop("signals", None)
+        for name in ("signals", "gain_unit"):
+            if not values.get(name):
+                values.pop(name, None)
         for name, value in values.items():
             if isinstance(value, tuple):
                 values[name] = np.array([np.inf if limit is None else limit for limit in value])

@@ -31,13 +31,13 @@ Structure = Literal["p", "pi", "pd", "pid"]
 _LARGEST_LOG = 12.0
 # Td over Tf where Td is free, or Tf beside a fixed Td: below a tenth the derivative adds less than 10 % to
 # the gain, and its pole and zero are told apart no longer; ten thousand is no filter. Chosen.
-_DERIVATIVE_RATIOS = (0.1, 1e4)
+DERIVATIVE_RATIOS = (0.1, 1e4)
 # Largest logarithm of a free Tf, in units of 1/scale: a filter twenty times slower than the loop leaves no
 # derivative. Chosen.
 _SLOWEST_FILTER_LOG = 3.0
 # Damping ratios that a free notch may have. Below .02 it is narrower than its mode is known; at 1 its poles
 # meet on the real axis, where a pair is told from two lags no longer.
-_NOTCH_DAMPING = (0.02, 0.99)
+NOTCH_DAMPING = (0.02, 0.99)
 # Damping ratios that a free low-pass may have: a resonance of 1.3 at most, and no two real corners.
 _LOW_PASS_DAMPING = (0.4, 0.99)
 # Largest depth of a free notch, a ratio: 60 dB. Deeper ones differ by less than a mode's frequency is known.
@@ -201,10 +201,10 @@ class PidPart(Part):
             shortest = float(np.log(self.shortest_filter))
             longest = _SLOWEST_FILTER_LOG
             if self.td is not None:
-                longest = float(np.log(self.td / _DERIVATIVE_RATIOS[0]))
+                longest = float(np.log(self.td / DERIVATIVE_RATIOS[0]))
             bounds.append((shortest, max(shortest, longest)))
         if self.has_derivative and self.td is None:
-            bounds.append((float(np.log(_DERIVATIVE_RATIOS[0])), float(np.log(_DERIVATIVE_RATIOS[1]))))
+            bounds.append((float(np.log(DERIVATIVE_RATIOS[0])), float(np.log(DERIVATIVE_RATIOS[1]))))
         return bounds
 
     def units(self, x: Real) -> list[float]:
@@ -274,13 +274,13 @@ class NotchPart(Part):
             high = float(np.tan(_HIGHEST_OF_NYQUIST * np.pi / 2)) / self.half_sample
             if self.width_tan is not None:
                 # zeta = width_tan (t + 1/t)/2 is at most the largest between the two roots in t.
-                half_sum = _NOTCH_DAMPING[1] / self.width_tan
+                half_sum = NOTCH_DAMPING[1] / self.width_tan
                 spread = float(np.sqrt(max(half_sum**2 - 1.0, 0.0)))
                 low = max(low, (half_sum - spread) / self.half_sample)
                 high = min(high, (half_sum + spread) / self.half_sample)
             bounds.append((float(np.log(low)), float(np.log(high))))
         if self.damping is None and self.width_tan is None:
-            bounds.append((float(np.log(_NOTCH_DAMPING[0])), float(np.log(_NOTCH_DAMPING[1]))))
+            bounds.append((float(np.log(NOTCH_DAMPING[0])), float(np.log(NOTCH_DAMPING[1]))))
         if self.depth is None:
             bounds.append((0.0, float(np.log(_DEEPEST))))
         return bounds

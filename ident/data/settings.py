@@ -126,6 +126,15 @@ def meant(word: str, known: Sequence[str], what: str) -> str:
     return f"did you mean {close[0]}?" if close else f"known {what}: {', '.join(known)}"
 
 
+# What pydantic calls after JSON, by its kind of complaint, in the words of TOML and of this documentation.
+_IN_OUR_WORDS = {
+    "dict_type": "expected a table",
+    "model_type": "expected a table",
+    "list_type": "expected a list",
+    "tuple_type": "expected a list",
+}
+
+
 def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
     """One complaint of pydantic about a model in one line; detail: its kind, place, message and input.
 
@@ -153,6 +162,7 @@ def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
     if kind == "value_error":
         return where + message
     message = message[:1].lower() + message[1:]
+    message = _IN_OUR_WORDS.get(kind, message)
     try:
         value = f"{detail['input']!r:.80}"
     except ValueError:  # Python writes no integer of more than 4300 digits

@@ -59,7 +59,7 @@ def test_the_terminal_and_the_json_show_what_is_fixed_and_what_was_found(flexlin
     (notch,) = found["notches"]
     assert [notch["frequency_hz"], notch["depth_db"], notch["width_hz"]] == pytest.approx([1.9, 10.0, 0.6])
     rows = {row["label"]: row["value"] for row in told["table"] if row["section"] == "controller"}
-    assert re.fullmatch(r"Kp = \S+, Ti = 0.8 s, Td = \S+ s, Tf = \S+ s", rows["PID"])
+    assert re.fullmatch(r"Kp = \S+, Ti = 0.8 s, Td = \S+ s, Tf = \S+ s(, Td/Tf at .*)?", rows["PID"])
     assert rows["notch"].startswith("1.9 Hz, 10 dB deep, 0.6 Hz wide")
     assert rows["low-pass"] == "7 Hz, order 2, damping 0.7"
     assert "K_without_delay" in rows["computational delay"]

@@ -24,7 +24,7 @@ from workflow.figures.bands import (
 from workflow.figures.description import Panel, Picture, X, new_picture, pad_limits, small_multiples
 from workflow.figures.nyquist import loop_of
 from workflow.figures.subjects import ChannelView, RunView
-from workflow.text.formats import share
+from workflow.text.formats import margin, share
 
 _DOTS: dict[str, Any] = {
     "color": style.MEASURED,
@@ -203,11 +203,11 @@ def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
     if np.isfinite(at_gain):
         here = float(np.interp(at_gain, loop.omega_rad_s, loop.phase_deg))
         phase.axhline(here - degrees, **limits)
-        label = f"gain crossover at {at_gain:.3g} rad/s: phase margin {degrees:.3g} deg"
+        label = f"gain crossover at {at_gain:.3g} rad/s: phase margin {margin(degrees)} deg"
         phase.plot([at_gain] * 2, [here - degrees, here], color=style.ACHIEVED, label=label, **look)
         gain.plot([at_gain], [1], color=style.ACHIEVED, ls="none", **look)
     if np.isfinite(at_phase):
-        label = f"phase crossover at {at_phase:.3g} rad/s: gain margin {style.decibels(factor):.3g} dB"
+        label = f"phase crossover at {at_phase:.3g} rad/s: gain margin {margin(float(style.decibels(factor)))} dB"
         gain.plot([at_phase] * 2, [1 / factor, 1], color=style.LIMIT, label=label, **look)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -51,11 +52,13 @@ def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect =
 @dataclass(frozen=True)
 class Logged:
     """Columns of the logs, of which quantity = scale * column + offset: scales of errors (Y,) and commands
-    (U,), and what they are in words. A law for them needs no scale and no turned sign on the machine."""
+    (U,), what they are in words, and the unit of command over error, "" where it is not known. A
+    law for them needs no scale and no turned sign on the machine."""
 
     error: tuple[float, ...]
     command: tuple[float, ...]
     signals: str
+    gain_unit: str = ""
 
     @classmethod
     def of(cls, config: AnyConfig, records: RecordsResult) -> Logged:
@@ -64,11 +67,20 @@ class Logged:
         columns = [[loop.output for loop in loops], [loop.input for loop in loops]]
         error, command = (tuple(scale.get(name, 1.0) for name in names) for names in columns)
         units = {name: records.unit(name) for names in columns for name in names}
-        return cls(error, command, said("signals", *columns, units, scale, offset))
+        known = [units[names[0]] for names in columns if len(names) == 1 and units[names[0]]]
+        as_logged = all(factor == 1 for factor in (*error, *command))
+        gain_unit = ""
+        if len(known) == len(columns) and as_logged:
+            error_unit, command_unit = known
+            if re.search(r"[/ *]", error_unit):
+                error_unit = f"({error_unit})"
+            gain_unit = f"{command_unit}/{error_unit}"
+        return cls(error, command, said("signals", *columns, units, scale, offset), gain_unit)
 
     def law(self, law: Controller) -> Controller:
         """Of a law in quantities."""
-        return replace(law.in_units(np.array(self.error), np.array(self.command)), signals=self.signals)
+        scaled = law.in_units(np.array(self.error), np.array(self.command))
+        return replace(scaled, signals=self.signals, gain_unit=self.gain_unit)
 
 
 def targets(out: Path) -> list[Path]:

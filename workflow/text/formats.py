@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from decimal import ROUND_CEILING, ROUND_DOWN, ROUND_FLOOR, Decimal
 from typing import Any
 
 import numpy as np
@@ -46,6 +46,11 @@ def at_most(value: float | None, digits: int = 3) -> str:
 def bound(value: float | None, lower: bool, digits: int = 4) -> str:
     """`at_least` for a lower bound, else `at_most`."""
     return at_least(value, digits) if lower else at_most(value, digits)
+
+
+def margin(value: float | None, digits: int = 3) -> str:
+    """A margin of either sign: as `number`, rounded towards zero, so that what it says is there is there."""
+    return number(_rounded(value, digits, ROUND_DOWN), digits)
 
 
 def _rounded(value: float | None, digits: int, way: str) -> float | None:
@@ -198,8 +203,8 @@ TESTS: Mapping[str, Callable[..., bool]] = {
     "nan": math.isnan,
 }
 _NAMED: tuple[Callable[..., Any], ...] = (
-    number, at_least, at_most, bound, si, percent, share, portion, signed, fixed, interval, extent, frequency,
-    hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
+    number, at_least, at_most, margin, bound, si, percent, share, portion, signed, fixed, interval, extent,
+    frequency, hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "quoted": as_typed,
