@@ -262,10 +262,10 @@ def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: 
     noted = earlier.manifest()["stages"].get(first.name, {})
     if noted.get("input_sha256") == first_hash or earlier.is_done(first.name, first_hash):
         return ""
-    if earlier.stage_file(first.name) is None:
-        return "it ended before its first stage was done"
     if earlier.manifest().get("code_sha256") != code_digest():
         return "it was made by another version of flexlink"
+    if not noted and earlier.stage_file(first.name) is None:
+        return "it ended before its first stage was done"
     return "its records were read with other settings"
 
 
