@@ -250,3 +250,23 @@ def test_parameters_that_the_rate_cannot_have_are_refused(fields, words):
         Specification(structure="pid", **fields).refuse_sampling(0.005)
     # At a faster rate they are possible.
     Specification(structure="pid", controller_dt_s=0.0005, **fields).refuse_sampling(0.005)
+
+
+def test_a_gain_has_its_unit_and_a_number_at_its_limit_is_said_to_be_there():
+    pid = PidNumbers("pid", 2.0, ti_s=0.5, td_s=0.01, tf_s=0.1)
+    numbers = ControllerNumbers(
+        0.01, pid, 2.0, 1, notches=(NotchNumbers(5.0, 10.0, 0.2, 0.02),), gain_unit="V/rad"
+    )
+    rows = dict(numbers.rows())
+    assert rows["PID"].startswith("Kp = 2 V/rad, Ti = 0.5 s")
+    assert rows["PID"].endswith("Td/Tf at the least of a free one, 0.1")
+    assert "(damping 0.02, the least of a free one)" in rows["notch"]
+    # Away from the limits, and without units, nothing is said.
+    free = ControllerNumbers(
+        0.01, PidNumbers("pd", 2.0, td_s=0.1, tf_s=0.1), 2.0, 0, notches=(NotchNumbers(5.0, 10.0, 0.2, 0.1),)
+    )
+    assert dict(free.rows())["PD"] == "Kp = 2, Td = 0.1 s, Tf = 0.1 s"
+    assert "least" not in str(free.rows())
+    law = Controller([[1.0]], [[0.02]], [[1.0]], [[0.5]], dt_s=0.01, gain_unit="Nm/rad")
+    assert "PI: Kp = 0.49 Nm/rad" in c_header(law)
+    assert Controller.from_json(law.to_json()).gain_unit == "Nm/rad"
