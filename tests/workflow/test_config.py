@@ -271,3 +271,10 @@ output = "hub_angle_rad"
     (tmp_path / "plan.toml").write_text((text % own).replace("plan.period_samples = 100\n", ""))
     with pytest.raises(InputError, match=r"missing key source\.plan\.period_samples"):
         load_config(tmp_path / "plan.toml")
+
+
+def test_kinds_are_named_in_the_words_of_toml(tmp_path):
+    with pytest.raises(InputError, match=r"specification\.fixed: expected a table, got 3"):
+        minimal(tmp_path, MINIMAL + "fixed = 3\n")
+    with pytest.raises(InputError, match=r"specification\.notches: expected a list, got 3"):
+        minimal(tmp_path, MINIMAL + "notches = 3\n")

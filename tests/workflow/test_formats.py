@@ -197,3 +197,7 @@ def test_a_filter_that_changed_is_asked_again(folder):
         )
         made.filters["with_unit"] = f"{{}} {unit}".format
         assert made.get_template("page").render() == f"1 {unit}"
+
+
+def test_a_margin_is_never_said_larger_than_it_is():
+    assert (formats.margin(70.66), formats.margin(-30.27), formats.margin(150.99)) == ("70.6", "-30.2", "150")

@@ -207,9 +207,8 @@ def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
         phase.plot([at_gain] * 2, [here - degrees, here], color=style.ACHIEVED, label=label, **look)
         gain.plot([at_gain], [1], color=style.ACHIEVED, ls="none", **look)
     if np.isfinite(at_phase):
-        label = (
-            f"phase crossover at {at_phase:.3g} rad/s: gain margin {margin(float(style.decibels(factor)))} dB"
-        )
+        gain_db = float(style.decibels(factor))
+        label = f"phase crossover at {at_phase:.3g} rad/s: gain margin {margin(gain_db)} dB"
         gain.plot([at_phase] * 2, [1 / factor, 1], color=style.LIMIT, label=label, **look)
 
 
