@@ -54,7 +54,7 @@ class Settings(BaseModel, metaclass=_Fields):
 
         NameError where an annotation names what its module does not have.
         """
-        lines = [(cls.__doc__ or "").rstrip(), "", "Fields", "------"]
+        lines = [(cls.__doc__ or "").rstrip(), "", "Fields:"]
         for name, field in cls.model_fields.items():
             default = ""
             if not field.is_required():

@@ -128,7 +128,7 @@ class SteppedArm:
         Raises
         ------
         ValueError
-            More than one integrator or a direct term: friction needs a speed.
+            More than one integrator or a direct term: friction needs a speed. No pole: nothing moves.
 
         Notes
         -----
@@ -139,6 +139,10 @@ class SteppedArm:
             raise ValueError(
                 "dry friction is identified for an output that is the position of the shaft: at most one "
                 "integrator and no direct term"
+            )
+        if poles.order == 0:
+            raise ValueError(
+                "dry friction is identified for an arm with at least one pole (expected n_real >= 1)"
             )
         # Taken twice, a pole moved that little still spans the same responses to a few parts in a million.
         real = np.maximum(poles.real, FASTEST_POLE).astype(np.complex128)

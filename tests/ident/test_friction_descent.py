@@ -275,3 +275,9 @@ def test_one_pole_each_is_the_arm_with_two() -> None:
     twice = double.arm.run(double.coefficients, command, law)
     assert once[0] == pytest.approx(twice[0], abs=1e-4 * np.ptp(twice[0]))
     assert once[1] == pytest.approx(twice[1], abs=0.02)
+
+
+def test_an_arm_without_a_pole_is_refused():
+    """A search behind the friction may find that nothing answers."""
+    with pytest.raises(ValueError, match="at least one pole"):
+        SteppedArm.of(Poles(), OPTIONS.structure(), DT_S, doubled=False)

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 
 from control_design import Controller
 from ident import IdentOptions, Record
+from ident.command_timing import timing_of
 from ident.data.finding import FindingKind
 from tests.workflow.test_init import DT_S, recorded, write
 from workflow.commands.logs import read_logs
@@ -20,7 +21,7 @@ from workflow.config.settings import check
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
-from workflow.tasks.identification import identify_channels, with_stated_controller
+from workflow.tasks.identification import identify_channels, made_in_loop, with_stated_controller
 from workflow.tasks.log_identification import identify_records
 from workflow.tasks.records import make_records
 from workflow.tasks.results import IdentifiedChannel, UncertainChannel
@@ -96,7 +97,8 @@ def test_the_same_numbers_by_identify_and_by_run(case, tmp_path):
     names = NAMES if reference else (NAMES[0], "", *NAMES[2:])
     logs = write(tmp_path, [*signals, signals[0]], names)
     read = read_logs(logs[:-1], validation=logs[-1:])  # columns as names and units say
-    found = identify_records(read.measured, read.fresh, **settings)
+    timing = timing_of([*read.measured, *read.fresh], in_loop=made_in_loop(read.measured))
+    found = identify_records(read.measured, read.fresh, timing=timing, **settings)
     about, spread = by_run(logs, reference, **settings)
     np.testing.assert_array_equal(about.model.poles.pairs, found.about.model.poles.pairs)
     np.testing.assert_array_equal(about.model.poles.real, found.about.model.poles.real)

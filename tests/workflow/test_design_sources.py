@@ -237,7 +237,7 @@ def test_no_stable_start_means_no_controller(flexlink, wish, tmp_path, monkeypat
     from control_design.synthesis.order_search import OrderResult, OrderSearch
 
     monkeypatch.setattr(OrderSearch, "run", lambda self: OrderResult(None, (), ()))
-    monkeypatch.setattr(OrderSearch, "quick", lambda self, free: (OrderResult(None, (), ()), False))
+    monkeypatch.setattr(OrderSearch, "quick", lambda self, *_, **__: (OrderResult(None, (), ()), False))
     out = tmp_path / "controller.json"
     answer = flexlink("design", tmp_path / "arm.json", "--spec", wish(), "--out", out)
     assert answer.code == 3
