@@ -15,6 +15,7 @@ has its depth at f, and a low-pass its corner, in discrete time exactly.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -91,7 +92,7 @@ def width_of_damping(damping: float, corner: float, dt_s: float) -> float:
     return float(np.arctan(2.0 * damping * corner / (1.0 + corner**2)) / (np.pi * dt_s))
 
 
-class Part:
+class Part(ABC):
     """What `Cascade` asks of a part. A part is frozen and hashable: functions of a structure are cached by
     it.
 
@@ -105,14 +106,14 @@ class Part:
         """How many parameters are free."""
         return len(self.bounds())
 
+    @abstractmethod
     def coefficients(self, x: Any, exp: Callable[[Any], Any]) -> tuple[list[Any], list[Any]]:
         """Numerator and denominator in p, order + 1 coefficients each, highest power first, the denominator's
         first is 1. x: the part's own free parameters, numbers or symbols; exp: the exponential of these."""
-        raise NotImplementedError
 
+    @abstractmethod
     def bounds(self) -> list[tuple[float, float]]:
         """Least and largest value of each free parameter, in the order of the vector."""
-        raise NotImplementedError
 
     def units(self, x: Real) -> list[float]:
         """A substantial change of each free parameter: 1 of logarithms."""

@@ -270,14 +270,20 @@ class StartMaker:
             parameters = self._shaped()
             if parameters is None:
                 continue
-            gamma = self.score(parameters)
-            if not np.isfinite(gamma):
-                parameters = with_gain(self.cascade, parameters, _RETRY_GAIN)
-                gamma = self.score(parameters)
-            if np.isfinite(gamma):
-                pool.append((parameters, gamma))
+            pool += self._scored(parameters)
         pool.sort(key=lambda entry: entry[1])
         return self._different(pool, most)
+
+    def _scored(self, parameters: Real) -> list[tuple[Real, float]]:
+        """Parameters (n,) with their finite score, as they are or at `_RETRY_GAIN` of their gain.
+
+        Empty where the score is finite at neither: a loop is not stable.
+        """
+        for candidate in (parameters, with_gain(self.cascade, parameters, _RETRY_GAIN)):
+            gamma = self.score(candidate)
+            if np.isfinite(gamma):
+                return [(candidate, gamma)]
+        return []
 
     def _different(self, pool: Sequence[tuple[Real, float]], most: int) -> list[tuple[Real, float]]:
         """At most `most` entries (parameters, score) of a pool sorted by score, without near duplicates.
@@ -449,12 +455,7 @@ class StartMaker:
             if not self.keeps_sign and self.rng.uniform() >= 0.5:
                 gain *= -1.0
             parameters = with_gain(self.cascade, parameters, gain)
-            gamma = self.score(parameters)
-            if not np.isfinite(gamma):
-                parameters = with_gain(self.cascade, parameters, _RETRY_GAIN)
-                gamma = self.score(parameters)
-            if np.isfinite(gamma):
-                pool.append((parameters, gamma))
+            pool += self._scored(parameters)
         pool.sort(key=lambda entry: entry[1])
         return self._different(pool, most)
 
