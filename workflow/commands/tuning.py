@@ -44,6 +44,7 @@ from workflow.figures.sensitivity import sensitivity_curves
 from workflow.figures.subjects import unit_of
 from workflow.tasks.design import bracket_numbers, find_bracket, find_design
 from workflow.tasks.design_source import level_can_change
+from workflow.tasks.exports import gain_unit_of
 from workflow.tasks.loop_sensitivity import settling_samples
 from workflow.tasks.results import DesignResult
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
@@ -287,6 +288,9 @@ class TuningSession:
         friction = ""
         if self._friction is not None and settles:
             friction = self._friction.settling(law, self._given(law, plants[0]))
+        numbers = engineers_numbers(law)
+        if numbers is not None:
+            numbers = replace(numbers, gain_unit=gain_unit_of(*self._units))
         table = rows_of(
             "summary/tune.j2",
             gamma=gamma,
@@ -297,7 +301,7 @@ class TuningSession:
             order=law.order,
             limits=at_limits,
             friction=friction,
-            numbers=engineers_numbers(law),
+            numbers=numbers,
         )
         curves = []
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):

@@ -49,6 +49,15 @@ def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect =
     return f"{note}\n{code(law, names.prefix, names.number)}".encode("ascii")
 
 
+def gain_unit_of(command_unit: str, error_unit: str) -> str:
+    """Unit of a controller's gain, "V/rad"; "" where one of the two is not known ("")."""
+    if not (command_unit and error_unit):
+        return ""
+    if re.search(r"[/ *]", error_unit):
+        error_unit = f"({error_unit})"
+    return f"{command_unit}/{error_unit}"
+
+
 @dataclass(frozen=True)
 class Logged:
     """Columns of the logs, of which quantity = scale * column + offset: scales of errors (Y,) and commands
@@ -72,9 +81,7 @@ class Logged:
         gain_unit = ""
         if len(known) == len(columns) and as_logged:
             error_unit, command_unit = known
-            if re.search(r"[/ *]", error_unit):
-                error_unit = f"({error_unit})"
-            gain_unit = f"{command_unit}/{error_unit}"
+            gain_unit = gain_unit_of(command_unit, error_unit)
         return cls(error, command, said("signals", *columns, units, scale, offset), gain_unit)
 
     def law(self, law: Controller) -> Controller:

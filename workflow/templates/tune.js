@@ -197,12 +197,13 @@ const numbers = () => {
   $("numbers").replaceChildren();
   const rows = found => [...found?.numbers ?? [], ["γ of any order, bound", digits(found?.bound)]], other = new Map(rows(pinned));
   for (const [words, value] of rows(shown)) {
-    const box = make("div", $("numbers"));
+    // A sentence has a line of its own, and is no headline.
+    const box = make("div", $("numbers"), "", {class: value.length > 30 ? "sentence" : ""});
     make("dt", box, words);
     const cell = make("dd", box, value);
     if (pinned) make("small", cell, "pinned: " + (other.get(words) ?? "–"));
   }
-  const box = make("div", $("numbers"));
+  const box = make("div", $("numbers"), "", {class: "sentence"});
   make("dt", box, "active constraint");
   make("dd", box, shown.stale ? "…" : shown.active || shown.reason || "–");
   $("items").replaceChildren();
