@@ -7,12 +7,14 @@ from ident.friction.command_causes import recorded_in_loop, with_commands_in_tim
 from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
+from ident.friction.rate_members import RateMember
 
 __all__ = [
     "BehindFriction",
     "EquivalentFriction",
     "FrictionFit",
     "FrictionLaw",
+    "RateMember",
     "at_amplitude",
     "equivalent_friction",
     "fit_friction",

@@ -23,12 +23,13 @@ from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.ellipses import LEVEL, chi2_radius
-from ident.data.frequency_uncertainty import FREQUENCIES
 from ident.data.record import Record
 from ident.friction.arm import less_friction
 from ident.friction.fit import moved_to
+from ident.friction.further_poles import frequencies_of, on_further_poles
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
 from ident.friction.inverse_dynamics import smoothed, speed_classes
+from ident.friction.rate_members import RateMember, rate_members
 from ident.friction.widths import heterogeneity
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
@@ -39,14 +40,11 @@ from ident.uncertainty.pole_intervals import laurent_rows, pole_intervals
 # Chosen: no law of friction is exact (docs/closed_loop_logs.md). Doubled, ellipses at low frequency are
 # nearly twice as wide where friction is much of the command.
 _SHAPE = 0.05
-# Lowest frequency of the ellipses, as a part of that of one radian in the longest record. Chosen: far below
-# what a record tells.
-_LENGTHS = 100
 # Normals along which the response is bent: damping, stiffness and friction.
 _MOST_CURVED = 3
 # Points of an arc, even in force, and as many even in gain. Chosen: an arc is smooth.
 _STEPS = 17
-# Parts of an arc that count, as a share of the largest; of powers its square. Chosen, far below an ellipse.
+# Parts of an arc that count, as a share of the largest. Chosen, far below an ellipse.
 _SMALL = 1e-3
 # Largest gain of an arc, over the centre: a damping that is not told from none has no end. Larger gains only
 # make a loop with integral action tighter (docs/closed_loop_logs.md).
@@ -55,12 +53,6 @@ _MOST_GAIN = 3.0
 _REACH = 1.7
 # Size of an ellipse at most, where the sign of the gain is known, as a share of the gain: zero is outside.
 _LARGEST = 0.9
-# Further real poles over the grid, which bent gains stand on: to .1 %, where four about the slowest left 16.
-_FURTHER = 20
-# Slowest of them in units of the lowest frequency. Chosen: within the grid, where their shapes differ.
-_SLOWEST_FURTHER = 10
-# Fastest of them, as this part of the highest frequency. Chosen likewise.
-_FASTEST_FURTHER = 3
 # Lowest missing mode, over the highest of the model: a nearer one the search would have found.
 _ABOVE_MODES = 1.1
 # Largest change of the logarithm of a decay rate in a round: a factor of e.
@@ -89,6 +81,8 @@ class BehindFriction:
     poles : Poles
         Of the arm, which shaft has twice: those of the model, the real ones moved to where the records have
         them beside an unknown level.
+    members : tuple of RateMember
+        Instead of `response`, where the slow rate of an axis is hardly known: they hold it together.
     """
 
     response: ResponsePosterior
@@ -97,6 +91,7 @@ class BehindFriction:
     level_factor: RealArray
     friction: FrictionFit
     poles: Poles
+    members: tuple[RateMember, ...] = ()
 
 
 def without_friction(
@@ -233,6 +228,7 @@ def _behind_observed(
     by_force = _by_linear_force(found, records, frictionless, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in frictionless) * model.dt_s
+    members = rate_members(response, poles, longest_s)
     response, straight, onto = of_force(response, poles, longest_s)
 
     # The level at the shaft is the first column of the forces, that beyond a spring the last.
@@ -241,7 +237,7 @@ def _behind_observed(
         levels.append(forces.shape[1] - 1)
     level = found.level + float(change[levels].sum())
     spread = np.append(wider * factor[levels].sum(axis=0), np.zeros(by_force.shape[1]))
-    return BehindFriction(response, straight, level, onto @ spread, found, poles)
+    return BehindFriction(response, straight, level, onto @ spread, found, poles, members)
 
 
 def of_force(
@@ -275,7 +271,7 @@ def of_force(
     """
     if response.unstable.order:
         return response, response, np.eye(response.covariance_factor.shape[1])
-    omega = _frequencies(response, longest_s)
+    omega = frequencies_of(response, longest_s)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
     moved = rows @ response.covariance_factor
@@ -329,25 +325,12 @@ def of_force(
         further = np.zeros((parts.shape[1] - 1, direction.size))
         onto.append(np.vstack([direction, further]))
 
-    # On more poles, which take up all of it: real ones, and those of the arm once more.
-    slowest = _SLOWEST_FURTHER * omega[0]
-    fastest = omega[-1] / _FASTEST_FURTHER
-    further_rates = np.geomspace(slowest, fastest, _FURTHER)
-    poles = poles.appended(Poles(np.exp(-further_rates * response.dt_s)))
-    nothing = np.zeros((response.mean.size + poles.order, 1))
-    bent = replace(
-        response, poles=response.poles.appended(poles), mean=nothing[:, 0], covariance_factor=nothing
-    )
     straight_part = (moved @ onto[0]) / gain[:, None]
     wanted = np.column_stack([centre, straight_part, *columns])
     # Errors as a share of the gain, or of what is not known of it: a zero between the modes would outweigh
-    # them all. Nearly equal poles would get large coefficients, and proofs between grid points fail.
-    weight = 1 / np.hypot(1, np.linalg.norm(change, axis=1))[:, None]
-    basis = real_rows(bent.frequency_rows(omega) / gain[:, None] * weight)
-    length = np.maximum(np.linalg.norm(basis, axis=0), np.finfo(np.float64).tiny)[:, None]
-    target = real_rows(wanted * weight)
-    solved = np.linalg.lstsq(basis / length.T, target, rcond=_SMALL**2)[0] / length
-    bent = replace(bent, mean=solved[:, 0], covariance_factor=solved[:, 1:])
+    # them all.
+    weight = 1 / np.hypot(1, np.linalg.norm(change, axis=1))
+    bent = on_further_poles(response, poles, omega, wanted, weight)
     normals = np.vstack(onto)
     straight = replace(response, covariance_factor=response.covariance_factor @ normals.T)
     return bent, straight, normals
@@ -370,19 +353,6 @@ def _parts_of(arc: ComplexArray, middle: ComplexArray) -> ComplexArray:
     return np.asarray(parts * reach / chi2_radius(LEVEL), np.complex128)
 
 
-def _frequencies(response: ResponsePosterior, longest_s: float) -> RealArray:
-    """Frequencies (F,), rad/s, as dense as what a kernel of the response does between them.
-
-    From far below one radian in the longest record (s) to the Nyquist frequency.
-    """
-    nyquist = np.pi / response.dt_s
-    spaced = np.geomspace(1 / (_LENGTHS * longest_s), nyquist, FREQUENCIES)
-    # Two points for each tap of the kernel.
-    n_points = 2 * response.fir_length
-    even = nyquist * np.arange(1, n_points + 1) / (n_points + 1)
-    return np.union1d(spaced, even)
-
-
 def _by_linear_force(
     friction: FrictionFit,
     records: Sequence[Record],
@@ -395,7 +365,7 @@ def _by_linear_force(
     integrates), each a share of the friction, rms over the records. `frictionless` are the records with the
     friction taken off.
     """
-    omega = _frequencies(response, max(record.n_samples for record in records) * response.dt_s)
+    omega = frequencies_of(response, max(record.n_samples for record in records) * response.dt_s)
     rows = response.frequency_rows(omega)
     gain = rows @ response.mean
     forces = []

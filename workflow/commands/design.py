@@ -186,8 +186,13 @@ def design_controller(
     shares = joint_numbers(certify.sampled)
     names = [plant.name for plant in plants]
     about = [
-        {"file": str(path), "plant": source.plant.name, "origin": source.origin, "remarks": source.remarks}
-        for path, source in zip(paths, sources_found, strict=True)
+        {
+            "file": str(source.path),
+            "plant": source.plant.name,
+            "origin": source.origin,
+            "remarks": source.remarks,
+        }
+        for source in sources_found
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, Any, Literal
 
 from workflow.config.joints_config import AnyConfig, JointsConfig
@@ -84,6 +85,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     that was identified, at the larger of two sizes.
     """
     # Here: a study that is refused needs the names of the columns only.
+    from control_design.analysis.margins import Margins
     from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
@@ -103,9 +105,11 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
         found["matching_error_unfiltered"] = prefilter.error_before
     if (certificate := certify.certificate) is not None:
         verdict, bound = certificate.plants[0], certificate.gamma_bound
-        found |= _margins("", verdict.worst_margins) | _margins("nominal_", verdict.nominal_margins)
+        # Of several plants a stated number is the least, and an unstable one has none.
+        least_margins = reduce(Margins.worse, (plant.worst_margins for plant in certificate.plants))
+        found |= _margins("", least_margins) | _margins("nominal_", verdict.nominal_margins)
         found["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
-        found["bandwidth_rad_s"] = verdict.bandwidth_rad_s
+        found["bandwidth_rad_s"] = min(plant.bandwidth_rad_s for plant in certificate.plants)
         low, high = config.specification.mode_band_rad_s or (0.0, math.inf)
         modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
         if least := min(modes, key=lambda mode: mode.zeta, default=None):

@@ -53,7 +53,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
         return ClosedLoopResult(skipped=results.certify.reason)
     law = results.reference_filter.law(controller)
     with naming("closed loop"):
-        radius = float(np.max(np.abs(closed_loop_poles(controller, stage.plant))))
+        radius = max(float(np.max(np.abs(closed_loop_poles(controller, plant)))) for plant in stage.plants)
         if not radius < 1:
             return ClosedLoopResult(skipped="the nominal closed loop is unstable")
         reference_filter = results.reference_filter.filter
@@ -86,11 +86,18 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                 some = bench.slew(), bench.push(), *bench.payloads(), bench.late(), *bench.frictions()
                 conditions = [*some, bench.coarse(), *bench.overdriven()]
         else:
-            # Control and performance channel are drawn independently.
-            own = posterior.sample(stage.rng("closed_loop", "control"), options.draws)
+            # Control and performance channel are drawn independently, the parts of the set in turn.
+            control_rng = stage.rng("closed_loop", "control")
             rng = stage.rng("closed_loop", "performance")
-            shown = None if tip is None else (tip, tip.sample(rng, options.draws))
-            achieved = run_on_draws(controller, (posterior, own), shown, trial, **converter_steps(options))
+            steps = converter_steps(options)
+            members = channels[config.control_index].members
+            counts = np.bincount(np.arange(options.draws) % len(members))
+            runs = []
+            for member, draws in zip(members, counts.tolist(), strict=False):
+                own = member.posterior, member.posterior.sample(control_rng, draws)
+                shown = None if tip is None else (tip, tip.sample(rng, draws))
+                runs.append(run_on_draws(controller, own, shown, trial, **steps))
+            achieved = LoopRuns.together(runs)
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
             first = slice(0, trial.half)

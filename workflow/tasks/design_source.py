@@ -44,7 +44,8 @@ from workflow.text.templates import said, words
 class DesignSource:
     """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
     options (`config`), and knows what a certificate is about (`certified_for`), the units of input and
-    output, and the columns they have in the logs (`logged`)."""
+    output, and the columns they have in the logs (`logged`); part: of the run's set that the plant is, where
+    that has several; path: its file or directory."""
 
     plant: UncertainPlant
     origin: str
@@ -53,11 +54,16 @@ class DesignSource:
     certified_for: str = ""
     units: tuple[str, str] = ("", "")
     logged: Logged | None = None
+    part: str = ""
+    path: Path = Path()
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
     """All plants, by different names and with one sampling time. Raises InputError naming the file."""
-    sources = [load_source(path, design) for path in paths]
+    sources = list[DesignSource]()
+    for path in paths:
+        several = _sources_of_run(path) if path.is_dir() else [load_source(path, design)]
+        sources += [replace(source, path=path) for source in several]
     if "level" in design.plant.model_fields_set:
         level = design.plant.level
         sources = [
@@ -69,12 +75,12 @@ def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource
         raise InputError(
             f"{design.name} [uncertainty]: nothing to state it for: {paths[0]} brings its own ellipses"
         )
-    if len(sources) == 1:
+    if len(paths) == 1:
         return sources
-    for path, source in zip(paths[1:], sources[1:], strict=True):
+    for source in sources[1:]:
         if not np.isclose(source.plant.dt_s, sources[0].plant.dt_s, rtol=1e-9, atol=0):
             raise InputError(
-                f"{path}: sampling time {source.plant.dt_s:.6g} s, but {paths[0]} has "
+                f"{source.path}: sampling time {source.plant.dt_s:.6g} s, but {paths[0]} has "
                 f"{sources[0].plant.dt_s:.6g} s: one controller runs at one"
             )
     names = [path.stem if path.suffix else path.name for path in paths]
@@ -82,10 +88,32 @@ def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource
         names = [f"{path.absolute().parent.name}/{path.name}" for path in paths]
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]
-    return [
-        replace(source, plant=replace(source.plant, name=name))
-        for source, name in zip(sources, names, strict=True)
-    ]
+    by_path = dict(zip(paths, names, strict=True))
+    # A run in several parts says behind its own name which part of it a plant is.
+    renamed = []
+    for source in sources:
+        name = by_path[source.path]
+        if source.part:
+            name = f"{name}, {source.part}"
+        renamed.append(replace(source, plant=replace(source.plant, name=name)))
+    return renamed
+
+
+def _sources_of_run(path: Path) -> list[DesignSource]:
+    """All plants of a run directory: several where its set has several parts. Raises InputError."""
+    run = RunDirectory.open(path)
+    config = config_of(run)
+    results = RunResults(run)
+    about = certified_for(results, config)
+    channel = config.control_channel
+    units = results.records.unit(channel.input), results.records.unit(channel.output)
+    logged = Logged.of(config, results.records)
+    parts = [member.about for member in results.uncertainty.channels[config.control_index].members]
+    sources = []
+    for plant, part in zip(results.uncertainty.plants(config), parts, strict=True):
+        remarks = (f"about {about}",)
+        sources.append(DesignSource(plant, "run directory", remarks, config, about, units, logged, part))
+    return sources
 
 
 def level_can_change(plant: UncertainPlant) -> bool:
@@ -96,15 +124,7 @@ def level_can_change(plant: UncertainPlant) -> bool:
 def load_source(path: Path, design: DesignFile) -> DesignSource:
     """One plant. Raises InputError: one line that names the file."""
     if path.is_dir():
-        run = RunDirectory.open(path)
-        config = config_of(run)
-        results = RunResults(run)
-        about = certified_for(results, config)
-        plant = results.uncertainty.plant(config)
-        channel = config.control_channel
-        units = results.records.unit(channel.input), results.records.unit(channel.output)
-        logged = Logged.of(config, results.records)
-        return DesignSource(plant, "run directory", (f"about {about}",), config, about, units, logged)
+        return _sources_of_run(path)[0]
     if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
         return _measured(path, design)
     document = read_document(path)

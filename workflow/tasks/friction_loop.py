@@ -307,7 +307,7 @@ def check_friction(
         elif sensitivity is not None:
             measured[k] = measured_on_arm(stage, controller, excitation, name).peak[0]
     sizes = plan.rms * np.array(_SHARES)
-    certified = certificate.plants[0].worst_peak_sensitivity
+    certified = max(plant.worst_peak_sensitivity for plant in certificate.plants)
     fitted = FrictionLoop.of(controller, found, **steps)
     radius = float(np.max(np.abs(controller.poles), initial=0.0))
     rest = settling_samples(radius, 200, 6000)
@@ -422,7 +422,7 @@ def soonest(
     # The step of the closed-loop stage, for as long as the slowest pole of the linear loop needs.
     records = stage.results.records.fitted(config.control_channel)
     size = config.closed_loop.reference_step or 0.5 * rms_of([record.output for record in records])
-    radius = float(np.max(np.abs(closed_loop_poles(law, stage.plant))))
+    radius = max(float(np.max(np.abs(closed_loop_poles(law, plant)))) for plant in stage.plants)
     step = np.append(0.0, np.full(settling_samples(radius, 200, 60_000) // 2, size))
 
     # What is soon enough.

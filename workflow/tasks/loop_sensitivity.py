@@ -97,7 +97,7 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
     certificate = stage.results.certify.certificate
     assert certificate is not None
     options, plan = stage.config.closed_loop, sensitivity_plan(stage, controller, transient_samples)
-    certified = certificate.plants[0].worst_peak_sensitivity
+    certified = max(plant.worst_peak_sensitivity for plant in certificate.plants)
     arms: list[tuple[str, tuple[dict[str, Any], ...], float]] = [
         ("arm as identified", (), 1.0),
         ("arm as identified, reference ten times smaller", (), SMALL),

@@ -6,6 +6,7 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Generic, Literal, TypeVar
@@ -244,13 +245,30 @@ class Intervals:
 
 
 @dataclass(frozen=True, eq=False)
+class UncertainMember:
+    """A part of the set that a channel may be in. about: which part; nominal: a member of it."""
+
+    about: str
+    posterior: ResponsePosterior
+    nominal: GobfModel
+
+    def at_rate(self, controller_dt_s: float, omega: RealArray) -> UncertainMember:
+        """The part as a controller of this period sees it; omega (F,): where both tell a response."""
+        step_s = self.posterior.dt_s
+        posterior = resampled(self.posterior, controller_dt_s)
+        poles = resampled_poles(self.nominal.poles, step_s, controller_dt_s)
+        return replace(self, posterior=posterior, nominal=nominal_near(posterior, poles, omega))
+
+
+@dataclass(frozen=True, eq=False)
 class UncertainChannel:
     """Ellipses of one channel and what the residuals say about them.
 
     nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
     display grid; empirical: response without a model, where the records allow one; tests: whiteness and
     independence of the residuals on the estimation records; advice: where they fail; repeat_scatter: None
-    without repeats; intervals: None where the method has none.
+    without repeats; intervals: None where the method has none. about: which part of the set posterior and
+    nominal are of, "" where it has one part; others: the further parts. The channel is in one of them.
     """
 
     name: str
@@ -266,6 +284,13 @@ class UncertainChannel:
     intervals: Intervals | None = None
     repeat_scatter: tuple[ScatterRow, ...] | None = None
     advice: tuple[Finding, ...] = ()
+    about: str = field(default="", metadata={"since": 2})
+    others: tuple[UncertainMember, ...] = field(default=(), metadata={"since": 2})
+
+    @property
+    def members(self) -> tuple[UncertainMember, ...]:
+        """All parts of the set, that of the identified model first."""
+        return (UncertainMember(self.about, self.posterior, self.nominal), *self.others)
 
     @property
     def noise_order(self) -> int:
@@ -288,6 +313,7 @@ class UncertainChannel:
             posterior=posterior,
             nominal=nominal_near(posterior, poles, omega),
             frequency=posterior.at(omega, self.level),
+            others=tuple(other.at_rate(controller_dt_s, omega) for other in self.others),
         )
 
     def in_plant(self) -> PlantChannel:
@@ -318,27 +344,37 @@ class UncertaintyResult:
         return self._channels_at[controller_dt_s]
 
     def plant(self, config: RunConfig) -> UncertainPlant:
-        """What the controller is designed for: control channel and first performance channel, at its rate."""
+        """The first of `plants`, that of the identified model."""
+        return self.plants(config)[0]
+
+    def plants(self, config: RunConfig) -> tuple[UncertainPlant, ...]:
+        """What the controller is designed for: control channel and first performance channel, at its rate.
+
+        One plant for each part of the set that the control channel may be in.
+        """
         name = config.control_channel.label
         performance_index = config.performance_index
         key = name, config.control_index, performance_index, config.specification.controller_dt_s
         if key not in self._plants:
             channels = self.seen_by_controller(config)
-            control = channels[config.control_index].in_plant()
+            control = channels[config.control_index]
             performance = None
             if performance_index is not None:
                 performance = channels[performance_index].in_plant()
-            self._plants[key] = UncertainPlant(
-                name=name,
-                nominal=control.nominal,
-                uncertainty=control.uncertainty,
-                performance=performance,
-                level=control.level,
+            self._plants[key] = tuple(
+                UncertainPlant(
+                    name=f"{name}, {member.about}" if member.about else name,
+                    nominal=member.nominal.to_control(),
+                    uncertainty=member.posterior,
+                    performance=performance,
+                    level=control.level,
+                )
+                for member in control.members
             )
         return self._plants[key]
 
     @cached_property
-    def _plants(self) -> dict[tuple[str, int, int | None, float | None], UncertainPlant]:
+    def _plants(self) -> dict[tuple[str, int, int | None, float | None], tuple[UncertainPlant, ...]]:
         """Plants by name, control and performance channel and rate: stages and figures ask for one again."""
         return {}
 
@@ -441,6 +477,17 @@ class LoopRuns:
     command: RealArray
     performance: RealArray | None
     limited: BoolArray
+
+    @classmethod
+    def together(cls, several: Sequence[LoopRuns]) -> LoopRuns:
+        """The runs of several, one after the other; all with a performance channel, or none."""
+        shown = [runs.performance for runs in several if runs.performance is not None]
+        return cls(
+            np.concatenate([runs.output for runs in several]),
+            np.concatenate([runs.command for runs in several]),
+            np.concatenate(shown) if shown else None,
+            np.concatenate([runs.limited for runs in several]),
+        )
 
 
 @dataclass(frozen=True)

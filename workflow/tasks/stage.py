@@ -34,8 +34,13 @@ class StageInput:
 
     @property
     def plant(self) -> UncertainPlant:
-        """The plant that was identified."""
-        return self.results.uncertainty.plant(self.config)
+        """The plant that was identified, of several the one nearest to the model."""
+        return self.plants[0]
+
+    @property
+    def plants(self) -> tuple[UncertainPlant, ...]:
+        """The plants that were identified: several where one ellipse would hold too much."""
+        return self.results.uncertainty.plants(self.config)
 
     @property
     def specification(self) -> Specification:

@@ -36,7 +36,7 @@ def design_controller(stage: StageInput) -> DesignResult:
     def found(asked: Specification, *, advise: bool) -> DesignResult:
         report = partial(stage.progress.update, "design")
         return find_design(
-            [stage.plant],
+            stage.plants,
             asked,
             config.synthesis,
             config.certificate,
@@ -55,7 +55,7 @@ def find_achievable(stage: StageInput) -> AchievablePerformance:
     config = stage.config
     report = partial(stage.progress.update, "achievable_performance")
     with naming("achievable performance"):
-        return find_bracket([stage.plant], stage.specification, config.achievable_performance, report)
+        return find_bracket(stage.plants, stage.specification, config.achievable_performance, report)
 
 
 def certify_controller(stage: StageInput) -> CertifyResult:
@@ -65,7 +65,7 @@ def certify_controller(stage: StageInput) -> CertifyResult:
     if law is None:
         return CertifyResult(None, certified=False, reason=design.reason)
     with naming("certify"):
-        return certify_asked(law, [stage.plant], stage.specification, config.certificate, rng)
+        return certify_asked(law, stage.plants, stage.specification, config.certificate, rng)
 
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
@@ -74,7 +74,7 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
     if law is None:
         return ReferenceFilterResult(reason=None if settings is None else said("no_filter"))
     with naming("reference filter"):
-        found = find_filter(law, [stage.plant], settings)
+        found = find_filter(law, stage.plants, settings)
     friction = stage.results.identify.friction
     if stage.config.closed_loop.friction_feedforward and friction is not None:
         found = replace(found, feedforward=friction_feedforward(law, resampled_friction(friction, law.dt_s)))

@@ -28,6 +28,7 @@ from ident.friction import (
     BehindFriction,
     EquivalentFriction,
     FrictionFit,
+    RateMember,
     at_amplitude,
     equivalent_friction,
     other_output_without_friction,
@@ -50,6 +51,7 @@ from workflow.tasks.results import (
     ModeInterval,
     RunRecord,
     UncertainChannel,
+    UncertainMember,
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
@@ -103,15 +105,18 @@ def uncertainty_of(
     at_shaft: bool = True,
     equivalent: EquivalentFriction | None = None,
     timing: CommandTiming | None = None,
+    in_parts: bool = True,
 ) -> tuple[UncertainChannel, EquivalentFriction | None]:
     """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
     that acts like the dry one where they are about an amplitude.
 
     measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
-    is where at_shaft; equivalent: where it is known from the shaft; timing: of the command between two rows.
+    is where at_shaft; equivalent: where it is known from the shaft; timing: of the command between two rows;
+    in_parts: a set that one ellipse holds badly may come in several parts.
     Raises ValueError, one line, where the model explains nothing.
     """
     poles, linear_poles, options = result.model.poles, result.model.poles, channel.embedding
+    members: tuple[RateMember, ...] = ()
     if friction is None:
         white = whiteness_test(result.identification.residuals).passed
 
@@ -142,8 +147,14 @@ def uncertainty_of(
         if channel.uncertainty.response == "this amplitude":
             equivalent = equivalent or equivalent_friction(friction, measured, rng)
             posterior, poles = at_amplitude(behind, equivalent, rng)
+        elif behind.members and (in_parts or len(behind.members) == 1):
+            members = behind.members
+            posterior, poles = members[0].response, members[0].poles
     if timing is not None:
         posterior = with_unknown_timing(posterior, timing)
+        members = tuple(
+            replace(member, response=with_unknown_timing(member.response, timing)) for member in members
+        )
     band, omega = result.data_band_rad_s, display_grid(result.model, result.bounded)
     if band is not None:  # the nominal model has to be right there, and need not elsewhere
         omega = omega[(omega >= band[0]) & (omega <= band[1])]
@@ -158,6 +169,7 @@ def uncertainty_of(
         poles=poles,
         linear=linear,
         linear_poles=linear_poles,
+        members=members,
         tests=tests,
     )
     # Friction is identified with a position; who records a speed is not told to record another signal.
@@ -184,13 +196,15 @@ def uncertain_channel(
     result: IdentifiedChannel,
     omega: RealArray,
     *,
+    members: Sequence[RateMember] = (),
     tests: Tests,
     poles: Poles,
     linear: ResponsePosterior,
     linear_poles: Poles,
 ) -> UncertainChannel:
     """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
-    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice."""
+    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice; members:
+    parts of the set, the posterior that of the first."""
     model = result.model
     doubts = [doubt for record in result.bounded for doubt in record.doubts]
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
@@ -202,6 +216,14 @@ def uncertain_channel(
     pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
     untold = [i for i, mode in enumerate(intervals.modes if intervals else ()) if not mode.told]
     nominal = nominal_of(posterior, poles, omega, pairs[untold])
+    others = tuple(
+        UncertainMember(
+            said("rate_part", member.from_rad_s, member.to_rad_s),
+            member.response,
+            nominal_of(member.response, member.poles, omega, pairs[untold]),
+        )
+        for member in members[1:]
+    )
     return UncertainChannel(
         name=result.name,
         method=method,
@@ -223,6 +245,8 @@ def uncertain_channel(
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
+        about=said("rate_part", members[0].from_rad_s, members[0].to_rad_s) if others else "",
+        others=others,
     )
 
 

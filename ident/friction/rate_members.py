@@ -1,0 +1,225 @@
+"""An integrating axis whose slow rate is hardly known, as a few posteriors that hold it together.
+
+An axis G = k / (s (s + p)) answers a force 1 / G that is linear in its rate p. Where the data tell p to a
+factor of eighty only, or no lower end of it at all, one ellipse that holds every gain holds zero, too, and
+no controller can be certified. The rate is positive, so its interval has two ends; `rate_members` parts it so
+that the ellipses of each part keep zero outside. What is certified for all of them is certified for the axis.
+
+The force at a frequency is a segment, F (1 + e eta), e from -1 to 1, about the force F in the middle. Its gain
+is an arc of a circle, A (e + eta) / (1 + e eta) about the middle of its ends, A its half chord; a disc holds
+it that is |eta| of its centre wide.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import ndtri_exp
+from scipy.stats import norm
+
+from ident.basis.poles import Poles
+from ident.basis.posterior import ResponsePosterior
+from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.data.arrays import BoolArray, ComplexArray, RealArray
+from ident.data.ellipses import LEVEL, chi2_radius
+from ident.friction.further_poles import frequencies_of, on_further_poles
+
+# Probability of a rate beyond either end of the interval that the members share. Chosen: with both ends 1 %
+# of the 5 % that ellipses leave out is for everything else that is not known. Halved, a rate that may be none
+# is held down to half of the lowest one.
+_TAIL = 0.0125
+# Half width of a member's force over the middle, at most. Zero is held from 1 on; what else is not known adds
+# about a tenth. It is that of a rate known to a factor of ten.
+_WIDEST = 0.75
+# XX
+_ACROSS = 1.05
+_LONGER_FROM = 4
+# Members at most. Chosen: a factor of ten each.
+_MOST_MEMBERS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class RateMember:
+    """Posterior of an axis whose slow rate lies in a part of its interval.
+
+    Attributes
+    ----------
+    response : ResponsePosterior
+    poles : Poles
+        Of the arm, the slowest real one at the member's rate.
+    from_rad_s, to_rad_s : float or None
+        Ends of the part, as the frequency above which the axis is an inertia: 1 / s^2. None: that of the
+        whole interval.
+    """
+
+    response: ResponsePosterior
+    poles: Poles
+    from_rad_s: float | None
+    to_rad_s: float | None
+
+
+def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) -> tuple[RateMember, ...]:
+    """Posteriors that together hold an axis whose slow rate is hardly known.
+
+    Parameters
+    ----------
+    response : ResponsePosterior
+        Whose covariance is that of the response, to first order, on P' unit normals.
+    poles : Poles
+        Of the arm, which the response has twice.
+    longest_s : float
+        Length of the longest record, s.
+
+    Returns
+    -------
+    tuple of RateMember
+        The one that holds the mean response first, else the nearest, the others by their rate. Empty where
+        one will do: the rate is known to a factor of ten, or the arm does not integrate, or is unstable.
+
+    Notes
+    -----
+    The response is linear, G = G0 (1 + x t) with normals t: to first order a force (1 - x t) / G0. One normal
+    moves the force at rest. Its values are those at which the damping Re(force / jw) is nowhere negative where
+    an ellipse to first order would hold zero; what is left is a normal that is cut off there. Its interval
+    without `_TAIL` on either side is parted at equal ratios. Of the other normals a change of the force stays
+    one, to first order about the member's centre. Neglected: bends above the first light mode.
+    """
+    if response.integrators != 1 or response.unstable.order:
+        return ()
+    omega = frequencies_of(response, longest_s)
+    rows = response.frequency_rows(omega)
+    gain = rows @ response.mean
+    change = (rows @ response.covariance_factor) / gain[:, None]
+    low = below_modes(omega, change, poles, response.dt_s)
+    at_rest = change[0].real
+    deviation = float(np.linalg.norm(at_rest))
+    if not (low.any() and deviation > 0):
+        return ()
+
+    # Where an ellipse to first order would hold zero. Above, the sign of the inertia is known.
+    x = change @ (at_rest / deviation)
+    holds_zero = low & (chi2_radius(LEVEL) * np.abs(x) >= 1)
+    if not holds_zero[0]:
+        return ()
+    first_known = int(np.argmin(holds_zero))
+    force = 1 / (1j * omega * gain)
+    force = force * np.sign(force[first_known].imag)
+
+    # A unit normal whose growth takes force away, and its values that leave a damping.
+    turn = np.sign(force[0].real)
+    direction = turn * at_rest / deviation
+    x = turn * x
+    by_normal = (x * force).real
+    counts = holds_zero & (by_normal > 0)
+    undamped = float(np.min(force.real[counts] / by_normal[counts]))
+    least, most = _positive_interval(undamped)
+
+    # As few parts as keep zero outside.
+    for n_members in range(1, _MOST_MEMBERS + 1):
+        edges = np.geomspace(least, most, n_members + 1)
+        middles = (edges[1:] + edges[:-1]) / 2
+        between = 1 - np.outer(x, undamped - middles)
+        half = np.outer(x, np.diff(edges) / 2) / between
+        if np.max(np.abs(half[low])) <= _WIDEST:
+            break
+
+    others = change - np.outer(x, direction)
+    members = list[RateMember]()
+    corners = [_corner(omega, force * (1 - x * (undamped - edge))) for edge in edges]
+    for k in range(n_members):
+        wanted = _covering(omega, x, undamped - middles[k], half[:, k], others, low)
+        weight = 1 / np.linalg.norm(wanted, axis=1)
+        rate = _corner(omega, force * between[:, k])
+        members.append(
+            RateMember(
+                on_further_poles(response, poles, omega, wanted, weight),
+                _with_rate(poles, rate, response.dt_s),
+                corners[k] if k else None,
+                corners[k + 1] if k + 1 < n_members else None,
+            )
+        )
+    nearest = int(np.argmin(np.abs(np.log(np.maximum(undamped, least) / np.sqrt(edges[1:] * edges[:-1])))))
+    return (members.pop(nearest), *members)
+
+
+def below_modes(omega: RealArray, change: ComplexArray, poles: Poles, dt_s: float) -> BoolArray:
+    """Frequencies (F,) of omega, rad/s, below the first light mode; of an arm without one, below the
+    frequency where the gain is known best, as above it is no longer the force of a slow motion.
+
+    change (F, P'): of the gain by unit normals, relative.
+    """
+    is_mode = poles.zeta() < LARGEST_DAMPING
+    modes_rad_s = poles.omega_rad_s(dt_s)[is_mode]
+    best_known = omega[np.argmin(np.linalg.norm(change, axis=1))]
+    return np.asarray(omega < np.min(modes_rad_s, initial=best_known))
+
+
+def _positive_interval(mean: float) -> tuple[float, float]:
+    """Ends of the interval of a normal of unit variance that is positive, without `_TAIL` on either side."""
+    log_positive = norm.logsf(-mean)
+    ends = []
+    for log_above in (np.log1p(-_TAIL), np.log(_TAIL)):
+        # Number above which a unit normal lies with this probability, however small.
+        ends.append(mean - float(ndtri_exp(log_above + log_positive)))
+    least, most = ends
+    return least, most
+
+
+def _covering(
+    omega: RealArray,
+    x: ComplexArray,
+    normal: float,
+    half: ComplexArray,
+    others: ComplexArray,
+    low: BoolArray,
+) -> ComplexArray:
+    """Centre and columns (F, 1 + N), over the gain, of ellipses at the level that hold a member's arcs.
+
+    omega (F,), rad/s; x (F,): change by the normal that moves the force at rest, `normal` its value in the
+    middle; half (F,): half width of the force over the middle; others (F, P'): change by the other normals;
+    low (F,): where a change is one of the force.
+
+    With the half chord an ellipse is as wide across as the arc bows, h. An arc of a rate bows by no more than
+    tan(h') 2 X / (1 + X^2), X the frequency over the one where it bows most, and a response that falls on both
+    sides of that with two poles is as large. It turns through the chord; behind an all-pass it lies across.
+    """
+    # Half the chord, and the middle of the ends.
+    middle = 1 / ((1 - x * normal) * (1 - half**2))
+    chord = half * middle
+    sine = np.abs(half.imag)
+    bow_slope = np.where(low, sine / (1 - np.abs(half) ** 2), 0.0)
+    most_bowed = omega[np.argmax(bow_slope)]
+    ratio = 1j * omega / most_bowed
+    band = 2 * ratio / (1 + ratio) ** 2
+    bow = _ACROSS * np.max(bow_slope) * band * chord
+    behind = (1 - ratio) / (1 + ratio)
+    longer = chord * ratio / (_LONGER_FROM + ratio)
+    parts = np.column_stack([chord, bow, bow * behind, bow * behind**2, longer])
+    of_others = others * (middle**2)[:, None]
+
+    # Into the straight ones, over the octave below the first light mode.
+    share = np.clip(np.log2(omega[low][-1] / omega) / 3 - 1 / 3, 0, 1)[:, None]
+    straight = half * (1 - x * normal)
+    straight_parts = np.zeros_like(parts)
+    straight_parts[:, 0] = straight_parts[:, -1] = straight
+    centre = share[:, 0] * middle + (1 - share[:, 0]) * (1 + x * normal)
+    parts = share * parts + (1 - share) * straight_parts
+    of_others = share * of_others + (1 - share) * others
+    return np.column_stack([centre, parts / chi2_radius(LEVEL), of_others])
+
+
+def _corner(omega: RealArray, force: ComplexArray) -> float:
+    """Frequency, rad/s, from which on a force over speed (F,) at omega (F,) is more inertia than damping."""
+    return float(omega[np.argmax(force.imag > force.real)])
+
+
+def _with_rate(poles: Poles, rate_per_s: float, dt_s: float) -> Poles:
+    """Poles whose slowest real one decays at a rate, 1/s; with one more where none decays."""
+    real = poles.real.copy()
+    decaying = np.flatnonzero(real > 0)
+    pole = np.exp(-rate_per_s * dt_s)
+    if decaying.size == 0:
+        return poles.appended(Poles(np.array([pole])))
+    real[decaying[np.argmax(real[decaying])]] = pole
+    return Poles(real, poles.pairs)
