@@ -25,18 +25,29 @@ from ident.data.arrays import BoolArray, ComplexArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.friction.further_poles import frequencies_of, on_further_poles
 
-# Probability of a rate beyond either end of the interval that the members share. Chosen: with both ends 1 %
-# of the 5 % that ellipses leave out is for everything else that is not known. Halved, a rate that may be none
-# is held down to half of the lowest one.
+# Probability of a rate beyond either end of the interval that the members share: half of the 5 % that ellipses
+# leave out; the other half is for everything else that is not known. Halved, a rate that may be none is held
+# down to half of the lowest one.
 _TAIL = 0.0125
-# Half width of a member's force over the middle, at most. Zero is held from 1 on; what else is not known adds
-# about a tenth. It is that of a rate known to a factor of ten.
+# Size of an ellipse to first order, over the gain, from which on a negative damping counts: it would hold the
+# opposite of the response. Chosen: where it is smaller, a lag of the drive looks like a negative damping.
+_AS_MUCH = 2
+# Half width of a member's force over the middle, at most: a rate known to a factor of seven. Where the arc bows
+# most its ellipse then is .84 of its centre wide. Zero is held from 1 on, and the rest that is not known adds a
+# tenth. With .85, a factor of twelve, ellipses hold zero.
 _WIDEST = 0.75
-# XX
-_ACROSS = 1.05
-_LONGER_FROM = 4
-# Members at most. Chosen: a factor of ten each.
+# Members at most: a normal that is cut off at zero has no more than a factor of 350 between its ends.
 _MOST_MEMBERS = 4
+# Factor on the width across an arc. Three columns, a quarter turn or more of the all-pass apart, are at their
+# narrowest 5 % less than the arc bows (tests/ident/test_rate_members.py; to a half width of .3).
+_ACROSS = 1.05
+# From this many times the frequency where an arc bows most its ellipse gets 1.4 times as long, so that rates
+# at the arc's ends have nearly the width across that the others have. Chosen: gains are far from zero there.
+# Doubled, draws of the highest rates lie outside over an octave more.
+_LONGER_FROM = 4
+# Octaves over which a change of the force turns into one of the gain, from three below the first light mode to
+# one. Chosen: over one octave the poles of the arm follow it less well.
+_TURNS_OVER = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,15 +86,17 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     -------
     tuple of RateMember
         The one that holds the mean response first, else the nearest, the others by their rate. Empty where
-        one will do: the rate is known to a factor of ten, or the arm does not integrate, or is unstable.
+        ellipses to first order do not hold zero, of an arm that does not integrate or is unstable, and where
+        parts of a rate do not keep zero outside.
 
     Notes
     -----
     The response is linear, G = G0 (1 + x t) with normals t: to first order a force (1 - x t) / G0. One normal
     moves the force at rest. Its values are those at which the damping Re(force / jw) is nowhere negative where
-    an ellipse to first order would hold zero; what is left is a normal that is cut off there. Its interval
-    without `_TAIL` on either side is parted at equal ratios. Of the other normals a change of the force stays
-    one, to first order about the member's centre. Neglected: bends above the first light mode.
+    an ellipse to first order would hold the opposite of the response; what is left is a normal that is cut off
+    there. Its interval without `_TAIL` on either side is parted at equal ratios. A relative change by another
+    normal is the same of every member. Neglected: bends above the first light mode, and lags of a drive in the
+    damping.
     """
     if response.integrators != 1 or response.unstable.order:
         return ()
@@ -99,11 +112,14 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
 
     # Where an ellipse to first order would hold zero. Above, the sign of the inertia is known.
     x = change @ (at_rest / deviation)
-    holds_zero = low & (chi2_radius(LEVEL) * np.abs(x) >= 1)
+    size = chi2_radius(LEVEL) * np.abs(x)
+    holds_zero = low & (size >= 1)
     if not holds_zero[0]:
         return ()
     first_known = int(np.argmin(holds_zero))
-    force = 1 / (1j * omega * gain)
+    # Force over speed, without the delay of the input and of the hold.
+    delay_s = (response.input_delay_samples + 0.5) * response.dt_s
+    force = np.exp(-1j * omega * delay_s) / (1j * omega * gain)
     force = force * np.sign(force[first_known].imag)
 
     # A unit normal whose growth takes force away, and its values that leave a damping.
@@ -111,7 +127,7 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     direction = turn * at_rest / deviation
     x = turn * x
     by_normal = (x * force).real
-    counts = holds_zero & (by_normal > 0)
+    counts = low & (size >= min(_AS_MUCH, size[0])) & (by_normal > 0)
     undamped = float(np.min(force.real[counts] / by_normal[counts]))
     least, most = _positive_interval(undamped)
 
@@ -123,6 +139,8 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
         half = np.outer(x, np.diff(edges) / 2) / between
         if np.max(np.abs(half[low])) <= _WIDEST:
             break
+    else:
+        return ()
 
     others = change - np.outer(x, direction)
     members = list[RateMember]()
@@ -180,9 +198,10 @@ def _covering(
     middle; half (F,): half width of the force over the middle; others (F, P'): change by the other normals;
     low (F,): where a change is one of the force.
 
-    With the half chord an ellipse is as wide across as the arc bows, h. An arc of a rate bows by no more than
-    tan(h') 2 X / (1 + X^2), X the frequency over the one where it bows most, and a response that falls on both
-    sides of that with two poles is as large. It turns through the chord; behind an all-pass it lies across.
+    Across, an ellipse has to be as wide as the arc bows, h. Of a rate tan(h') = h bows by no more than a column
+    with two equal poles about the frequency of the largest one is long, twice as wide as the slope there. Such
+    a column turns through the direction of the chord; behind an all-pass it turns faster, so that three of them
+    are as wide across everywhere.
     """
     # Half the chord, and the middle of the ends.
     middle = 1 / ((1 - x * normal) * (1 - half**2))
@@ -196,10 +215,11 @@ def _covering(
     behind = (1 - ratio) / (1 + ratio)
     longer = chord * ratio / (_LONGER_FROM + ratio)
     parts = np.column_stack([chord, bow, bow * behind, bow * behind**2, longer])
-    of_others = others * (middle**2)[:, None]
+    of_others = others * middle[:, None]
 
-    # Into the straight ones, over the octave below the first light mode.
-    share = np.clip(np.log2(omega[low][-1] / omega) / 3 - 1 / 3, 0, 1)[:, None]
+    # Near the first light mode a change is one of the gain.
+    octaves_below = np.log2(omega[low][-1] / omega)
+    share = np.clip((octaves_below - 1) / _TURNS_OVER, 0, 1)[:, None]
     straight = half * (1 - x * normal)
     straight_parts = np.zeros_like(parts)
     straight_parts[:, 0] = straight_parts[:, -1] = straight

@@ -24,6 +24,7 @@ from workflow.figures.bands import (
 from workflow.figures.description import Panel, Picture, X, new_picture, pad_limits, small_multiples
 from workflow.figures.nyquist import loop_of
 from workflow.figures.subjects import ChannelView, RunView
+from workflow.tasks.results import UncertainMember
 from workflow.text.formats import margin, share
 
 _DOTS: dict[str, Any] = {
@@ -40,9 +41,15 @@ _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2
 
 
 @style.drawing("bode")
-def draw_channel(channel: ChannelView, name: str) -> Picture:
-    """Identified response of a channel, its nominal model, and what the records say without one."""
+def draw_channel(channel: ChannelView, name: str, part: UncertainMember | None = None) -> Picture:
+    """Identified response of a channel, its nominal model, and what the records say without one.
+
+    part: the further part of its set that is shown.
+    """
     found, spread = channel.found, channel.spread
+    if part is not None:
+        frequency = part.posterior.at(spread.frequency.omega_rad_s, spread.level)
+        spread = replace(spread, nominal=part.nominal, frequency=frequency)
     signals = f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}"
     return draw_bode(
         spread.frequency,

@@ -317,7 +317,7 @@ def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> lis
         second = results.reference_filter
         found = results.uncertainty.seen_by_controller(config)[config.control_index]
         kept = [results.run.path / "model.json"]
-        storage.write_together({kept[0]: model_bytes(kept[0], ModelFile(found.nominal, found.frequency))})
+        storage.write_together({kept[0]: model_bytes(kept[0], ModelFile(found.nominal, found.enclosing))})
     if (controller := results.design.controller) is None:
         return kept
     law = Logged.of(config, results.records).law(second.law(controller))

@@ -246,11 +246,13 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class UncertainMember:
-    """A part of the set that a channel may be in. about: which part; nominal: a member of it."""
+    """A part of the set that a channel may be in. about: which part; nominal: a member of it; bands: size of
+    its ellipses."""
 
     about: str
     posterior: ResponsePosterior
     nominal: GobfModel
+    bands: tuple[Band, ...]
 
     def at_rate(self, controller_dt_s: float, omega: RealArray) -> UncertainMember:
         """The part as a controller of this period sees it; omega (F,): where both tell a response."""
@@ -290,7 +292,26 @@ class UncertainChannel:
     @property
     def members(self) -> tuple[UncertainMember, ...]:
         """All parts of the set, that of the identified model first."""
-        return (UncertainMember(self.about, self.posterior, self.nominal), *self.others)
+        return (UncertainMember(self.about, self.posterior, self.nominal, self.bands), *self.others)
+
+    @property
+    def enclosing(self) -> FrequencyUncertainty:
+        """Ellipses that hold those of all parts, for a file that has one of each frequency.
+
+        Ellipses C_i about places d_i from the middle lie in that of the sum of 2 (C_i + d_i d_i'): with points
+        x of the one, |x + d|^2 <= 2 |x|^2 + 2 |d|^2 in every direction.
+        """
+        if not self.others:
+            return self.frequency
+        omega = self.frequency.omega_rad_s
+        parts = [member.posterior.at(omega, self.level) for member in self.members]
+        centre = np.mean([part.centre for part in parts], axis=0)
+        covariance = np.zeros_like(self.frequency.covariance)
+        for part in parts:
+            away = np.stack([(part.centre - centre).real, (part.centre - centre).imag], axis=1)
+            away = away / chi2_radius(self.level)
+            covariance += 2 * (part.covariance + away[:, :, None] * away[:, None, :])
+        return replace(self.frequency, centre=centre, covariance=covariance)
 
     @property
     def noise_order(self) -> int:

@@ -226,6 +226,8 @@ def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
             row["frequency_Hz"] = list(known.frequency_Hz)
     for row, test in zip(found["tests"], spread.tests, strict=True):
         row["verdict"] = words(test.finding)
+    for part in found["others"]:
+        del part["posterior"], part["nominal"]
     found["advice"] = [words(item) for item in spread.advice]
     return {**found, "report": codec.plain(spread.posterior.report)}
 

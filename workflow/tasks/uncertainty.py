@@ -210,8 +210,6 @@ def uncertain_channel(
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
     refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
-    relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
-    bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())  # of equal ratio
     intervals = intervals_of(linear, linear_poles.without(model.unstable), level)
     pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
     untold = [i for i, mode in enumerate(intervals.modes if intervals else ()) if not mode.told]
@@ -221,6 +219,7 @@ def uncertain_channel(
             said("rate_part", member.from_rad_s, member.to_rad_s),
             member.response,
             nominal_of(member.response, member.poles, omega, pairs[untold]),
+            bands_of(member.response.at(omega, level)),
         )
         for member in members[1:]
     )
@@ -237,16 +236,24 @@ def uncertain_channel(
             level=level,
             band_rad_s=result.data_band_rad_s,
         ),
-        bands=tuple(
-            Band(low, high, float(np.median(inside)), float(np.max(inside)))
-            for low, high in bands
-            for inside in [relative[(frequency.omega_rad_s >= low) & (frequency.omega_rad_s < high)]]
-        ),
+        bands=bands_of(frequency),
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
         about=said("rate_part", members[0].from_rad_s, members[0].to_rad_s) if others else "",
         others=others,
+    )
+
+
+def bands_of(frequency: FrequencyUncertainty) -> tuple[Band, ...]:
+    """Size of ellipses in bands of equal ratio over their frequencies."""
+    omega = frequency.omega_rad_s
+    relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
+    bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())
+    return tuple(
+        Band(low, high, float(np.median(inside)), float(np.max(inside)))
+        for low, high in bands
+        for inside in [relative[(omega >= low) & (omega < high)]]
     )
 
 
