@@ -3,9 +3,9 @@
     python -m benchmarks.machines_with_truth [--machines DIR] [--only NAME,NAME] [--keep DIR]
 
 DIR holds a folder a machine: run*.csv and truth.json. What is printed of each: the share of the frequencies
-that its command excites (above 1e-3 of the largest power density) at which the 95 % ellipse, of several parts
-of a set that of any, holds the true response without friction; friction and modes with their intervals; whether the certified loop keeps its
-modulus margin with the true response, at the frequencies that truth.json has.
+that its command excites (above 1e-3 of the largest power density) at which the 95 % ellipse (of several parts
+of a set any) holds the true response without friction; friction and modes with their intervals; whether the
+certified loop keeps its modulus margin with the true response, at the frequencies that truth.json has.
 """
 
 from __future__ import annotations

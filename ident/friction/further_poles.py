@@ -1,8 +1,8 @@
 """A posterior whose response is stated over frequency, put onto more poles than those it stood on.
 
-Where what is not known of a response is bent (`ident.friction.posterior.of_force`) or covered member by member
-(`ident.friction.rate_members`), centre and columns are functions of frequency. `on_further_poles` finds the
-coefficients that have them, so that the result is a posterior at any frequency like every other.
+Where what is not known of a response is bent (`ident.friction.posterior.of_force`) or covered member by
+member (`ident.friction.rate_members`), centre and columns are functions of frequency. `on_further_poles`
+finds the coefficients that have them, so that the result is a posterior at any frequency like every other.
 """
 
 from __future__ import annotations

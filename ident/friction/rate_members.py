@@ -5,9 +5,9 @@ factor of eighty only, or no lower end of it at all, one ellipse that holds ever
 no controller can be certified. The rate is positive, so its interval has two ends; `rate_members` parts it so
 that the ellipses of each part keep zero outside. What is certified for all of them is certified for the axis.
 
-The force at a frequency is a segment, F (1 + e eta), e from -1 to 1, about the force F in the middle. Its gain
-is an arc of a circle, A (e + eta) / (1 + e eta) about the middle of its ends, A its half chord; a disc holds
-it that is |eta| of its centre wide.
+The force at a frequency is a segment, F (1 + e eta), e from -1 to 1, about the force F in the middle. Its
+gain is an arc of a circle, A (e + eta) / (1 + e eta) about the middle of its ends, A its half chord; a disc
+holds it that is |eta| of its centre wide.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from ident.data.arrays import BoolArray, ComplexArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.friction.further_poles import frequencies_of, on_further_poles
 
-# Probability of a rate beyond either end of the interval that the members share: half of the 5 % that ellipses
-# leave out; the other half is for everything else that is not known. Halved, a rate that may be none is held
-# down to half of the lowest one.
+# Probability of a rate beyond either end of the interval that the members share: half of the 5 % that
+# ellipses leave out; the other half is for everything else that is not known. Halved, a rate that may be none
+# is held down to half of the lowest one.
 _TAIL = 0.0125
 # Size of an ellipse to first order, over the gain, from which on a negative damping counts: it would hold the
 # opposite of the response. Chosen: where it is smaller, a lag of the drive looks like a negative damping.
 _AS_MUCH = 2
-# Half width of a member's force over the middle, at most: a rate known to a factor of seven. Where the arc bows
-# most its ellipse then is .84 of its centre wide. Zero is held from 1 on, and the rest that is not known adds a
-# tenth. With .85, a factor of twelve, ellipses hold zero.
+# Half width of a member's force over the middle, at most: a rate known to a factor of seven. Where the arc
+# bows most its ellipse then is .84 of its centre wide. Zero is held from 1 on, and the rest that is not known
+# adds a tenth. With .85, a factor of twelve, ellipses hold zero.
 _WIDEST = 0.75
 # Members at most: a normal that is cut off at zero has no more than a factor of 350 between its ends.
 _MOST_MEMBERS = 4
@@ -45,8 +45,8 @@ _ACROSS = 1.05
 # at the arc's ends have nearly the width across that the others have. Chosen: gains are far from zero there.
 # Doubled, draws of the highest rates lie outside over an octave more.
 _LONGER_FROM = 4
-# Octaves over which a change of the force turns into one of the gain, from three below the first light mode to
-# one. Chosen: over one octave the poles of the arm follow it less well.
+# Octaves over which a change of the force turns into one of the gain, from three below the first light mode
+# to one. Chosen: over one octave the poles of the arm follow it less well.
 _TURNS_OVER = 2
 
 
@@ -92,11 +92,11 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     Notes
     -----
     The response is linear, G = G0 (1 + x t) with normals t: to first order a force (1 - x t) / G0. One normal
-    moves the force at rest. Its values are those at which the damping Re(force / jw) is nowhere negative where
-    an ellipse to first order would hold the opposite of the response; what is left is a normal that is cut off
-    there. Its interval without `_TAIL` on either side is parted at equal ratios. A relative change by another
-    normal is the same of every member. Neglected: bends above the first light mode, and lags of a drive in the
-    damping.
+    moves the force at rest. Its values are those at which the damping Re(force / jw) is nowhere negative
+    where an ellipse to first order would hold the opposite of the response; what is left is a normal that is
+    cut off there. Its interval without `_TAIL` on either side is parted at equal ratios. A relative change by
+    another normal is the same of every member. Neglected: bends above the first light mode, and lags of a
+    drive in the damping.
     """
     if response.integrators != 1 or response.unstable.order:
         return ()
@@ -198,20 +198,20 @@ def _covering(
     middle; half (F,): half width of the force over the middle; others (F, P'): change by the other normals;
     low (F,): where a change is one of the force.
 
-    Across, an ellipse has to be as wide as the arc bows, h. Of a rate tan(h') = h bows by no more than a column
-    with two equal poles about the frequency of the largest one is long, twice as wide as the slope there. Such
-    a column turns through the direction of the chord; behind an all-pass it turns faster, so that three of them
-    are as wide across everywhere.
+    An ellipse as long as the chord that is as wide across as the arc bows holds the arc. For a rate this
+    width is at most `slope` in units of half the chord, |Im half| / (1 - |half|^2), which goes with frequency
+    w like 2 X / (1 + X^2), X = w / (w where it is largest): a column with two equal poles. Its phase turns
+    from across to along the chord; behind an all-pass it turns faster, so that three of them are wide enough
+    everywhere.
     """
     # Half the chord, and the middle of the ends.
     middle = 1 / ((1 - x * normal) * (1 - half**2))
     chord = half * middle
-    sine = np.abs(half.imag)
-    bow_slope = np.where(low, sine / (1 - np.abs(half) ** 2), 0.0)
-    most_bowed = omega[np.argmax(bow_slope)]
+    slope = np.where(low, np.abs(half.imag) / (1 - np.abs(half) ** 2), 0.0)
+    most_bowed = omega[np.argmax(slope)]
     ratio = 1j * omega / most_bowed
     band = 2 * ratio / (1 + ratio) ** 2
-    bow = _ACROSS * np.max(bow_slope) * band * chord
+    bow = _ACROSS * np.max(slope) * band * chord
     behind = (1 - ratio) / (1 + ratio)
     longer = chord * ratio / (_LONGER_FROM + ratio)
     parts = np.column_stack([chord, bow, bow * behind, bow * behind**2, longer])

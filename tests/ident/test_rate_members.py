@@ -34,7 +34,8 @@ def axis(rate: RealArray | float) -> ComplexArray:
 
 
 def other_directions() -> ComplexArray:
-    """Relative changes (F, 2) of the response by two more normals: 2 % of the gain, and behind an all-pass."""
+    """Relative changes (F, 2) of the response by two more normals: 2 % of the gain, and behind an
+    all-pass."""
     return 0.02 * np.column_stack([np.ones(OMEGA.size), (1 - 1j * OMEGA) / (1 + 1j * OMEGA)])
 
 

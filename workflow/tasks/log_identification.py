@@ -86,7 +86,9 @@ def identify_records(
         )
     with naming("identify"), progress.stage("uncertainty"):
         rng = stage_rng(RunSection().seed, "uncertainty", channel.label)
-        spread, equivalent = uncertainty_of(channel, about, measured, rng, friction=friction, timing=timing, in_parts=False)
+        spread, equivalent = uncertainty_of(
+            channel, about, measured, rng, friction=friction, timing=timing, in_parts=False
+        )
     return LogIdentification(
         measured=tuple(measured),
         fresh_records=tuple(fresh_records),

@@ -298,8 +298,8 @@ class UncertainChannel:
     def enclosing(self) -> FrequencyUncertainty:
         """Ellipses that hold those of all parts, for a file that has one of each frequency.
 
-        Ellipses C_i about places d_i from the middle lie in that of the sum of 2 (C_i + d_i d_i'): with points
-        x of the one, |x + d|^2 <= 2 |x|^2 + 2 |d|^2 in every direction.
+        Ellipses C_i about places d_i from the middle lie in that of the sum of 2 (C_i + d_i d_i'): with
+        points x of the one, |x + d|^2 <= 2 |x|^2 + 2 |d|^2 in every direction.
         """
         if not self.others:
             return self.frequency

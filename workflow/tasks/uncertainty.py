@@ -203,8 +203,8 @@ def uncertain_channel(
     linear_poles: Poles,
 ) -> UncertainChannel:
     """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
-    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice; members:
-    parts of the set, the posterior that of the first."""
+    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice;
+    members: parts of the set, the posterior that of the first."""
     model = result.model
     doubts = [doubt for record in result.bounded for doubt in record.doubts]
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
