@@ -19,7 +19,7 @@ from workflow.tasks.uncertainty import uncertain_channel
 
 
 def in_two_parts(run: RunDirectory) -> UncertainChannel:
-    """The control channel of an example run, its set made one of two parts: as it is, and with half the gain."""
+    """The control channel of an example run, its set made one of two parts: as it is, and half the gain."""
     results = RunResults(run)
     found = results.uncertainty.channels[0]
     identified = results.identify.channels[0]
@@ -81,6 +81,7 @@ def test_numbers_for_programs_tell_the_parts(run: RunDirectory) -> None:
     assert set(other) == {"about", "bands"}
 
 
+@pytest.mark.slow
 def test_the_page_shows_every_part(run: RunDirectory) -> None:
     page = write_report(RunResults(run), example.config()).read_text(encoding="utf-8")
     assert "The set has 2 parts" in page
