@@ -18,7 +18,7 @@ optimised, what no controller can meet (the functions `_refuse_...`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -127,6 +127,11 @@ class Specification(Settings):
         default=None,
         description="where bandwidth_rad_s cannot be met, the highest that can, down to here; none = "
         "bandwidth_rad_s as it stands",
+    )
+    tracking_from_rad_s: _Positive | None = Field(
+        default=None,
+        description="tracking is asked from here on, rad/s; none = at all frequencies, or above those where "
+        "the ellipses hold a gain of zero, with which no controller tracks",
     )
     integrator: bool = Field(default=False, description="the controller has a pole at z = 1")
     # Chosen: 60 dB.
@@ -247,6 +252,8 @@ class Specification(Settings):
         # Tracking and effort: in words or as a weight.
         if self.sensitivity_weight is not None and self.bandwidth_rad_s is not None:
             raise ValueError("give bandwidth_rad_s or sensitivity_weight, not both")
+        if self.tracking_from_rad_s is not None and not self.asks_tracking:
+            raise ValueError("tracking_from_rad_s needs bandwidth_rad_s or sensitivity_weight")
         if self.lowest_bandwidth_rad_s is not None:
             bandwidth = self.bandwidth_rad_s
             if bandwidth is None or not self.lowest_bandwidth_rad_s < bandwidth:
@@ -349,6 +356,11 @@ class Specification(Settings):
             refuse_sampling(self, self.controller_dt_s or dt_s)
         except ValueError as error:
             raise SpecificationError(str(error)) from None
+
+    @property
+    def asks_tracking(self) -> bool:
+        """Whether S is weighed at low frequency, by a bandwidth or a weight of its own."""
+        return self.bandwidth_rad_s is not None or self.sensitivity_weight is not None
 
     def tracking_weight(self, plant: UncertainPlant | None = None) -> RationalWeight | None:
         """W1 without the modulus margin; None without a tracking requirement.
@@ -505,8 +517,18 @@ class Tracking(WeightedRequirement):
         weight = spec.tracking_weight(plant)
         if weight is None:
             return None
+        band = None
+        if spec.tracking_from_rad_s is not None:
+            band = (spec.tracking_from_rad_s, np.inf)
         # Where the weight asks for no more than the modulus margin, that requirement asks it already.
-        return cls(weight, above=spec.modulus_margin)
+        return cls(weight, band, above=spec.modulus_margin)
+
+    def check(self, found: Findings) -> SpecificationItem:
+        """Item as of every weighted requirement, with the frequency from which on it is asked."""
+        item = super().check(found)
+        if self.band is None:
+            return item
+        return replace(item, requirement=f"{self.caption}, from {self.band[0]:.3g} rad/s on")
 
 
 class ModulusMargin(WeightedRequirement):
@@ -809,8 +831,11 @@ def _refuse_zeros(spec: Specification, plant: UncertainPlant) -> None:
     There S = 1 for every stable loop, so |W1| must not exceed 1. The message names the zero and, of a
     bandwidth, the largest that is possible there.
 
-    plant: zeros in z and D of its nominal are read. A zero on the circle is not looked at.
+    plant: zeros in z and D of its nominal are read. A zero on the circle is not looked at; nor is any where
+    tracking is asked in a band only, as the bound is one for weights on all frequencies.
     """
+    if spec.tracking_from_rad_s is not None:
+        return
     # In the Tustin plane; the sample of delay's zero at z = infinity is w = 2/dt, the last.
     is_outside = np.abs(plant.zeros) > _OUTSIDE_CIRCLE
     outside = plant.zeros[is_outside]

@@ -103,7 +103,7 @@ class Problem(Grids):
     @property
     def asks_tracking(self) -> bool:
         """Whether the specification weighs S at low frequency, by a bandwidth or a weight of its own."""
-        return self.spec.bandwidth_rad_s is not None or self.spec.sensitivity_weight is not None
+        return self.spec.asks_tracking
 
     # What the optimisers see
 

@@ -20,6 +20,7 @@ from control_design.convex.reference_filter import design_reference_filter
 from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import GIVES_WAY, RationalWeight, Specification, SpecificationError
+from control_design.specification.told_band import tracking_where_told
 from control_design.synthesis.giving_way import synthesise_giving_way, without_limits
 from control_design.synthesis.joint_synthesis import synthesise_jointly
 from control_design.synthesis.synthesis import part_of, synthesise
@@ -78,6 +79,7 @@ def find_design(
     specification = Specification.model_validate(
         specification.model_dump(include=set(Specification.model_fields))
     )
+    specification = tracking_where_told(specification, plants)
     stated = specification
     if plants:
         # What the user has to change, not what a search has found.

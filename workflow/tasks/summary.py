@@ -72,6 +72,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
                 "blocking": [] if design.synthesis is None else codec.plain(design.synthesis.blocking),
                 "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
                 "gave_way": codec.plain(gave_way(config.specification, design.specification)),
+                "tracking_from_rad_s": (design.specification or config.specification).tracking_from_rad_s,
                 "controller_dt_s": None if design.controller is None else design.controller.dt_s,
             },
             "engineers_numbers": None if numbers is None else numbers.to_dict(),
