@@ -170,7 +170,7 @@ def stage_of(found, records=(), step=0.02):
         records=SimpleNamespace(fitted=lambda channel: records, timing=timing),
     )
     config = config.model_copy(update={"specification": asked, "closed_loop": loop})
-    return SimpleNamespace(config=config, results=results, plant=None)
+    return SimpleNamespace(config=config, results=results, plants=(None,))
 
 
 def test_the_recorded_loop_stands_beside_the_new_one():

@@ -10,7 +10,6 @@ import pytest
 from scipy.signal import lfilter
 
 from control_design import certify
-from control_design.plants.plant_set import PlantChannel
 from ident import IdentOptions, Record, identify
 from plant import linear_arm, paper_link, parse_effect, simulate
 from tests.workflow.command import FAST_ARM
@@ -306,8 +305,9 @@ def test_a_configuration_resamples_and_unwraps(tmp_path):
 
 def test_a_plant_is_kept_under_all_that_it_was_made_of():
     """Two configurations that call the same channel differently get plants of their own names."""
-    plant = PlantChannel(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01))
-    channel = SimpleNamespace(in_plant=lambda: plant)
+    system = control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01)
+    part = SimpleNamespace(about="", nominal=SimpleNamespace(to_control=lambda: system), posterior=None)
+    channel = SimpleNamespace(members=(part,), level=0.95)
     channel.at_rate = lambda dt_s: channel
     result = UncertaintyResult((channel,))
 
