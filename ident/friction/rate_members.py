@@ -13,6 +13,7 @@ holds it that is |eta| of its centre wide.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import ndtri_exp
@@ -86,8 +87,8 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     -------
     tuple of RateMember
         The one that holds the mean response first, else the nearest, the others by their rate. Empty where
-        ellipses to first order do not hold zero, of an arm that does not integrate or is unstable, and where
-        parts of a rate do not keep zero outside.
+        ellipses to first order do not hold zero, of an arm that does not integrate or is unstable, where the
+        data deny every damping, and where parts of a rate do not keep zero outside.
 
     Notes
     -----
@@ -120,45 +121,54 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     # Force over speed, without the delay of the input and of the hold.
     delay_s = (response.input_delay_samples + 0.5) * response.dt_s
     force = np.exp(-1j * omega * delay_s) / (1j * omega * gain)
-    force = force * np.sign(force[first_known].imag)
+    force = force * np.copysign(1.0, force[first_known].imag)
 
     # A unit normal whose growth takes force away, and its values that leave a damping.
-    turn = np.sign(force[0].real)
+    turn = np.copysign(1.0, force[0].real)
     direction = turn * at_rest / deviation
     x = turn * x
     by_normal = (x * force).real
     counts = low & (size >= min(_AS_MUCH, size[0])) & (by_normal > 0)
     undamped = float(np.min(force.real[counts] / by_normal[counts]))
-    least, most = _positive_interval(undamped)
-
-    # As few parts as keep zero outside.
-    for n_members in range(1, _MOST_MEMBERS + 1):
-        edges = np.geomspace(least, most, n_members + 1)
-        middles = (edges[1:] + edges[:-1]) / 2
-        between = 1 - np.outer(x, undamped - middles)
-        half = np.outer(x, np.diff(edges) / 2) / between
-        if np.max(np.abs(half[low])) <= _WIDEST:
-            break
-    else:
+    # A damping that the data deny is not taken for granted.
+    if undamped < -chi2_radius(LEVEL):
+        return ()
+    edges = _edges(undamped, x[low])
+    if edges.size == 0:
         return ()
 
     others = change - np.outer(x, direction)
-    members = list[RateMember]()
     corners = [_corner(omega, force * (1 - x * (undamped - edge))) for edge in edges]
-    for k in range(n_members):
-        wanted = _covering(omega, x, undamped - middles[k], half[:, k], others, low)
+    corners_between = [None, *corners[1:-1], None]
+    members = list[RateMember]()
+    for k, (slowest, fastest) in enumerate(pairwise(edges.tolist())):
+        normal = undamped - (slowest + fastest) / 2
+        between = 1 - x * normal
+        half = x * (fastest - slowest) / 2 / between
+        wanted = _covering(omega, x, normal, half, others, low)
         weight = 1 / np.linalg.norm(wanted, axis=1)
-        rate = _corner(omega, force * between[:, k])
-        members.append(
-            RateMember(
-                on_further_poles(response, poles, omega, wanted, weight),
-                _with_rate(poles, rate, response.dt_s),
-                corners[k] if k else None,
-                corners[k + 1] if k + 1 < n_members else None,
-            )
-        )
-    nearest = int(np.argmin(np.abs(np.log(np.maximum(undamped, least) / np.sqrt(edges[1:] * edges[:-1])))))
+        bent = on_further_poles(response, poles, omega, wanted, weight)
+        own_poles = _with_rate(poles, _corner(omega, force * between), response.dt_s)
+        members.append(RateMember(bent, own_poles, corners_between[k], corners_between[k + 1]))
+
+    # The mean response has the damping `undamped`, in deviations.
+    nearest = int(np.count_nonzero(edges[1:-1] < undamped))
     return (members.pop(nearest), *members)
+
+
+def _edges(undamped: float, x: ComplexArray) -> RealArray:
+    """Ends (M + 1,) of the parts of an interval, as dampings in deviations above none; (0,) for too many.
+
+    undamped: the mean; x (F,): relative change of the force by one deviation, where a change is one of force.
+    """
+    for n_members in range(1, _MOST_MEMBERS + 1):
+        edges = np.geomspace(*_positive_interval(undamped), n_members + 1)
+        middles = (edges[1:] + edges[:-1]) / 2
+        between = 1 - np.outer(x, undamped - middles)
+        half = np.outer(x, np.diff(edges) / 2) / between
+        if np.max(np.abs(half)) <= _WIDEST:
+            return edges
+    return np.zeros(0)
 
 
 def below_modes(omega: RealArray, change: ComplexArray, poles: Poles, dt_s: float) -> BoolArray:

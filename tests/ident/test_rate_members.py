@@ -108,6 +108,10 @@ def test_an_arm_on_a_spring_has_no_parts() -> None:
     assert rate_members(replace(straight, integrators=0), poles, LONGEST_S) == ()
 
 
+def test_a_damping_that_the_data_deny_is_not_taken_for_granted() -> None:
+    assert parts_of(-3.0, 1.0) == ()
+
+
 def test_parts_meet_where_they_say() -> None:
     """Each begins at the rate where the one before ends, and the first holds the mean rate."""
     members = parts_of(0.5, 5.0)
