@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.closed_loop_machines.judge import worst_of
 from ident.friction import RateMember
 from tests.workflow import report_examples as example
 from workflow.config.design_file import DesignFile
@@ -79,6 +80,23 @@ def test_numbers_for_programs_tell_the_parts(run: RunDirectory) -> None:
     (other,) = uncertainty_numbers(RunResults(run).uncertainty.channels[0])["others"]
     assert other["about"] == "slow rate above 0.3 rad/s"
     assert set(other) == {"about", "bands"}
+
+
+def test_a_machine_is_held_to_the_least_of_what_its_parts_state() -> None:
+    one = {"modulus": 0.6, "gain_up": 3.0, "gain_down": 0.1, "phase_rad": 0.9, "delay_s": 0.02}
+    other = {
+        "modulus": 0.5,
+        "gain_up": {"$float": "inf"},
+        "gain_down": 0.2,
+        "phase_rad": 1.0,
+        "delay_s": 0.01,
+    }
+    verdicts = [
+        {"worst_margins": margins, "bandwidth_rad_s": bandwidth}
+        for margins, bandwidth in ((one, 20.0), (other, 30.0))
+    ]
+    least = {"modulus": 0.5, "gain_up": 3.0, "gain_down": 0.2, "phase_rad": 0.9, "delay_s": 0.01}
+    assert worst_of(verdicts) == {"worst_margins": least, "bandwidth_rad_s": 20.0}
 
 
 @pytest.mark.slow
