@@ -101,6 +101,7 @@ class FindingKind(Enum):
     INDEPENDENCE = auto()
     NOT_WHITE = auto()
     UNTRIED_FRICTION = auto()
+    REMOTE_FRICTION = auto()
     NOMINAL_OUTSIDE = auto()
     NOT_INDEPENDENT = auto()
     CHI_SQUARE = auto()

@@ -8,6 +8,12 @@ from ident.friction.fit import fit_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 from ident.friction.rate_members import RateMember
+from ident.friction.remote import (
+    RemoteFriction,
+    remote_friction,
+    with_remote_friction,
+    without_remote_friction,
+)
 
 __all__ = [
     "BehindFriction",
@@ -15,6 +21,7 @@ __all__ = [
     "FrictionFit",
     "FrictionLaw",
     "RateMember",
+    "RemoteFriction",
     "at_amplitude",
     "equivalent_friction",
     "fit_friction",
@@ -22,6 +29,9 @@ __all__ = [
     "other_output_without_friction",
     "recorded_in_loop",
     "refuse_unseen_shaft",
+    "remote_friction",
     "with_commands_in_time",
+    "with_remote_friction",
     "without_friction",
+    "without_remote_friction",
 ]

@@ -50,8 +50,8 @@ _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 class Found:
     """What the template of the configuration shows, of a command. scale, units: as stated, and the sign that
     is turned; before: the draft that the logs were identified by, where `draft` is what followed; refused:
-    why no friction is identified although it may be there; typed: keys of the specification that the user
-    stated."""
+    why no friction is identified at the sensor although it may be there; remote: friction is identified at a
+    shaft that the sensor does not see; typed: keys of the specification that the user stated."""
 
     command: str
     logs: tuple[Path, ...]
@@ -64,6 +64,7 @@ class Found:
     doubts: tuple[Finding, ...]
     before: Draft | None = None
     refused: str = ""
+    remote: bool = False
     typed: frozenset[str] = frozenset()
 
 
@@ -159,16 +160,20 @@ def decided(
         except InputError as refused:
             if not config.control_channel.uncertainty.friction_identified:
                 raise
-            # Logs that no model with friction explains still tell the machine as it was recorded.
-            found = replace(found, refused=str(refused).partition(": ")[2].partition(". ")[0])
-            config, text = written(found, file)
-            with suppress(InputError):
-                identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
+            # The friction may be at a shaft that the sensor does not see; and logs that no model with
+            # friction explains still tell the machine as it was recorded.
+            why = str(refused).partition(": ")[2].partition(". ")[0]
+            for remote in (True, False):
+                found = replace(found, refused=why, remote=remote)
+                config, text = written(found, file)
+                with suppress(InputError):
+                    identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
+                    break
             spread = run.stage_file("uncertainty") and RunResults(run).uncertainty.channels
             if not spread or min(band.median_radius_percent for band in spread[0].bands) > 100 * TOLD:
                 raise
         results, at = RunResults(run), config.control_index
-        if found.refused:
+        if found.refused and not found.remote:
             found = replace(found, refused=found.refused + _best_linear(results.identify.channels[at]))
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
     if typed:

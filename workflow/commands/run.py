@@ -94,7 +94,7 @@ def run_from_files(
                 "run", logs, place / "config.toml", stated, progress, begun, earlier=earlier, typed=typed
             )
             note = ""
-            if found.refused:
+            if found.refused and not found.remote:
                 note = f"described as recorded, its friction not identified: {found.refused}"
             from workflow.report.pages import page_of
             from workflow.tasks.pipeline import run_pipeline

@@ -31,19 +31,25 @@ class UncertaintyOptions(EmbeddingOptions):
         "from run to run or with amplitude (four records or more)",
     )
     level: float = Field(0.95, gt=0.5, lt=1, description="confidence of each ellipse taken alone")
-    response: Literal["as recorded", "without friction", "this amplitude"] = Field(
+    response: Literal["as recorded", "without friction", "without remote friction", "this amplitude"] = Field(
         "as recorded",
         description="which response the ellipses describe. as recorded: linear dynamics, everything else "
-        "counts as noise. The others identify dry friction as well: the output (of the control "
-        "channel) must be the shaft's position. without friction: linear dynamics "
-        "without friction; this amplitude: best linear approximation with friction, at "
-        "the rms of the recorded inputs",
+        "counts as noise. without remote friction: of logs of a loop whose sensor is at a load behind a "
+        "spring, the dry friction of the motor's shaft taken off by inverse dynamics. The others identify "
+        "dry friction as well: the output (of the control channel) must be the shaft's position. "
+        "without friction: linear dynamics without friction; this amplitude: best linear "
+        "approximation with friction, at the rms of the recorded inputs",
     )
 
     @property
     def friction_identified(self) -> bool:
         """The dry friction of the shaft is identified with the arm."""
-        return self.response != "as recorded"
+        return self.response in ("without friction", "this amplitude")
+
+    @property
+    def friction_remote(self) -> bool:
+        """The dry friction of a shaft behind a spring is taken off the command."""
+        return self.response == "without remote friction"
 
     @model_validator(mode="after")
     def _friction_by_tangent(self) -> Self:

@@ -21,10 +21,13 @@ from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments, settling_time_s
 from ident.friction import (
     FrictionFit,
+    RemoteFriction,
     fit_friction,
     identify_behind,
     recorded_in_loop,
     refuse_unseen_shaft,
+    remote_friction,
+    without_remote_friction,
 )
 from ident.one_input import identify
 from ident.recorded_law import RecordedLaw
@@ -116,13 +119,23 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             measured = records.fitted(channel)
             loop = config.closed_loop_data if in_loop else None
             units = scale.get(channel.input, 1.0) / scale.get(channel.output, 1.0)
+            seen = unseen
+            if channel.uncertainty.friction_remote:
+                remote = shaft_friction_of_load(channel, measured, loop, report)
+                measured = [without_remote_friction(record, remote) for record in measured]
+                seen = [
+                    (without_remote_friction(record.siso(channel.input, channel.output), remote), role)
+                    for record, role in unseen
+                ]
             # The law is that of the output that is fed back.
             timing = records.timing if k == config.control_index else None
+            if channel.uncertainty.friction_remote:
+                timing = None  # the law made the command, not what friction leaves of it
             channels.append(
                 identify_channel(
                     channel,
                     measured,
-                    unseen,
+                    seen,
                     loop,
                     report,
                     friction=known,
@@ -150,6 +163,20 @@ def shaft_friction(
     found = fit_friction(measured, channel.identification, free=free, progress=report)
     refuse_unseen_shaft(found, measured)
     return found
+
+
+def shaft_friction_of_load(
+    channel: Channel, measured: Sequence[Record], loop: ClosedLoopData | None, report: Progress
+) -> RemoteFriction:
+    """Friction of a shaft behind a spring from the position of a load.
+
+    channel, measured, loop: as of `identify_channel`. Raises ValueError, one line, where the logs were not
+    made in a loop or do not tell such a friction.
+    """
+    if loop is None:
+        raise ValueError("response = 'without remote friction' is for logs of a loop; none was seen in these")
+    as_recorded = identify_channel(channel, measured, [], loop, report, with_plot=False)
+    return remote_friction(measured, as_recorded.model)
 
 
 def identify_channel(

@@ -32,6 +32,8 @@ from ident.friction import (
     at_amplitude,
     equivalent_friction,
     other_output_without_friction,
+    remote_friction,
+    with_remote_friction,
     without_friction,
 )
 from ident.response_uncertainty import Tests, with_noise_model
@@ -150,6 +152,11 @@ def uncertainty_of(
         elif behind.members and (in_parts or len(behind.members) == 1):
             members = behind.members
             posterior, poles = members[0].response, members[0].poles
+    remote = None
+    if channel.uncertainty.friction_remote:
+        remote = remote_friction(measured, result.model)
+        longest_s = max(record.n_samples for record in measured) * result.model.dt_s
+        posterior, linear = with_remote_friction(posterior, remote, poles, longest_s)
     if timing is not None:
         posterior = with_unknown_timing(posterior, timing)
         members = tuple(
@@ -177,14 +184,27 @@ def uncertainty_of(
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
         refuse_unexplained(result, found.agreement, friction, position=position)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
-    rubs = friction is None and result.closed_loop is not None and not white
+    rubs = friction is None and remote is None and result.closed_loop is not None and not white
     advice = residual_advice(
         *tests,
         noise_order=found.noise_order,
         friction=friction is None and band is None and not result.increments and not rubs and position,
         observer=observer and at_shaft,
     )
-    if rubs:
+    if remote is not None:
+        # What an inexact direction leaves is not white; the ellipses are widened for it.
+        advice = [item for item in advice if item.kind is not FindingKind.NOT_WHITE]
+        advice.append(
+            finding(
+                FindingKind.REMOTE_FRICTION,
+                output=result.output,
+                unit="".join(measured[0].input_units),
+                level=remote.level,
+                level_std=remote.level_std,
+                ratio=remote.ratio,
+            )
+        )
+    elif rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output, speed=not position))
     return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
 
