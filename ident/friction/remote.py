@@ -36,7 +36,7 @@ from ident.friction.inverse_dynamics import direction_of, presliding_of, smoothe
 from ident.friction.posterior import of_force
 from ident.response_coefficients import coefficients_of
 
-# Ratios of load to motor inertia that are tried, beside none: from a load that hardly shows to a motor that
+# Ratios of load to motor inertia that are tried: from a load that hardly shows to a motor that
 # hardly does, 20 % apart.
 _RATIOS = np.geomspace(0.05, 10.0, 30)
 # Ratios that are tried within one step of the best of them: 3 % apart, which moves a level by less.
@@ -73,11 +73,16 @@ _MOST_STD = 0.5
 # What a shaft ahead of the sensor leaves of the command, over what one beside it leaves, at most. Chosen: of
 # machines with the friction at the sensor it was .98 and more, of others .3 and .5.
 _BETTER = 0.84
-# Coherence of the instrument with the command from which on a share counts.
+# Squared coherence of the instrument with what is left of the command from which on a share counts. Chosen:
+# of half of the power.
 _COHERENT = 0.5
-# Width over which spectra are smoothed, as a part of the frequency, and lines on either side at least.
+# Width over which spectra are smoothed, lines on either side as a part of their number. Chosen: a tenth of an
+# octave, as a mode is wide.
 _SMOOTHED = 0.06
+# Lines on either side at least: spectra of a window have three.
 _LINES = 2
+# Frequencies at which a share is told. Chosen: closer than it is smoothed.
+_N_SHARES = 200
 # Share of the largest gain below which a gain counts as zero: rounding of doubles (`command_timing`).
 _SMALLEST_GAIN = 1e-14
 # Points of the grid of frequencies on which the directions are fitted. Chosen: over five decades a hundred in
@@ -222,6 +227,7 @@ def without_remote_friction(record: Record, remote: RemoteFriction) -> Record:
     Returns
     -------
     Record
+        With a friction that is not delayed: half a sample of the input's hold is neglected.
     """
     motion = _Motion.of(record, 1, remote.first_Hz)
     return less_friction(record, remote.level * motion.direction(remote.ratio, remote.presliding), 0)
@@ -317,24 +323,22 @@ def _share(
         friction = level * motion.direction(ratio, presliding)
         net = motion.command - friction
         instrument = net if motion.reference is None else motion.reference
-        parts = [
+        h, v, z = (
             np.fft.rfft(window * (signal - signal.mean()), n_fft) for signal in (friction, net, instrument)
-        ]
-        h, v, z = parts
+        )
         cross += [h * z.conj(), v * z.conj(), np.abs(v) ** 2, np.abs(z) ** 2]
     omega = 2 * np.pi * np.fft.rfftfreq(n_fft, dt_s)
-    grid = np.geomspace(omega[_LINES + 1], 0.5 * omega[-1], 200)
-    lines = np.arange(omega.size)
+    grid = np.geomspace(omega[_LINES + 1], 0.5 * omega[-1], _N_SHARES)
     centre = np.searchsorted(omega, grid)
     half = np.maximum(_LINES, np.round(_SMOOTHED * centre)).astype(int)
     sums = np.hstack([np.zeros((4, 1)), np.cumsum(cross, axis=1)])
     low = np.maximum(centre - half, 1)
-    high = np.minimum(centre + half + 1, lines.size)
-    hz, uz, uu, zz = sums[:, high] - sums[:, low]
-    coherent = np.abs(uz) ** 2 > _COHERENT * np.abs(uu) * np.abs(zz)
+    high = np.minimum(centre + half + 1, omega.size)
+    hz, vz, vv, zz = sums[:, high] - sums[:, low]
+    coherent = np.abs(vz) ** 2 > _COHERENT * np.abs(vv) * np.abs(zz)
     if not coherent.any():
         return grid, np.zeros(grid.size, np.complex128)
-    return grid[coherent], (hz / uz)[coherent]
+    return grid[coherent], (hz / vz)[coherent]
 
 
 def with_remote_friction(
