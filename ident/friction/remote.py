@@ -41,6 +41,8 @@ from ident.response_coefficients import coefficients_of
 _RATIOS = np.geomspace(0.05, 10.0, 30)
 # Ratios that are tried within one step of the best of them: 3 % apart, which moves a level by less.
 _POINTS_NEAR = 15
+# Dead times of the command that are tried, samples. Chosen: a controller, a bus and a drive.
+_MOST_DELAY = 6
 # Rows in a period of the first mode that the inverse dynamics see. Chosen: a direction turns within one.
 _ROWS_IN_PERIOD = 24
 # Low-pass of the inverse dynamics, in frequencies of the first mode: the ratio is told by what the mode does
@@ -119,6 +121,11 @@ class RemoteFriction:
     like_linear : tuple of float
         Units of the input per unit of the position, of its first and of its second derivative: of a linear
         force whose rms is the friction's.
+    delay_samples : int
+        Dead time of the command, which does not delay the friction.
+    is_told : bool
+        The logs tell that the shaft is ahead of the sensor. Otherwise the level may be none, or twice as
+        much.
     """
 
     level: float
@@ -129,6 +136,8 @@ class RemoteFriction:
     omega_rad_s: RealArray
     share: ComplexArray
     like_linear: tuple[float, ...]
+    delay_samples: int = 0
+    is_told: bool = True
 
 
 def remote_friction(records: Sequence[Record], model: GobfModel) -> RemoteFriction:
@@ -148,21 +157,29 @@ def remote_friction(records: Sequence[Record], model: GobfModel) -> RemoteFricti
     Raises
     ------
     ValueError
-        One line: the model has no light mode, the friction is as well told of a shaft that moves with the
-        sensor, or none is found.
+        One line: the model has no light mode, or no friction is found.
     """
     name = records[0].output_names[0]
     first_Hz = _first_Hz(model)
     if first_Hz is None:
         raise ValueError(f"no light mode lies between a shaft with friction and '{name}'")
-    motions = _thinned(records, first_Hz)
     presliding = _COARSE * presliding_of(records)
+    motions = _thinned(records, first_Hz)
+    # The command acts later than it was logged: by half a sample of its hold, and by dead time.
+    best_left = np.inf
+    delay_samples = 0
+    for tried in range(_MOST_DELAY + 1):
+        delayed = [motion.later((tried + 0.5) * records[0].dt_s) for motion in motions]
+        left = _level(delayed, None, presliding, _BANDS[-1])[1]
+        if left < best_left:
+            best_left = left
+            delay_samples = tried
+    motions = [motion.later((delay_samples + 0.5) * records[0].dt_s) for motion in motions]
 
     # The ratio by the widest band, where the mode turns the direction.
     _, left_beside = _level(motions, None, presliding, _BANDS[-1])
     ratio, left = _least(motions, _RATIOS, presliding)
-    if not left < _BETTER * left_beside:
-        raise ValueError(f"the friction is told no better at a shaft behind a spring than at '{name}'")
+    is_told = left < _BETTER * left_beside
     step = np.log(_RATIOS[1] / _RATIOS[0])
     near = ratio * np.exp(np.linspace(-step, step, _POINTS_NEAR))
     ratio, _ = _least(motions, near, presliding)
@@ -172,10 +189,13 @@ def remote_friction(records: Sequence[Record], model: GobfModel) -> RemoteFricti
     level = levels[0]
     if not level > 0:
         raise ValueError(f"inverse dynamics find no friction at a shaft behind a spring from '{name}'")
-    spread = np.std(levels) / level
+    spread = float(np.std(levels)) / level
     along_direction = _ALONG * by_band[0][1] / level
-    std_share = float(np.linalg.norm([spread, along_direction, _LEAST_STD]))
-    return _of_level(motions, ratio, presliding, level, min(std_share, _MOST_STD))
+    std_share = min(float(np.hypot(np.hypot(spread, along_direction), _LEAST_STD)), _MOST_STD)
+    if not is_told:
+        # Little of the command, or a mode that hardly swings: the ellipses hold none and twice of it.
+        std_share = _MOST_STD
+    return _of_level(motions, ratio, presliding, level, std_share, delay_samples, is_told)
 
 
 def _first_Hz(model: GobfModel) -> float | None:
@@ -201,7 +221,13 @@ def _least(motions: Sequence[_Motion], ratios: RealArray, presliding: float) -> 
 
 
 def _of_level(
-    motions: Sequence[_Motion], ratio: float, presliding: float, level: float, std_share: float
+    motions: Sequence[_Motion],
+    ratio: float,
+    presliding: float,
+    level: float,
+    std_share: float,
+    delay_samples: int,
+    is_told: bool,
 ) -> RemoteFriction:
     """Friction of a level, known to a share of it, and what it is like."""
     omega, share = _share(motions, ratio, presliding, level)
@@ -211,7 +237,16 @@ def _of_level(
         like_linear.append(level / float(np.sqrt(mean_square)))
     first_Hz = motions[0].first_Hz
     return RemoteFriction(
-        level, std_share * level, ratio, first_Hz, presliding, omega, share, tuple(like_linear)
+        level,
+        std_share * level,
+        ratio,
+        first_Hz,
+        presliding,
+        omega,
+        share,
+        tuple(like_linear),
+        delay_samples,
+        is_told,
     )
 
 
@@ -227,10 +262,11 @@ def without_remote_friction(record: Record, remote: RemoteFriction) -> Record:
     Returns
     -------
     Record
-        With a friction that is not delayed: half a sample of the input's hold is neglected.
+        Half a sample of the input's hold is neglected.
     """
     motion = _Motion.of(record, 1, remote.first_Hz)
-    return less_friction(record, remote.level * motion.direction(remote.ratio, remote.presliding), 0)
+    friction = remote.level * motion.direction(remote.ratio, remote.presliding)
+    return less_friction(record, friction, remote.delay_samples)
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +311,14 @@ class _Motion:
             [position[::every], *(signal[::every] for signal in derivatives)],
             twist[::every],
         )
+
+    def later(self, delay_s: float) -> _Motion:
+        """The same with its command later by a time, s, which need not be whole rows."""
+        n = self.command.size
+        f_Hz = np.fft.rfftfreq(2 * n, self.dt_s)
+        mirrored = np.fft.rfft(np.concatenate([self.command, self.command[::-1]]))
+        shifted = np.fft.irfft(mirrored * np.exp(-2j * np.pi * f_Hz * delay_s), 2 * n)[:n]
+        return replace(self, command=np.asarray(shifted))
 
     def direction(self, ratio: float | None, presliding: float) -> RealArray:
         """Friction (T,) of unit level at a shaft ahead of the load; beside it where the ratio is None."""

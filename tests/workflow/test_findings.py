@@ -56,6 +56,7 @@ OTHERWISE = {
     "CONTROLLER_PERIOD": [{"reference": ""}, {"repeats": True}],
     "TWO_STAGE": [{"least_in_loop_percent": 84.2, "most_in_loop_percent": 90.1}],
     "UNTRIED_FRICTION": [{"speed": True}],
+    "REMOTE_FRICTION": [{"ratio": 0.0}],
     "OPPOSITE": [{"options": "--scale y=-1 --unit y=rad"}],
     "WRAPS": [{"name": "hub angle", "period": 2 * 3.141592653589793}],
     "NUISANCE": [{"needed": False}],

@@ -201,7 +201,7 @@ def uncertainty_of(
                 unit="".join(measured[0].input_units),
                 level=remote.level,
                 level_std=remote.level_std,
-                ratio=remote.ratio,
+                ratio=remote.ratio if remote.is_told else 0.0,
             )
         )
     elif rubs:
