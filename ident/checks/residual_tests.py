@@ -249,7 +249,12 @@ def conditions_of(advice: Iterable[Finding]) -> list[Finding]:
     Left out where an observer's prediction errors are not white: the ellipses were widened for it. Empty
     where none of the findings is one; unknown kinds are passed over.
     """
-    kinds = {FindingKind.NOT_WHITE, FindingKind.NOMINAL_OUTSIDE, FindingKind.UNTRIED_FRICTION}
+    kinds = {
+        FindingKind.NOT_WHITE,
+        FindingKind.NOMINAL_OUTSIDE,
+        FindingKind.UNTRIED_FRICTION,
+        FindingKind.REMOTE_FRICTION,
+    }
     conditions = []
     for item in advice:
         widened_for = item.values.get("observer")

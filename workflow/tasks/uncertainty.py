@@ -192,8 +192,9 @@ def uncertainty_of(
         observer=observer and at_shaft,
     )
     if remote is not None:
-        # What an inexact direction leaves is not white; the ellipses are widened for it.
-        advice = [item for item in advice if item.kind is not FindingKind.NOT_WHITE]
+        # What an inexact direction leaves is not white; the ellipses are widened for it where it is told.
+        if remote.is_told:
+            advice = [item for item in advice if item.kind is not FindingKind.NOT_WHITE]
         advice.append(
             finding(
                 FindingKind.REMOTE_FRICTION,
