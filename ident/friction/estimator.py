@@ -74,9 +74,9 @@ def fit_friction_in_loop(
     # Each structure of the arm with the fewest poles, on logs thinned for the highest mode of them all.
     report(0.0, "friction: level and a simple arm")
     starts = list[tuple[IdentOptions, FrictionFit]]()
-    for structure_options in possible_structures(options):
+    for possible in possible_structures(options):
         with suppress(LostError):
-            simple_start = simplest(whole, structure_options)
+            simple_start = simplest(whole, possible)
             if simple_start is not None:
                 starts.append(simple_start)
     steps = min((steps_for(fit, stated, whole.dt_s) for stated, fit in starts), default=1)
