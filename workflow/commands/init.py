@@ -41,7 +41,7 @@ from workflow.text.templates import RunSummary, environment, rows_of
 if TYPE_CHECKING:
     from workflow.config.run_config import RunConfig
     from workflow.tasks.draft import Draft
-    from workflow.tasks.results import IdentifiedChannel
+    from workflow.tasks.results import IdentifiedChannel, RunResults
 
 _NEARLY_ALL = 0.99  # rows of a held log: one may be missing
 
@@ -150,7 +150,6 @@ def decided(
     """
     config, text, found = drafted(command, logs, file, stated, progress)
     from workflow.tasks.draft import informed
-    from workflow.tasks.first_look import TOLD
     from workflow.tasks.pipeline import identify_only
     from workflow.tasks.results import RunResults
 
@@ -168,9 +167,9 @@ def decided(
                 config, text = written(found, file)
                 with suppress(InputError):
                     identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
-                    break
-            spread = run.stage_file("uncertainty") and RunResults(run).uncertainty.channels
-            if not spread or min(band.median_radius_percent for band in spread[0].bands) > 100 * TOLD:
+                    if _is_described(RunResults(run)):
+                        break
+            else:
                 raise
         results, at = RunResults(run), config.control_index
         if found.refused and not found.remote:
@@ -180,6 +179,17 @@ def decided(
         draft = replace(draft, specification=with_typed(draft.specification, typed))
     found = replace(found, draft=draft, before=found.draft, typed=frozenset(typed or ()))
     return (*written(found, file), found)
+
+
+def _is_described(results: RunResults) -> bool:
+    """Whether a model explains a log, and its ellipses are narrow somewhere: what is fallen back on when no
+    model with friction explains the logs must explain more than that did."""
+    from workflow.tasks.first_look import TOLD
+    from workflow.tasks.uncertainty import EXPLAINED_PERCENT
+
+    bands = results.uncertainty.channels[0].bands
+    is_narrow = min(band.median_radius_percent for band in bands) <= 100 * TOLD
+    return is_narrow and results.identify.channels[0].best_fit_percent >= EXPLAINED_PERCENT
 
 
 def _best_linear(channel: IdentifiedChannel) -> str:

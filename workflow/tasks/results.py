@@ -144,6 +144,16 @@ class IdentifiedChannel:
         return self.model.output_name
 
     @property
+    def best_fit_percent(self) -> float:
+        """Best fit of a free run of the model to a log, or to one in its loop where such runs were made; not
+        below zero."""
+        in_loop = (
+            0.0 if self.closed_loop is None else self.closed_loop.values.get("most_in_loop_percent", 0.0)
+        )
+        fresh = (fit.fit_percent for fit in self.fresh)
+        return float(max(*self.identification.fit_percent.tolist(), *fresh, in_loop, 0.0))
+
+    @property
     def data_band_rad_s(self) -> Interval | None:
         """Band of the data behind the ellipses; None where they were not confined to one."""
         return self.bounds_band_rad_s or self.band_rad_s

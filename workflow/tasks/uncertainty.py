@@ -61,9 +61,12 @@ from workflow.text.templates import said, words
 
 _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal model has a tenth as many numbers
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
-# A model explains nothing whose best fit to a log is below this, where the sensor's noise leaves a third of
-# the rest at most (right ones had 90 % and more, wrong ones 75 % and less).
-_EXPLAINED, _BEYOND_NOISE = 80.0, 3.0
+# A model explains nothing whose best fit to a log is below this, in percent: right ones had 90 and more,
+# wrong ones 75 and less.
+EXPLAINED_PERCENT = 80.0
+# With friction, the arm's free run is only doubted where it leaves more than so many times the sensor's
+# noise.
+_BEYOND_NOISE = 3.0
 
 N_BANDS = 6
 """Bands of equal width on the log axis in which radii and scatter are summarised."""
@@ -288,14 +291,15 @@ def refuse_unexplained(
     """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
     of it means anything. friction: of the fit, None where none was identified; position: of the output."""
     found = result.identification
-    best = max(*found.fit_percent.tolist(), *(fit.fit_percent for fit in result.fresh), 0.0)
+    best = result.best_fit_percent
     why = ""
     if agreement.share_inside_percent < MOST_INSIDE_PERCENT:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
-    elif friction is not None and best < _EXPLAINED and found.noise_std > _BEYOND_NOISE * friction.noise_std:
+    elif friction is not None and best < EXPLAINED_PERCENT:
         times = found.noise_std / friction.noise_std
-        why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
+        if times > _BEYOND_NOISE:
+            why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     if why:
         raise ValueError(said("unexplained_logs", result.output, why, friction is not None or not position))
 
