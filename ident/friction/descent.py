@@ -24,7 +24,12 @@ from ident.friction.arm import SteppedArm
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, LostError
 from ident.friction.logs import LoopLogs
 from ident.friction.observer import observed
-from ident.friction.parameters import LEAST_LAG_SAMPLES, NOT_NEGATIVE, FrictionParameters
+from ident.friction.parameters import (
+    LEAST_LAG_SAMPLES,
+    NOT_NEGATIVE,
+    FrictionParameters,
+    has_least_damping,
+)
 from ident.uncertainty.embedding_algebra import triangle_of
 
 # Times that derivatives are taken, at most. Chosen: from inverse dynamics five are usual, from a fit nearby
@@ -67,6 +72,9 @@ _CHANGE_OF_LEVEL = 2e-3
 _CHANGE_OF_RESPONSE = 1e-3
 # Factor by which a change grows or shrinks at most from one set of derivatives to the next. Chosen.
 _CHANGE_GROWS = 10.0
+# Error of the mean friction over all logs by the measured direction of the motion, one standard deviation as
+# a share of its level. Chosen: while a shaft sticks its friction is not known.
+_MEAN_FRICTION = 0.1
 # Parts that are levels of a force.
 _LEVELS = ("coulomb_level", "level_at_load", "stribeck_excess", "bias")
 # Part in which the prediction errors are rough: a shaft sticks and slips at other times. A wrong step of it
@@ -92,8 +100,9 @@ class ConvergedFit:
     level_std : float
         Standard deviation of the friction's level on both sides of a spring, units of the input.
     has_empty_part : bool
-        A Stribeck excess, a lag or a friction at the load has come out as nothing: without it the same errors
-        cost a parameter less.
+        A Stribeck excess, a lag or a friction at the load has come out as nothing, or a Stribeck speed or a
+        pair's damping as the limit at which it is none: without it about the same errors cost a parameter
+        less.
     is_converged : bool
         The way that is left is small; otherwise the steps were given up, or were too few.
     """
@@ -213,6 +222,10 @@ def converged(
     is_level = np.isin(problem.names, ("coulomb_level", "level_at_load"))
     nothing = np.where(problem.names == "drive_lag_samples", LEAST_LAG_SAMPLES, 0.0)
     is_empty = np.isin(problem.names, NOT_NEGATIVE) & (point.vector <= nothing)
+    # Friction that falls over all speeds of the logs is less viscous friction.
+    is_empty |= (problem.names == "log_stribeck_speed") & (point.vector >= problem.highest)
+    is_damping = problem.names == "log_dampings"
+    is_empty[is_damping] = has_least_damping(np.exp(point.vector[is_damping]), options)
     return ConvergedFit(
         fit=point.fit,
         errors=float(point.errors @ point.errors),
@@ -273,13 +286,18 @@ class _Problem:
             largest_fall=logs.rms_speed,
             dt_s=logs.dt_s,
         )
-        # Known beforehand: logarithms of the law to their deviation, a bias within the command's rms.
+        # Known beforehand: logarithms of the law to their deviation, a bias within the command's rms. An
+        # observer corrects what a wrong bias does, so that its errors hardly tell it; of an integrating arm
+        # the balance of forces over whole records does.
         expected = parameters.pack()
         expected[names == "log_presliding"] = np.log(logs.presliding)
         expected[names == "bias"] = 0.0
         known_std = np.full(names.size, np.inf)
         known_std[np.isin(names, ("log_presliding", "log_stribeck_speed"))] = STD_LOG
         known_std[names == "bias"] = logs.input_rms
+        if fit.arm.structure.integrators:
+            expected[names == "bias"] = logs.mean_input - fit.level * logs.mean_direction
+            known_std[names == "bias"] = np.hypot(logs.unbalanced, _MEAN_FRICTION * fit.level)
         return cls(logs, parameters, names, lowest, highest, expected, known_std)
 
     def first_changes(self, fit: FrictionFit) -> RealArray:

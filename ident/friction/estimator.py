@@ -114,7 +114,7 @@ def fit_friction_in_loop(
 
     # The last descent sees the whole logs.
     report(0.9, "friction: all samples")
-    fit = at_step(without_empty_parts(best.fit), whole.dt_s)
+    fit = at_step(without_empty_parts(best.fit, whole.rms_speed), whole.dt_s)
     fit = converged(fit, whole.thinned(1, best.delay_samples), options).fit
     return with_widths(_complete(fit, best.delay_samples), whole)
 

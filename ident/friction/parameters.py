@@ -13,10 +13,12 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from scipy.linalg import qr
 
+from ident.basis.coordinates import ZETA_LEAST
 from ident.basis.functions import basis_response
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
+from ident.checks.plausible_modes import AT_BOUND
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, real_rows
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.gauss_newton import FrictionFit
@@ -34,9 +36,6 @@ _N_ANCHOR_ANGLES = 100
 NOT_NEGATIVE = ("stribeck_excess", "drive_lag_samples", "level_at_load")
 # Damping ratio at most, whatever the options say: at 1 a pair is two real poles.
 _LARGEST_ZETA = 0.99
-# Damping ratio at least, where the options say nothing: half of what a steel link without joints has. A pair
-# that noise makes would go to zero.
-_SMALLEST_ZETA = 1e-3
 # Frequency of a pair at most, as a share of the Nyquist frequency, whatever the options say: beyond it a pair
 # would be named by its image.
 _HIGHEST_SHARE = 0.95
@@ -310,8 +309,16 @@ class FrictionParameters:
         )
         nyquist = np.pi / dt_s
         bounded("log_frequencies", options.omega_min_rad_s, options.omega_max_rad_s, _HIGHEST_SHARE * nyquist)
-        bounded("log_dampings", options.zeta_min or _SMALLEST_ZETA, options.zeta_max, _LARGEST_ZETA)
+        bounded("log_dampings", options.zeta_min or ZETA_LEAST, options.zeta_max, _LARGEST_ZETA)
         return np.minimum(lowest, vector), np.maximum(highest, vector)
+
+
+def has_least_damping(zeta: RealArray, options: IdentOptions) -> BoolArray:
+    """Which damping ratios (P,) are the least that a pair may have, where neither it nor the number of pairs
+    was stated: such a pair follows a line in a disturbance, such as a drive's cogging, and is no mode."""
+    if options.zeta_min is not None or options.n_pairs is not None:
+        return np.zeros(zeta.shape, np.bool_)
+    return np.asarray(zeta <= ZETA_LEAST * AT_BOUND)
 
 
 def _moving(fit: FrictionFit) -> tuple[BoolArray, BoolArray]:

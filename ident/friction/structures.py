@@ -17,7 +17,7 @@ import numpy as np
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.plausible_modes import LARGEST_DAMPING
+from ident.checks.plausible_modes import AT_BOUND, LARGEST_DAMPING
 from ident.data.record import Record
 from ident.fit.least_squares import fit as linear_fit
 from ident.fit.regression import prepare
@@ -27,7 +27,7 @@ from ident.friction.gauss_newton import FrictionFit
 from ident.friction.inverse_dynamics import highest_Hz
 from ident.friction.logs import LoopLogs
 from ident.friction.observer import ObserverFilter
-from ident.friction.parameters import LEAST_LAG_SAMPLES
+from ident.friction.parameters import LEAST_LAG_SAMPLES, has_least_damping
 from ident.friction.spring import Spring
 
 # Lowest further pair, as a share of the first mode: friction that is left over looks like slow poles. Chosen.
@@ -113,7 +113,8 @@ class Search:
                 optimum = converged(start, logs, self.options, to_beat=best.criterion)
                 if optimum.has_empty_part:
                     # Without its empty parts it is another structure, perhaps one that was not tried.
-                    start = without_empty_parts(optimum.fit)
+                    start = without_empty_parts(optimum.fit, logs.rms_speed)
+                    start = _without_undamped(logs, start, self.options)
                     structure = _structure_of(start, delay_samples)
                     if structure in self.tried:
                         continue
@@ -143,15 +144,31 @@ def _structure_of(fit: FrictionFit, delay_samples: int) -> tuple[object, ...]:
     return (delay_samples, fit.model.poles.counts, fit.lag > 0, fit.spring is not None, has_stribeck)
 
 
-def without_empty_parts(fit: FrictionFit) -> FrictionFit:
-    """A fit without a Stribeck excess, a lag or a friction at the load that has come out as nothing."""
+def without_empty_parts(fit: FrictionFit, largest_fall: float) -> FrictionFit:
+    """A fit without a Stribeck excess, a lag or a friction at the load that has come out as nothing, or a
+    Stribeck speed that has come out as the largest (`largest_fall`, output units per second)."""
     if fit.lag <= LEAST_LAG_SAMPLES:
         fit = replace(fit, lag=0.0)
-    if np.isfinite(fit.law.fall) and fit.law.excess <= 0:
+    if np.isfinite(fit.law.fall) and (fit.law.excess <= 0 or fit.law.fall >= largest_fall / AT_BOUND):
         fit = replace(fit, law=replace(fit.law, excess=0.0, fall=np.inf))
     if fit.spring is not None and fit.beyond <= 0:
         fit = replace(fit, spring=None, beyond=0.0)
     return fit
+
+
+def _without_undamped(logs: LoopLogs, fit: FrictionFit, options: IdentOptions) -> FrictionFit:
+    """A fit without the pairs whose damping has come out as the least of all; the fit itself where it has
+    none. ValueError where no pole is left."""
+    structure = fit.arm.structure
+    known = np.concatenate([options.fixed().pairs, structure.unstable.pairs])
+    poles = fit.model.poles
+    is_undamped = has_least_damping(poles.zeta(), options) & ~np.isin(poles.pairs, known)
+    if not np.any(is_undamped):
+        return fit
+    fewer = Poles(poles.real, poles.pairs[~is_undamped])
+    if not fewer.order:
+        raise ValueError("no pole of the arm is left")
+    return on_poles(logs, fit, fewer)
 
 
 def on_model(fit: FrictionFit, model: GobfModel) -> FrictionFit:
