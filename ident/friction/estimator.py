@@ -24,7 +24,7 @@ from ident.friction.descent import converged
 from ident.friction.gauss_newton import FrictionFit, LostError, started
 from ident.friction.logs import LoopLogs
 from ident.friction.loop_start import possible_structures, simplest
-from ident.friction.observer import correction_of
+from ident.friction.observer import correction_of, observed
 from ident.friction.structure_steps import STEPS
 from ident.friction.structures import Candidate, Search, above_noise, without_empty_parts
 from ident.friction.time_step import at_step, steps_for
@@ -73,16 +73,22 @@ def fit_friction_in_loop(
 
     # Each structure of the arm with the fewest poles, on logs thinned for the highest mode of them all.
     report(0.0, "friction: level and a simple arm")
+    # Rows in which the sensor reads the same tell nothing new, and what it rounds off there is no white
+    # noise.
+    least_steps = 1
+    if not options.fixed_poles and not options.unstable_poles:
+        least_steps = whole.rows_of_a_reading
+    coarse = whole.thinned(least_steps, 0)
     starts = list[tuple[IdentOptions, FrictionFit]]()
     for possible in possible_structures(options):
         with suppress(LostError):
-            simple_start = simplest(whole, possible)
+            simple_start = simplest(coarse, possible)
             if simple_start is not None:
                 starts.append(simple_start)
-    steps = min((steps_for(fit, stated, whole.dt_s) for stated, fit in starts), default=1)
+    steps = least_steps * min((steps_for(fit, stated, coarse.dt_s) for stated, fit in starts), default=1)
     begun = list[tuple[Search, Candidate]]()
     for structure_options, start_fit in starts:
-        delay_samples = structure_options.input_delay_samples
+        delay_samples = least_steps * structure_options.input_delay_samples
         searched = structure_options.model_copy(update={"input_delay_samples": 0})
         search = Search(whole, searched, steps, options.delay_left_to_data)
         with suppress(LostError):
@@ -114,9 +120,11 @@ def fit_friction_in_loop(
 
     # The last descent sees the whole logs.
     report(0.9, "friction: all samples")
-    fit = at_step(without_empty_parts(best.fit, whole.rms_speed), whole.dt_s)
-    fit = converged(fit, whole.thinned(1, best.delay_samples), options).fit
-    return with_widths(_complete(fit, best.delay_samples), whole)
+    fit = at_step(without_empty_parts(best.fit, whole.rms_speed), least_steps * whole.dt_s)
+    fit = converged(fit, whole.thinned(least_steps, best.delay_samples), options).fit
+    if least_steps > 1:
+        fit = observed(at_step(fit, whole.dt_s), whole.thinned(1, best.delay_samples).records)
+    return with_widths(_complete(fit, best.delay_samples), whole, every=least_steps)
 
 
 def _complete(fit: FrictionFit, delay_samples: int) -> FrictionFit:

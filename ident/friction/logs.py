@@ -70,6 +70,12 @@ class LoopLogs:
         return rms_speed(self.records)
 
     @cached_property
+    def rows_of_a_reading(self) -> int:
+        """Rows over which the sensor reads the same while the shaft moves: in the record where these are the
+        fewest, the median over its readings."""
+        return min(_rows_of_a_reading(record.output[:, 0]) for record in self.records)
+
+    @cached_property
     def mean_input(self) -> float:
         """Mean command over all records, units of the input."""
         return float(np.mean(np.concatenate([record.input[:, 0] for record in self.records])))
@@ -133,3 +139,11 @@ class LoopLogs:
                 residual = fit.residual(record)
                 parts.append(residual[residual.size // _START :])
         return np.concatenate(parts)
+
+
+def _rows_of_a_reading(position: RealArray) -> int:
+    """Median number of rows in which a position (T,) stays the same, at least 1. A shaft that sticks makes
+    few long ones."""
+    changes = np.flatnonzero(np.diff(position)) + 1
+    lengths = np.diff(np.concatenate([[0], changes, [position.size]]))
+    return int(np.median(lengths))

@@ -28,6 +28,9 @@ from ident.unstable import find_unstable
 
 # Longest dead time of a drive that is tried, in samples. Chosen.
 LONGEST_DELAY = 20
+# Dead times beyond the best one so far that are tried, samples: where poles took the place of a part of it,
+# the next ones are worse at first. Chosen.
+_DELAYS_BEYOND = 4
 
 
 class PossibleStructure(NamedTuple):
@@ -84,10 +87,9 @@ def simplest(logs: LoopLogs, possible: PossibleStructure) -> tuple[IdentOptions,
             data = prepare(whitened, moving(few).structure())
             poles = PoleSearch(data, moving(few)).descend(best.poles, "friction").poles
         linear = linear_fit(prepare(whitened, moving(few).structure()), poles)
-        if best is not None and not linear.rss < best.rss:
-            break
-        best = _Start(poles, np.ravel(linear.coefficients), delay_samples, linear.rss)
-        if not options.delay_left_to_data:
+        if best is None or linear.rss < best.rss:
+            best = _Start(poles, np.ravel(linear.coefficients), delay_samples, linear.rss)
+        if not options.delay_left_to_data or delay_samples - best.delay_samples >= _DELAYS_BEYOND:
             break
     assert best is not None
     dt_s = logs.dt_s

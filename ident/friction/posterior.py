@@ -29,6 +29,7 @@ from ident.friction.fit import moved_to
 from ident.friction.further_poles import frequencies_of, on_further_poles
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
 from ident.friction.inverse_dynamics import smoothed, speed_classes
+from ident.friction.logs import LoopLogs
 from ident.friction.rate_members import RateMember, rate_members
 from ident.friction.widths import heterogeneity
 from ident.response_uncertainty import NOISE_ORDERS
@@ -224,7 +225,8 @@ def _behind_observed(
 
     # Wider by what parts of the logs differ in, and by forces that no residual shows.
     noise = response.report.noise if response.report else WHITE_NOISE
-    wider = np.sqrt(heterogeneity(found, records, noise.without_start))
+    every = LoopLogs.of(records).rows_of_a_reading
+    wider = np.sqrt(heterogeneity(found, records, noise.without_start, every=every))
     by_force = _by_linear_force(found, records, frictionless, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in frictionless) * model.dt_s

@@ -29,7 +29,7 @@ from ident.friction.observer import ObserverFilter
 from ident.uncertainty.embedding_algebra import RANK, by_class, sandwiched
 
 
-def with_widths(fit: FrictionFit, logs: LoopLogs) -> FrictionFit:
+def with_widths(fit: FrictionFit, logs: LoopLogs, *, every: int = 1) -> FrictionFit:
     """A fit with its covariance: wider by what parts of the logs differ in, then by what speeds differ in.
 
     Parameters
@@ -38,6 +38,9 @@ def with_widths(fit: FrictionFit, logs: LoopLogs) -> FrictionFit:
         At its optimum, with an observer, its arm with each pole twice.
     logs : LoopLogs
         Whole.
+    every : int
+        One row in so many counts: what the fit leaves in those between is not independent of it
+        (`LoopLogs.rows_of_a_reading`).
 
     Returns
     -------
@@ -45,30 +48,36 @@ def with_widths(fit: FrictionFit, logs: LoopLogs) -> FrictionFit:
         Raises LostError where something is not finite.
     """
     whiten = ObserverFilter.of(fit)
-    blocks, targets = observed_equations(fit, logs.records, whiten)
+    blocks, targets = observed_equations(fit, logs.records, whiten, every=every)
     n_rows = sum(target.size for target in targets)
     noise = float(np.sqrt(sum(target @ target for target in targets) / n_rows))
     fit = with_covariance(fit, blocks, targets, noise)
-    wider_factor = np.sqrt(heterogeneity(fit, logs.records, whiten)) * fit.covariance_factor
+    wider_factor = np.sqrt(heterogeneity(fit, logs.records, whiten, every=every)) * fit.covariance_factor
 
     solution = least_squares(blocks, targets, np.zeros((0, blocks[0].shape[1] + 1)))
     record_scores = []
     for record, block, target in zip(logs.records, blocks, targets, strict=True):
         residual = target - block @ solution.change
-        record_scores.append(by_class(residual, speed_classes(record)).T @ block)
+        classes = speed_classes(record)[::-1][::every][::-1]
+        record_scores.append(by_class(residual, classes).T @ block)
     scores = sum(record_scores) @ fit.covariance_factor * n_rows / solution.residual_rss
     return replace(fit, covariance_factor=sandwiched(wider_factor, scores))
 
 
 def observed_equations(
-    fit: FrictionFit, records: Sequence[Record], whiten: Callable[[RealArray], RealArray]
+    fit: FrictionFit,
+    records: Sequence[Record],
+    whiten: Callable[[RealArray], RealArray],
+    *,
+    every: int = 1,
 ) -> tuple[list[RealArray], list[RealArray]]:
     """Whitened equations of a Gauss-Newton step behind an observer, record by record.
 
     Derivatives (M, P + Q') of y - G (u - f - bias) with respect to the coefficients of the doubled poles and
     to the columns of `driven_by_law`, and what the fit leaves (M,), output units behind the filter. What the
     start of the record may be (free responses, an offset) is taken off both. `whiten` filters rows (T, ...)
-    and drops those in which it settles. Raises LostError where something is not finite.
+    and drops those in which it settles; of the others one in `every` counts, the last one among them. Raises
+    LostError where something is not finite.
     """
     structure = fit.arm.structure
     delay = structure.input_delay_samples
@@ -96,13 +105,18 @@ def observed_equations(
         rows = rows - u @ (u.T @ rows)
         if not np.all(np.isfinite(rows)):
             raise LostError
+        rows = rows[::-1][::every][::-1]
         blocks.append(rows[:, :-1])
         targets.append(rows[:, -1])
     return blocks, targets
 
 
 def heterogeneity(
-    found: FrictionFit, records: Sequence[Record], whiten: Callable[[RealArray], RealArray]
+    found: FrictionFit,
+    records: Sequence[Record],
+    whiten: Callable[[RealArray], RealArray],
+    *,
+    every: int = 1,
 ) -> float:
     """How much more the parts of the records differ in arm and friction than their noise makes them.
 
@@ -114,6 +128,8 @@ def heterogeneity(
         Each is parted in two halves.
     whiten : callable
         Filter of rows (T, ...) that makes the residuals white.
+    every : int
+        One row in so many counts, as of `with_widths`.
 
     Returns
     -------
@@ -125,7 +141,7 @@ def heterogeneity(
         middle = record.n_samples // 2
         halves.append(record.slice(0, middle))
         halves.append(record.slice(middle, record.n_samples))
-    blocks, targets = observed_equations(found, halves, whiten)
+    blocks, targets = observed_equations(found, halves, whiten, every=every)
     nothing_known = np.zeros((0, blocks[0].shape[1] + 1))
     together = least_squares(blocks, targets, nothing_known)
     singles = []

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm, solve_discrete_are
 
+from benchmarks.closed_loop_machines.logs import machine as drafted
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
@@ -16,11 +17,13 @@ from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.behind import behind_drive
 from ident.friction.descent import converged, with_each_pole_once
+from ident.friction.estimator import fit_friction_in_loop
 from ident.friction.gauss_newton import FrictionFit, lag_filter, started
 from ident.friction.kernel import behind_motor
 from ident.friction.logs import LoopLogs
+from ident.friction.loop_start import PossibleStructure, possible_structures, simplest
 from ident.friction.observer import observed
-from ident.friction.parameters import FrictionParameters
+from ident.friction.parameters import FrictionParameters, has_least_damping
 from ident.friction.structure_steps import with_dead_time, with_poles, with_stribeck
 from ident.friction.structures import Candidate, Search
 from ident.friction.time_step import at_step
@@ -281,3 +284,58 @@ def test_an_arm_without_a_pole_is_refused():
     """A search behind the friction may find that nothing answers."""
     with pytest.raises(ValueError, match="at least one pole"):
         SteppedArm.of(Poles(), OPTIONS.structure(), DT_S, doubled=False)
+
+
+def test_rows_of_a_reading_are_those_of_a_moving_shaft() -> None:
+    """A sensor of one count a millisecond, read ten times as often; it stands still for a third of it."""
+    counts = np.concatenate([np.repeat(np.arange(200), 10), np.full(1000, 200)])
+    record = Record("log", counts[:, None] * 0.01, counts[:, None] * 0.1, 1e-4, ("u",), ("y",))
+    assert LoopLogs.of([record]).rows_of_a_reading == 10
+    assert logs().rows_of_a_reading == 1
+
+
+def test_friction_is_found_through_a_coarse_sensor() -> None:
+    """Of five rows four read as the one before: what is rounded off there is no white noise."""
+    (record,) = logs(noise=1e-9).records
+    step = 5 * float(np.median(np.abs(np.diff(record.output[:, 0]))))
+    coarse = replace(record, output=step * np.round(record.output / step))
+    assert LoopLogs.of([coarse]).rows_of_a_reading > 2
+    found = fit_friction_in_loop([coarse], OPTIONS)
+    assert found.level == pytest.approx(0.3, abs=3 * found.level_std)
+    assert found.level_std < 0.1
+
+
+def test_a_bias_of_an_integrating_arm_is_told_by_balance() -> None:
+    """The log begins in motion, and its observer is not asked how the forces add up."""
+    (record,) = logs().records
+    begins_in_motion = LoopLogs.of([record.slice(300, 2000)])
+    end = converged(replace(begun(), bias=2.0), begins_in_motion, OPTIONS)
+    assert abs(end.fit.bias) < 0.3 * end.fit.level
+    assert begins_in_motion.unbalanced < 0.1 * begins_in_motion.input_rms
+
+
+def test_an_arm_that_integrates_is_not_thrown_over() -> None:
+    stated = possible_structures(IdentOptions(integrators=0))
+    assert [possible.thrown_over for possible in stated] == [False]
+    integrating, thrown = possible_structures(IdentOptions())
+    assert (integrating.options.integrators, thrown.options.integrators) == (1, 0)
+    assert thrown.thrown_over
+    assert simplest(logs(), thrown) is None
+
+
+def test_a_dead_time_of_five_samples_is_found_from_none() -> None:
+    """Poles first take the place of a part of it, so that the next dead time explains less."""
+    one = drafted("late", 1, 21)
+    got, begin = one.record(0, one.rng(0))
+    signals = got["u"][begin:, None], got["y"][begin:, None]
+    record = Record("log", *signals, one.plant.dt_s, ("u",), ("y",))
+    started_with = simplest(LoopLogs.of([record]), PossibleStructure(IdentOptions(integrators=1), False))
+    assert started_with is not None
+    assert started_with[0].input_delay_samples == one.plant.delay == 5
+
+
+def test_a_pair_without_damping_is_a_line_unless_it_was_stated() -> None:
+    zeta = np.array([1e-3, 0.02])
+    assert has_least_damping(zeta, IdentOptions()).tolist() == [True, False]
+    assert not has_least_damping(zeta, IdentOptions(n_pairs=2)).any()
+    assert not has_least_damping(zeta, IdentOptions(zeta_min=1e-3)).any()
