@@ -219,19 +219,25 @@ class Cascade:
         another length of x.
         """
         h = self.dt_s * self.scale_rad_s / 2.0
-        a: Real = np.zeros((0, 0))
-        b: Real = np.zeros((0, 1))
-        c: Real = np.zeros((1, 0))
-        d: Real = np.ones((1, 1))
+        order = self.order
+        a = np.zeros((order, order))
+        b = np.zeros((order, 1))
+        c = np.zeros((1, order))
+        d = 1.0
+        before = 0
         for numerator, denominator in self.split(x):
             section_a, section_b, section_c, section_d = _tustin_section(numerator, denominator, h)
             # The output of the cascade so far drives the section.
-            no_coupling = np.zeros((a.shape[0], section_a.shape[0]))
-            a = np.block([[a, no_coupling], [section_b @ c, section_a]])
-            b = np.vstack([b, section_b @ d])
-            c = np.hstack([section_d @ c, section_c])
-            d = section_d @ d
-        return a, b, c, d
+            end = before + len(section_a)
+            a[before:end, before:end] = section_a
+            a[before:end, :before] = section_b * c[:, :before]
+            b[before:end] = section_b * d
+            direct = section_d[0, 0]
+            c[0, :before] *= direct
+            c[0, before:end] = section_c[0]
+            d *= direct
+            before = end
+        return a, b, c, np.array([[d]])
 
 
 def _parameters_of(section: Section) -> int:

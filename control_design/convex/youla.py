@@ -39,6 +39,20 @@ from control_design.specification.requirement import LoopFunction
 from ident.data.arrays import factor_matrices
 from ident.data.shown import Shown
 
+# Requirements that the bounds do not know: with other values of these they are the same.
+UNKNOWN_TO_BOUND = (
+    "controller_order",
+    "structure",
+    "fixed",
+    "notches",
+    "low_pass",
+    "controller_damping",
+    "delay_margin_s",
+    "mode_damping",
+    "input_limit",
+    "rate_limit",
+)
+
 # Turns of angles and Q at most; it ends earlier once a turn gains less than ten times the accuracy. A local
 # optimum that is not reached leaves a value that is a little too high, and still some controller's. Chosen.
 _ELLIPSE_ROUNDS = 20

@@ -26,10 +26,11 @@ from control_design.controllers.controller import Controller
 from control_design.plants.frequency_grid import lowest_rad_s
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import GIVES_WAY, Specification, SpecificationError
-from control_design.synthesis.order_search import Progress
+from control_design.synthesis.order_search import FINER, Progress
 from control_design.synthesis.synthesis import synthesise
 from control_design.synthesis.synthesis_options import SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
+from control_design.synthesis.youla_starts import free_controllers
 
 # Worst case of a quick design up to which a bandwidth counts as met; below 1, so that the whole design, which
 # has to stay below 1, is met there, too. Chosen.
@@ -97,7 +98,8 @@ def synthesise_giving_way(
 
     Notes
     -----
-    A wider bandwidth, and less effort, are taken to ask for more. Trials start from the controller of the
+    A wider bandwidth, and less effort, are taken to ask for more. What the Youla bound says no controller of
+    any order reaches is not tried. Trials start from the controller of the
     last trial that was met, then from the Youla bound, and from many starts only where these lead to nothing
     stable, until that has failed once; what many starts would meet beside them is not found. Once a design
     meets the specification no further starts are tried: a lower gamma would only be spare.
@@ -171,6 +173,8 @@ class _Designs:
         """
         self.tell(0.0, message)
         try:
+            if self.is_out_of_reach(trial):
+                return False
             # Where no fit of the Youla bound's controllers is stable, the trial may still be met: by the many
             # starts of a thorough search.
             for thorough in (False, True) if self.many_starts_may_help else (False,):
@@ -191,6 +195,15 @@ class _Designs:
             return False
         self.many_starts_may_help = False
         return False
+
+    def is_out_of_reach(self, trial: Specification) -> bool:
+        """Whether no controller of any order clearly meets a specification, as the Youla bound tells.
+
+        Its floor lies so far above what a trial is to reach that the small basis does not explain it. Raises
+        SpecificationError where plants and specification contradict each other.
+        """
+        trial.check_against(self.plants)
+        return free_controllers(self.plants, trial).floor > FINER * _CLEAR
 
     def whole(self, specification: Specification) -> SynthesisResult:
         """The best design for a specification; many starts only where the others do not meet it.

@@ -86,7 +86,7 @@ _FAIR = 1.05
 # How far the small problem's worst case lies above that of the default one, at most: 8 % were seen
 # (`youla_starts`). A design below both shows that the small problem has ended in a valley of its own, and
 # that its value is no bound.
-_FINER = 1.1
+FINER = 1.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,9 +253,9 @@ class OrderSearch:
         free = bound()
 
         def near_free(gamma: float) -> bool:
-            """Whether a worst case is within `_NEAR` of the bound, and not so far below it (`_FINER`) that
+            """Whether a worst case is within `_NEAR` of the bound, and not so far below it (`FINER`) that
             the bound cannot be one; False for an infinite bound."""
-            return free.gamma / _FINER <= gamma <= _NEAR * free.gamma < np.inf
+            return free.gamma / FINER <= gamma <= _NEAR * free.gamma < np.inf
 
         def agreed(gamma: float, fair: float = np.inf) -> bool:
             """Whether enough ends agree and gamma meets the specification, within fair times the bound (by

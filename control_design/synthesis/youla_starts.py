@@ -18,12 +18,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
 from control_design.controllers.biquads import Cascade, tustin_frequency
 from control_design.convex.convex_options import YoulaOptions
-from control_design.convex.youla import BracketProblem
+from control_design.convex.youla import UNKNOWN_TO_BOUND, BracketProblem
 from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
@@ -43,6 +44,9 @@ _SMALL = YoulaOptions(
 )
 # Relative accuracy of the small problems: a tenth of the 3 % that the search asks of them.
 _ACCURACY = 3e-3
+# Bounds that are remembered: a search for a bandwidth asks for those of each trial's bandwidth again, for the
+# whole design and for controllers of fewer states. Chosen; it costs memory alone.
+_REMEMBERED = 64
 # Relocations of the poles; the fifth already moves them by less than a per cent, the others are for slow
 # cases.
 _RELOCATIONS = 12
@@ -93,10 +97,14 @@ class FreeControllers:
         Up to three of each plant: for its ellipses, enclosing and inscribed discs, where the value is finite.
     gamma : float
         Largest of their worst cases over the ellipses, one for each plant; inf: some plant has none.
+    floor : float
+        Largest of their worst cases over the inscribed discs, below which no controller of any order goes,
+        but for the size of the basis; 0: some plant has none.
     """
 
     each: tuple[FreeController, ...]
     gamma: float
+    floor: float = 0.0
 
 
 def free_controllers(
@@ -116,11 +124,23 @@ def free_controllers(
     Returns
     -------
     FreeControllers
-        Where a plant has no such bound (its problem raises ValueError or ArithmeticError), gamma is inf, and
-        the plants that follow are left out.
+        Where a plant has no such bound (its problem raises ValueError or ArithmeticError), gamma is inf and
+        floor 0, and the plants that follow are left out. What was asked before is remembered: plants are
+        compared by identity, specifications by what the bound knows of them.
     """
+    anything = Specification()
+    unknown = {name: getattr(anything, name) for name in UNKNOWN_TO_BOUND}
+    return _free_controllers(tuple(plants), specification.model_copy(update=unknown), options)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _free_controllers(
+    plants: tuple[UncertainPlant, ...], specification: Specification, options: YoulaOptions
+) -> FreeControllers:
+    """As `free_controllers`, of arguments that can be compared."""
     controllers: list[FreeController] = []
     gamma = 0.0
+    floor = 0.0
     for plant in plants:
         try:
             problem = BracketProblem(plant, specification, options, accuracy=_ACCURACY)
@@ -131,10 +151,14 @@ def free_controllers(
         for value, x in answers:
             if np.isfinite(value):
                 controllers.append(FreeController(*problem.controller(x)))
-        # The first answer is that over the ellipses.
-        gamma_over_ellipses = answers[0][0]
-        gamma = max(gamma, gamma_over_ellipses)
-    return FreeControllers(tuple(controllers), gamma)
+        (over_ellipses, _), _, (over_inscribed, _) = answers
+        gamma = max(gamma, over_ellipses)
+        # What a controller reaches over the ellipses it reaches over discs within them. Where nothing stable
+        # was found nothing is known.
+        least = min(over_inscribed, over_ellipses)
+        if np.isfinite(least):
+            floor = max(floor, least)
+    return FreeControllers(tuple(controllers), gamma, floor)
 
 
 def fitted(

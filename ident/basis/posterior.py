@@ -74,9 +74,10 @@ class EmbeddingReport:
         return AutoregressiveNoise(np.array([1.0, *self.ar_coefficients]))
 
 
-# Pairs of a posterior and a frequency grid whose ellipses are remembered: checks at other levels, and stages
-# after one another, ask for the same ones again, a handful at a time. Chosen; it costs memory alone.
-_REMEMBERED = 16
+# Pairs of a posterior and a frequency grid whose ellipses are remembered: trials of other bandwidths, checks
+# at other levels, and stages after one another ask for the same ones again, a search for a bandwidth for some
+# ninety. Chosen; it costs memory alone, about 50 kB each.
+_REMEMBERED = 256
 # How far above pi / dt, as a share of it, a frequency may lie: the rounding of tables with ten digits.
 _NYQUIST_ROUNDING = 1e-9
 

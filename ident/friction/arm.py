@@ -249,7 +249,7 @@ class SteppedArm:
             stride=powers[-1, :-1, :-1].copy(),
             held=powers[-1, :-1, -1].copy(),
             pushes=pulses[::-1].copy(),
-            ahead=out @ powers[1:, :-1, :-1],
+            ahead=(out @ powers[1:, :-1, :-1]).T.copy(),
             pulse=pulses @ out,
             slope=out @ self._flow[:-1],
         )

@@ -112,21 +112,20 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
     fading = -1 / fall
     total = 0.0
     moment = 0.0
+    # What a unit of effort that is held adds to the position over a stride.
+    pulses = 0.0
+    for i in range(n_steps):
+        pulses += arm.pulse[i]
     for stride in range(STRIDES):
-        # Positions that the arm would have without friction, from the state on.
-        pulses = 0.0
-        for i in range(n_steps):
-            pulses += arm.pulse[i]
-            free[i] = pulses * drive
-            for j in range(n):
-                free[i] += arm.ahead[i, j] * state[j]
-
         # A shaft that slips on in one direction has constant friction: the stride is one matrix product. It
         # counts where position and speed at its end have gone on in that direction.
         constant = excess == 0 or abs(speed) > _EXCESS_GONE * fall
         if constant and abs(deflection) >= max(level, _TINY) / stiffness:
             force = level if deflection > 0 else -level
-            end = free[n_steps - 1] - pulses * force
+            end = pulses * drive
+            for j in range(n):
+                end += arm.ahead[j, n_steps - 1] * state[j]
+            end -= pulses * force
             speed = arm.slope[n] * (drive - force)
             start_speed = speed
             for i in range(n):
@@ -144,6 +143,15 @@ def advance(drive: float, state: Any, shaft: Any, free: Any, arm: ArmSteps, dt_s
                 moment += n_steps * force * (n_steps * (stride + 0.5) - 0.5 * n_in_sample)
                 continue
             speed = start_speed
+
+        # Positions that the arm would have without friction, from the state on.
+        adds = 0.0
+        for i in range(n_steps):
+            adds += arm.pulse[i]
+            free[i] = adds * drive
+        for j in range(n):
+            for i in range(n_steps):
+                free[i] += arm.ahead[j, i] * state[j]
 
         # Otherwise step by step: each force moves the positions and the final state that follow it.
         for i in range(n):

@@ -38,20 +38,6 @@ from workflow.tasks.results import (
 )
 from workflow.text.templates import said
 
-# Requirements that the bracket does not know: a bracket of other values of these is the same.
-UNKNOWN_TO_BRACKET = (
-    "controller_order",
-    "structure",
-    "fixed",
-    "notches",
-    "low_pass",
-    "controller_damping",
-    "delay_margin_s",
-    "mode_damping",
-    "input_limit",
-    "rate_limit",
-)
-
 # Worst case of a quick design that the whole design then meets, too, as a rule.
 _CLEARLY = 0.97
 # Whole designs at most that verify a hint: each takes as long as the one that missed.

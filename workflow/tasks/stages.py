@@ -9,11 +9,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+from control_design.convex.youla import UNKNOWN_TO_BOUND
 from control_design.specification import Specification
 from ident.resampling import resampled_friction
 from workflow.engine.errors import naming
 from workflow.tasks.closed_loop import run_closed_loop
-from workflow.tasks.design import UNKNOWN_TO_BRACKET, certify_asked, find_bracket, find_design, find_filter
+from workflow.tasks.design import certify_asked, find_bracket, find_design, find_filter
 from workflow.tasks.friction_loop import friction_feedforward, soonest
 from workflow.tasks.identification import identify_channels
 from workflow.tasks.joints import certify_joints, design_joints, identify_points, run_loops
@@ -134,7 +135,7 @@ STAGES: tuple[Stage, ...] = (
         2.5,
         uses={"specification": True, "achievable_performance": True, **_PURPOSES},
         # Another order leaves the bracket as it is.
-        except_for={"specification": set(UNKNOWN_TO_BRACKET)},
+        except_for={"specification": set(UNKNOWN_TO_BOUND)},
     ),
     Stage(
         "certify",
