@@ -20,6 +20,7 @@ from scipy.linalg import toeplitz
 from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
 from ident.basis.noise_model import NoiseModel, reflected_inside
 from ident.data.arrays import RealArray
+from ident.uncertainty.embedding_algebra import triangle_of
 
 # Largest relative change of A(q) on the unit circle by a correction: |1 + x|^2 >= 1/2, so that the spectrum
 # is nowhere more than doubled. A correction that is larger is no small one, and first order does not hold.
@@ -59,7 +60,7 @@ def absorbed_gradient(absorbed: Sequence[RealArray], noise: NoiseModel, order: i
         innovations = noise.filtered(z)[start:]
         for lag in range(1, order + 1):
             earlier = z[start - lag : n_rows - lag]
-            sums[lag - 1] += float(np.sum(innovations * earlier))
+            sums[lag - 1] += float(np.vdot(innovations, earlier))
     return sums
 
 
@@ -118,14 +119,21 @@ def fit_autoregression(
     target = np.concatenate(targets)
     n = target.size
 
+    # Of every order the coefficients and errors follow from one triangle: its first columns are those of
+    # fewer lags.
+    triangle = triangle_of(np.column_stack([rows, target]))
+    of_target = triangle[:, -1]
+    rounding = np.finfo(np.float64).eps * n
+
     # The order of least BIC, n log variance + order log n. Residuals of zero have a logarithm, too.
     smallest = np.finfo(np.float64).tiny
     best = np.ones(1)
     best_cost = n * np.log(max(float(target @ target) / n, smallest))
     variance = 0.0
     for order in range(1, max_order + 1):
-        coefficients, *_ = np.linalg.lstsq(rows[:, :order], target, rcond=None)
-        error = target - rows[:, :order] @ coefficients
+        of_lags = triangle[:order, :order]
+        coefficients, *_ = np.linalg.lstsq(of_lags, of_target[:order], rcond=rounding)
+        error = of_target - triangle[:, :order] @ coefficients
         error_sum = float(error @ error)
         cost = n * np.log(max(error_sum / n, smallest)) + order * np.log(n)
         if cost < best_cost:
@@ -141,8 +149,8 @@ def fit_autoregression(
     # the singular values of X, less those that are rounding: X^T X may be beyond the reach of double
     # precision.
     gradient = absorbed_gradient(absorbed, weights, order, max_order)
-    _, singular, axes = np.linalg.svd(rows[:, :order], full_matrices=False)
-    certain = singular > np.finfo(np.float64).eps * n * singular[0]
+    _, singular, axes = np.linalg.svd(triangle[:order, :order])
+    certain = singular > rounding * singular[0]
     certain_axes = axes[certain]
     scaled_axes = certain_axes.T / singular[certain] ** 2
     step = variance * scaled_axes @ (certain_axes @ gradient)

@@ -319,10 +319,15 @@ def stack_blocks(blocks: Iterable[RegressionBlock], upon: StackedBlocks | None =
         rank = basis.shape[1]
         upper = np.zeros((0, rank + n_columns))
         for rows in pieces(block.output.size):
-            piece = [basis[rows], block.regressors[rows], block.kernel[rows], block.output[rows]]
-            stacked = np.column_stack(piece)
-            if len(upper):
-                stacked = np.vstack([upper, stacked])
+            # In the order in which LAPACK reads it, under the triangle of the pieces before.
+            known = len(upper)
+            output = block.output[rows]
+            stacked = np.empty((known + output.size, rank + n_columns), order="F")
+            stacked[:known] = upper
+            stacked[known:, :rank] = basis[rows]
+            stacked[known:, rank : rank + p] = block.regressors[rows]
+            stacked[known:, rank + p : -1] = block.kernel[rows]
+            stacked[known:, -1] = output
             upper = triangle_of(stacked)
         upper = upper[rank : rank + n_columns, rank:]
         n_rows += block.output.size - rank
