@@ -6,6 +6,7 @@ import pytest
 from control_design import synthesise
 from control_design.controllers.biquads import Cascade
 from control_design.controllers.parts import NotchPart
+from control_design.synthesis.order_search import FINER
 from control_design.synthesis.youla_starts import FreeController, fitted, free_controllers
 from validation.example_plants import flexible_link, flexible_link_specification
 
@@ -54,7 +55,11 @@ def test_the_search_ends_with_few_starts_where_they_come_near_the_bound(scenario
     plant, specification = flexible_link(scenario), flexible_link_specification(5)
     free = free_controllers([plant], specification)
     assert youla <= free.gamma <= 1.1 * youla
+    # Which order is asked for is nothing to the bound: it is the same object.
+    assert free_controllers([plant], flexible_link_specification(3)) is free
     result = synthesise([plant], specification, rng=np.random.default_rng(1))
     assert result.gamma <= limit
+    # The floor is a bound of any controller, but for the size of the basis.
+    assert 0.9 * free.gamma < free.floor <= min(free.gamma, FINER * result.gamma)
     assert len(result.starts) < 30
     assert {start.status for start in result.starts} == {"descent"}

@@ -273,6 +273,10 @@ def test_autoregression_finds_order_and_coefficients():
     assert found.order == 2
     # sd of an AR coefficient is at most 1 / sqrt(8000) = 0.011
     np.testing.assert_allclose(found.a_polynomial, true, atol=0.045)
+    # Least squares of that order, on the rows that have eight predecessors.
+    earlier = np.concatenate([np.stack([e[7:-1], e[6:-2]], axis=1) for e in records])
+    later = np.concatenate([e[8:] for e in records])
+    np.testing.assert_allclose(-found.a_polynomial[1:], np.linalg.lstsq(earlier, later)[0], rtol=1e-9)
     assert fit_autoregression([rng.standard_normal(5000)], 8).is_white
     with pytest.raises(ValueError, match=r"order 8.*16"):
         fit_autoregression([np.zeros(10)], 8)
