@@ -314,9 +314,14 @@ class _Problem:
         """
         derivatives = np.empty((point.errors.size, changes.size))
         for place in range(changes.size):
+            # Upwards where there is room, else downwards, else as far as the wider side goes.
+            room_above = self.highest[place] - point.vector[place]
+            room_below = point.vector[place] - self.lowest[place]
             change = changes[place]
-            if point.vector[place] + change > self.highest[place]:
-                change = -change
+            if change > room_above and room_below > min(room_above, change):
+                change = -min(change, room_below)
+            elif change > room_above:
+                change = room_above
             changed = point.vector.copy()
             changed[place] += change
             errors = self.logs.prediction_errors(self.parameters.unpack(changed).onto(point.fit))

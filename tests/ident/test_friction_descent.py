@@ -177,6 +177,31 @@ def test_a_needless_pair_is_given_up() -> None:
     assert with_poles(search, candidate).fit.model.poles.counts == (2, 0)
 
 
+def test_a_damping_that_may_be_anything_is_varied_within_its_limits() -> None:
+    """Of a pair of next to nothing at the largest damping the deviation is many factors of e; that much less
+    damping is none at all, and no fit has a pole on the unit circle."""
+    from ident.friction.descent import _Point, _Problem
+
+    start = begun()
+    pair = np.exp((-0.6 + 0.8j) * 0.3)
+    poles = Poles(start.model.poles.real, np.array([pair]))
+    model = replace(start.model, poles=poles, coefficients=np.append(start.model.coefficients, [1e-9, 1e-9]))
+    start = with_each_pole_once(started(model, OPTIONS.structure(), start.law))
+    fit = observed(start, logs().records)
+    problem = _Problem.of(fit, logs(), OPTIONS.model_copy(update={"zeta_max": 0.6}))
+    point = _Point(fit, problem.parameters.pack(), logs().prediction_errors(fit))
+    (place,) = np.flatnonzero(problem.names == "log_dampings")
+    changes = problem.first_changes(fit)
+    changes[place] = 60.0
+    derivatives = problem.secants(point, changes)
+    changed = point.vector.copy()
+    changed[place] = problem.lowest[place]
+    least_damped = problem.parameters.unpack(changed).onto(fit)
+    change = changed[place] - point.vector[place]
+    wanted = (logs().prediction_errors(least_damped) - point.errors) / change
+    assert derivatives[:, place] == pytest.approx(wanted, rel=1e-9)
+
+
 def test_thinned_logs_take_the_position_later_by_the_dead_time() -> None:
     command = np.arange(20.0)
     record = Record("log", command[:, None], 100 + command[:, None], DT_S, ("u",), ("y",))

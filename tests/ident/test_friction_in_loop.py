@@ -75,6 +75,54 @@ def test_level_and_dead_time_of_a_belt_are_found(belt) -> None:
     assert found.beyond == 0
 
 
+def every(record: Record, rows: int) -> Record:
+    """A log that was written every so many rows: the commands between them are lost."""
+    assert record.reference is not None
+    return replace(
+        record,
+        input=record.input[::rows],
+        output=record.output[::rows],
+        reference=record.reference[::rows],
+        dt_s=rows * record.dt_s,
+    )
+
+
+@pytest.mark.parametrize(
+    ("at_motor", "delay", "rows"),
+    [
+        pytest.param(1.0, 1, 2, marks=pytest.mark.slow),
+        pytest.param(0.8, 1, 3, marks=pytest.mark.slow),
+        pytest.param(1.0, 0, 2, marks=pytest.mark.long),
+        pytest.param(1.0, 1, 3, marks=pytest.mark.long),
+        pytest.param(0.8, 1, 2, marks=pytest.mark.long),
+        pytest.param(0.8, 0, 2, marks=pytest.mark.long),
+    ],
+)
+def test_friction_is_in_its_interval_in_a_log_of_every_few_rows(
+    at_motor: float, delay: int, rows: int
+) -> None:
+    """The controller goes on between two rows: its mean command is up to half a step late."""
+    one = machine("belt", 0)
+    level = float(one.plant.friction[0, 0])
+    friction = one.plant.friction.copy()
+    friction[:2, 0] = level * np.array([at_motor, 1 - at_motor])
+    friction[:2, 1] = friction[:2, 0]
+    slower = replace(one, plant=replace(one.plant, friction=friction, delay=delay))
+    records = []
+    for log in range(2):
+        got, begin = slower.record(log, slower.rng(log))
+        rows_kept = slice(begin, begin + 6000)
+        signals = [got[name][rows_kept, None] for name in "uyr"]
+        whole = Record(
+            f"log {log}", *signals[:2], one.plant.dt_s, ("u",), ("y",), signals[2], reference_names=("r",)
+        )
+        records.append(every(whole, rows))
+    found = fit_friction(records, IdentOptions(integrators=1))
+    assert abs(found.level - levels_of(slower)) < 2 * found.level_std
+    assert found.level_std < 0.05 * levels_of(slower)
+    assert found.beyond / found.level == pytest.approx(1 - at_motor, abs=0.03)
+
+
 def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     one, records, found = belt
     mode, omega = modes_of(one)[0], np.geomspace(1.0, 200.0, 80)
