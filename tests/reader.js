@@ -1,4 +1,4 @@
-// What a reader would mind about a page: words too pale, boxes too narrow, pictures without words. [faults, least contrast]
+// What a reader would mind about a page: words too pale or too small, boxes too narrow, pictures without words. [faults, least contrast]
 () => {
   document.querySelectorAll("details").forEach(part => part.open = true);
   const faults = document.querySelector("main h1") ? [] : ["no page"], numbers = text => (text.match(/[\d.]+/g) ?? []).map(Number);
@@ -29,6 +29,12 @@
     if (svg && getComputedStyle(svg).filter !== "none") ink = turned(ink);
     ink = ink.map((v, k) => v * look.opacity + paper[k] * (1 - look.opacity));
     const [low, high] = [light(ink), light(paper)].sort((a, b) => a - b), ratio = (high + .05) / (low + .05);
+    // Letters of a picture are as much smaller as the picture is; of 7 pixels one still tells an 8 from a 3.
+    const shown = parseFloat(look.fontSize) * (svg?.getScreenCTM()?.a ?? 1);
+    if (shown < 7) faults.push(`${innerWidth} px: letters ${shown.toFixed(1)} px high: ${walker.currentNode.data.slice(0, 40)}`);
+    const paperOf = element.closest(".plot > svg:not(.part)")?.getBoundingClientRect(), box = paperOf && element.getBoundingClientRect();
+    if (paperOf?.width > 1 && (box.left < paperOf.left - 1 || box.right > paperOf.right + 1))
+      faults.push(`${innerWidth} px: cut at the edge of its picture: ${walker.currentNode.data.slice(0, 40)}`);
     const size = parseFloat(look.fontSize), large = !svg && (size >= 24 || size >= 18.66 && look.fontWeight >= 700);
     least = Math.min(least, ratio);
     if (ratio < (large ? 3 : 4.5)) faults.push(`contrast ${ratio.toFixed(2)}: ${walker.currentNode.data.slice(0, 40)}`);

@@ -152,8 +152,8 @@ def test_a_picture_saved_from_the_page_looks_like_itself(opened):
     """The link's target is caught: an SVG with the styles it needs, and a PNG."""
     catch = "function () { saved.push([this.download, this.href]); }"
     opened.ask(f"window.saved = []; HTMLAnchorElement.prototype.click = {catch}")
-    opened.ask("document.querySelectorAll('.tools button')[1].click()")
-    opened.ask("document.querySelectorAll('.tools button')[2].click()")
+    opened.ask("document.querySelectorAll('figure > .tools button')[1].click()")
+    opened.ask("document.querySelectorAll('figure > .tools button')[2].click()")
     opened.ask("new Promise(done => setTimeout(done, 700))")
     (svg, content), (png, image) = opened.ask("saved")
     assert (svg, png) == ("bode.svg", "bode.png")
@@ -171,6 +171,40 @@ def test_a_narrow_screen_gets_panels_below_each_other(browser, faults_seen, page
     )
     assert len(browser.ask(widths)) == 2  # the two panels of the poles
     assert min(browser.ask(widths)) > 350
+
+
+def test_one_wide_panel_is_laid_out_anew_on_a_narrow_screen(opened):
+    """Gain over phase: as wide as the screen with letters to read; hidden entries, values and the title with
+    them."""
+    seen = "[...document.querySelectorAll('figure')][0].querySelectorAll('.plot')"
+    shown = f"[...{seen}].filter(plot => plot.checkVisibility()).map(plot => plot.className)"
+    assert opened.ask(shown) == ["plot wide"]
+    gain = "identified response (centre)"
+    left, top, right, bottom = axes(opened, 0)["box"]
+    opened.mouse("mouseMoved", *place(opened, (left + right) / 2, (top + bottom) / 2))
+    on_a_wide_screen = tip(opened)
+
+    opened.resize(400)
+    assert opened.ask(shown) == ["plot narrow"]
+    part = "document.querySelector('.plot.narrow')"
+    letters = f"{part}.querySelector('svg').getScreenCTM().a * 9"
+    assert opened.ask(letters) > 10
+    inside = (
+        f"(frame => [...{part}.querySelectorAll('text')].every(text => (box => box.left >= frame.left - 1"
+        f" && box.right <= frame.right + 1)(text.getBoundingClientRect())))({part}.getBoundingClientRect())"
+    )
+    assert opened.ask(inside)
+    # The middle of the panel is the same frequency and the same gain.
+    left, top, right, bottom = opened.ask(f"JSON.parse({part}.dataset.plot).axes[0].box")
+    matrix = f"(m => [m.a, m.d, m.e, m.f])({part}.querySelector('svg').getScreenCTM())"
+    a, d, e, f = opened.ask(matrix)
+    opened.mouse("mouseMoved", a * (left + right) / 2 + e, d * (top + bottom) / 2 + f)
+    on_a_narrow_screen = tip(opened)
+    for name in ("frequency", gain):
+        assert value(on_a_narrow_screen[name]) == pytest.approx(value(on_a_wide_screen[name]), rel=0.02)
+    opened.ask("document.querySelectorAll('[data-entry]')[1].click()")
+    hidden = f"[...{part}.querySelectorAll('.k1')].map(group => group.style.display)"
+    assert set(opened.ask(hidden)) == {"none"}
 
 
 def test_report_of_a_run(browser, faults_seen, tmp_path):

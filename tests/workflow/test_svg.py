@@ -144,15 +144,34 @@ def test_what_lies_outside_of_a_panel_is_not_written():
 @pytest.mark.parametrize("scale", [1.0, 1e-7, 3e6])
 @pytest.mark.parametrize("words", ["Two panels and more", HOSTILE])
 def test_words_are_whole_and_none_lies_on_another(scale, words):
-    made, page = page_of(everything(scale, words))
-    width, height = made.plot["width"], made.plot["height"]
+    made, _ = page_of(everything(scale, words))
+    assert len(made.narrow) == 2  # a part of it is too wide for a narrow screen
+    for form in (made, *made.narrow):
+        boxes = boxes_of_words(form)
+        assert len(boxes) > 10
+        for said, left, top, right, bottom in boxes:
+            assert left > -1, said
+            assert top > -1, said
+            assert right < form.plot["width"] + 1, said
+            assert bottom < form.plot["height"] + 1, said
+        for (one, *a), (other, *b) in itertools.combinations(boxes, 2):
+            overlap = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
+            assert min(overlap) < 1, f"{one!r} overlaps {other!r}"
+    for form in (made, made.narrow[0]):
+        assert words in [said for said, *_ in boxes_of_words(form)]
+
+
+def boxes_of_words(made):
+    """Words of a picture and the box of each (left, top, right, bottom) [pt]."""
     boxes = []
     # Of data only the legend and tags speak; here are titles, labels and numbers.
-    for group in page.findall("./g"):
+    for group in ElementTree.fromstring(made.svg).findall("./g"):
         for text in group.iter("text"):
-            said = "".join(text.itertext())
+            lines = [text.text or "", *(line.text or "" for line in text)]
+            said = " ".join(lines)
             size = {"ti": 10.5, "lb": 9.5, "se": 8.5}.get((text.get("class") or "").split(" ")[0], 9.0)
-            length = svg.text_width(said, size, bold="ti" in (text.get("class") or ""))
+            bold = "ti" in (text.get("class") or "")
+            length = svg.text_width("\n".join(lines), size, bold=bold)
             if turned := re.match(r"translate\(([-\d.]+) ([-\d.]+)\)rotate", text.get("transform", "")):
                 x, y = map(float, turned.groups())
                 boxes.append((said, x - 0.76 * size, y - length / 2, x + 0.2 * size, y + length / 2))
@@ -160,17 +179,33 @@ def test_words_are_whole_and_none_lies_on_another(scale, words):
             x, y = float(text.get("x")), float(text.get("y"))
             names = f"{text.get('class')} {next((g.get('class') for g in group if text in list(g)), '')}"
             x -= length if " en" in names else length / 2 if " mi" in names else 0
-            boxes.append((said, x, y - 0.76 * size, x + length, y + 0.2 * size))
-    assert len(boxes) > 20
-    for said, left, top, right, bottom in boxes:
-        assert left > -1, said
-        assert top > -1, said
-        assert right < width + 1, said
-        assert bottom < height + 1, said
-    for (one, *a), (other, *b) in itertools.combinations(boxes, 2):
-        overlap = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
-        assert min(overlap) < 1, f"{one!r} overlaps {other!r}"
-    assert words in [said for said, *_ in boxes]
+            foot = y + 1.2 * size * (len(lines) - 1)
+            boxes.append((said, x, y - 0.76 * size, x + length, foot + 0.2 * size))
+    return boxes
+
+
+def test_long_names_and_labels_leave_room_for_bars_on_a_narrow_screen():
+    """Names beside bars go on in a second line, the label below moves inwards, numbers at the ends are whole."""
+    names = ["a delay of the command and output offset", "something else that is missing here", "short"]
+    picture, panel = new_picture(3.0)
+    panel.y.named = [(float(k), name) for k, name in enumerate(names)]
+    panel.x.every = 20.0
+    panel.bars(np.arange(3.0), np.array([100.0, 99.8, 3.0]), 0.6, lying=True, color=style.MODEL)
+    for k, share in enumerate((100.0, 99.8, 3.0)):
+        panel.words(f"{share:g} %", share, k, offset=(4, 0), vertical="center")
+    panel.set_title("What each of these effects explains by itself, and no other")
+    panel.set(xlabel="share of the model error that is explained by it [%]", xlim=(0, 105))
+    made, _ = page_of(picture)
+    (narrow,) = made.narrow
+    assert sorted(names) == sorted(said for said, *_ in boxes_of_words(narrow) if said in names)
+    for said, left, top, right, bottom in boxes_of_words(narrow):
+        assert 0 <= left < right <= narrow.plot["width"], said
+        assert 0 <= top < bottom <= narrow.plot["height"], said
+    left, _, right, _ = narrow.plot["axes"][0]["box"]
+    assert right - left > 0.4 * narrow.plot["width"]
+    # On a wide screen a name of this length stands on one line.
+    assert 'class="y en"' in made.body
+    assert "<tspan" not in made.body
 
 
 @pytest.mark.parametrize("scale", [1e-7, 3e6])

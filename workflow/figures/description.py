@@ -23,6 +23,9 @@ Y = 1
 
 # Width of a picture: a page is 1000 pixels wide, and looks right at 100 pixels an inch.
 WIDTH_IN = 10.0
+# Width of a picture on a narrow screen: letters of 9 pt are then 11.6 pixels high where 372 pixels are left for
+# it (a screen of 400). Twice as much shrinks them to 5.8 pixels, which nobody reads.
+NARROW_WIDTH_IN = 4.0
 # Room between data and the ends of an axis that nobody stated, share of the data's range: as of matplotlib.
 _MARGIN = 0.05
 # Where a log axis without any positive value begins and ends; without data there is nothing to choose by.
@@ -127,7 +130,7 @@ class Axis:
     margin : float
         Room beside the data, share of their range, at an end that was not stated.
     every : float or None
-        A number at every multiple of it.
+        A number at every multiple of it, or at every second, third ... where not all have room.
     whole : bool
         Numbers at whole values only.
     named : sequence of (float, str) or None
@@ -363,7 +366,8 @@ class Panel:
 
 @dataclass(eq=False)
 class Picture:
-    """Panels in a grid, row by row, and the size of the whole in inches."""
+    """Panels in a grid, row by row, and the size of the whole in inches; a place of the grid without a panel
+    holds None."""
 
     height_in: float
     width_in: float
@@ -374,7 +378,31 @@ class Picture:
     @property
     def panels(self) -> list[Panel]:
         """The panels that are seen, row by row."""
-        return [panel for panel in self.grid.ravel() if panel.visible]
+        return [panel for panel in self.grid.ravel() if panel is not None and panel.visible]
+
+    def of_columns(self, columns: Iterable[int], *, width_in: float, height_in: float) -> Picture:
+        """A picture of some columns of this one, in another size [in].
+
+        Parameters
+        ----------
+        columns : iterable of int
+            Columns of the grid that stay; all others are left empty and take no width.
+        width_in, height_in : float
+            Size of the new picture.
+
+        Returns
+        -------
+        Picture
+            It holds the same panels, at the same places of a grid of the same shape.
+        """
+        kept = set(columns)
+        grid = self.grid.copy()
+        width_ratios = list(self.width_ratios)
+        for column in range(grid.shape[1]):
+            if column not in kept:
+                grid[:, column] = None
+                width_ratios[column] = 0.0
+        return Picture(height_in, width_in, grid, self.height_ratios, width_ratios)
 
     def legend(self) -> dict[str, Mark]:
         """Words of the legend and the mark that each first stood with, in the order of the panels."""
@@ -389,7 +417,7 @@ class Picture:
     def numbered(self, panel: Panel, which: int) -> bool:
         """Whether numbers stand at an axis: where panels share it, at the lowest or the leftmost only."""
         row, column = panel.place
-        sharing = [other for other in panel.axis(which).panels if other.visible]
+        sharing = [other for other in self.panels if other.axis(which) is panel.axis(which)]
         if which == X:
             return not any(other.place[1] == column and other.place[0] > row for other in sharing)
         return not any(other.place[0] == row and other.place[1] < column for other in sharing)

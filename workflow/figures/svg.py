@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Any
 from xml.sax.saxutils import escape
 
@@ -21,6 +21,7 @@ import numpy as np
 
 from workflow.figures import look as looks
 from workflow.figures.description import (
+    NARROW_WIDTH_IN,
     Area,
     Arrow,
     Axis,
@@ -79,6 +80,9 @@ _UNSEEN = 0.1
 # The same on a logarithmic axis, where a tenth of a point may be 1 % of the value that the script reads
 # there.
 _UNSEEN_LOG = 0.05
+# How much more is left out on a narrow screen: lines off by a quarter of a point, a third of a pixel there. A
+# finger points no nearer, and such a picture is one more in the page: so it weighs a quarter less.
+_COARSER = 2.5
 # How often every second point of a line is looked at; each time leaves at least half of them. Ten leave a
 # thousandth of a straight line, and later ones find little.
 _THINNINGS = 10
@@ -90,8 +94,18 @@ _EDGE = 3.0
 _SPECK = 0.4
 # A pixel of a page that is 1000 pixels wide [pt].
 _PIXEL = 0.72
-# Panels are laid out by the numbers that the layout before gave: two are usual, four end what would go on.
-_MOST_LAYOUTS = 4
+# A picture is laid out anew for a narrow screen where a part of it that cannot be parted further is wider than
+# this [pt]: letters of 9 pt would be less than 8.4 pixels high on a screen of 400. Half of a picture, with the
+# words that reach into its other half, is just not. Twice as much lets letters of 4 pixels pass.
+_WIDEST_PART = 400.0
+# Panels are laid out in the room that the words of the layout before need: three are usual, six end what would
+# go on.
+_MOST_LAYOUTS = 6
+# Rooms that differ by less are the same [pt]: what is seen at most, a pixel.
+_SAME_ROOM = 0.72
+# Longest words in place of numbers beside a panel, share of the width of the picture: longer ones go on in a
+# second line. Half as much parts words of two syllables, twice as much leaves no panel on a narrow screen.
+_LONGEST_NAME = 0.4
 # Farther outside of the picture than this [pt] a place is drawn at this distance.
 _FAR = 2e4
 # Height of a row in the legend of a file [pt]: letters of 9 pt with room to tell rows apart. Chosen.
@@ -118,13 +132,15 @@ COMMON_STYLE = (
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A picture in a page: the groups of its SVG without a legend; sample (groups around the middle of a box
-    from (0, -4.5) to (18, 4.5)) and words of each entry of the legend; what the script reads of it."""
+    from (0, -4.5) to (18, 4.5)) and words of each entry of the legend; what the script reads of it; and its
+    parts laid out anew for a narrow screen, none where the parts of this one can be read there."""
 
     picture: Picture
     label: str
     body: str
     legend: list[tuple[str, str]]
     plot: dict[str, Any]
+    narrow: list[Drawn] = field(default_factory=list)
 
     @property
     def svg(self) -> str:
@@ -170,6 +186,9 @@ class _Frame:
     hertz: Ticks | None = None
     decibel: Ticks | None = None
     numbered: tuple[bool, bool] = (True, True)
+    title: str = ""  # as it fits into the picture, in several lines where it is longer
+    x_label: str = ""  # likewise
+    coarser: float = 1.0  # how much more of its lines is left out than on a wide screen
 
     @property
     def width(self) -> float:
@@ -178,11 +197,6 @@ class _Frame:
     @property
     def height(self) -> float:
         return float(self.box[3] - self.box[1])
-
-    @property
-    def numbers(self) -> tuple[list[str], list[str]]:
-        """Words of the numbers of both axes."""
-        return self.x.words, self.y.words
 
     def place(self, which: int, values: Any) -> Real:
         """Where values of an axis lie [pt]."""
@@ -194,8 +208,8 @@ class _Frame:
         """A line (N, 2) as it is written: without points that are not seen; in y to a tenth where the axis is
         linear, which is 0.03 % of a panel's height."""
         if self.panel.y.kind != "lin":
-            return thinned(points, _UNSEEN_LOG)
-        points = thinned(points)
+            return thinned(points, _UNSEEN_LOG * self.coarser)
+        points = thinned(points, _UNSEEN * self.coarser)
         return np.column_stack([points[:, X], np.round(points[:, Y], 1)])
 
     def number_room(self, which: int) -> float:
@@ -228,12 +242,12 @@ class _Frame:
         if panel.colour_bar:
             left, right = 0.0, left
         bottom = self.number_room(X)
-        if panel.labels[X]:
-            bottom += _TO_LABEL + panel.label_size[X] * _LINE
+        if self.x_label:
+            bottom += _TO_LABEL + _lines(self.x_label) * panel.label_size[X] * _LINE
         top = self.above()
-        if panel.title:
+        if self.title:
             raised = max(panel.title_raised, top + _TO_TITLE)
-            top = raised + _lines(panel.title) * panel.title_size * _LINE
+            top = raised + _lines(self.title) * panel.title_size * _LINE
         if self.decibel is not None:
             words = max((text_width(word, _SECOND_SIZE) for word in self.decibel.words), default=0.0)
             right = _TO_NUMBERS + words + _TO_LABEL + _SECOND_SIZE * _LINE
@@ -263,12 +277,28 @@ class _Frame:
         """From where to where its words reach [pt], its title included."""
         left, _, right, _ = self.around()
         panel = self.panel
-        title = self.box[0] + text_width(panel.title, panel.title_size, bold=panel.title_bold)
+        title = self.box[0] + text_width(self.title, panel.title_size, bold=panel.title_bold)
         return float(self.box[0] - left - self.label_room()), max(float(self.box[2] + right), title)
 
 
 def _lines(text: str) -> int:
     return text.count("\n") + 1
+
+
+def _wrapped(text: str, size: float, room: float, *, bold: bool = False) -> str:
+    """A text in lines that are no longer than `room` [pt], parted between words; a longer word stays whole."""
+    lines: list[str] = []
+    for given in text.split("\n"):
+        line = ""
+        for word in given.split(" "):
+            longer = f"{line} {word}" if line else word
+            if line and text_width(longer, size, bold=bold) > room:
+                lines.append(line)
+                line = word
+            else:
+                line = longer
+        lines.append(line)
+    return "\n".join(lines)
 
 
 def _laid_out(picture: Picture, height: float) -> list[_Frame]:
@@ -277,21 +307,23 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
     rows, columns = picture.grid.shape
     before = np.zeros((2, max(rows, columns)))
     after = np.zeros((2, max(rows, columns)))
+    pad = np.zeros((2, max(rows, columns)))  # a column that holds no panel takes no width
     for panel in picture.panels:
         row, column = panel.place
         before[X, column], before[Y, row] = 55.0, 25.0
         after[X, column], after[Y, row] = 12.0, 25.0
+        pad[X, column] = _PAD
+        pad[Y, row] = _PAD
     frames: list[_Frame] = []
     for _ in range(_MOST_LAYOUTS):
-        x = _edges(before[X, :columns] + _PAD, after[X, :columns] + _PAD, picture.width_ratios, width)
-        y = _edges(before[Y, :rows] + _PAD, after[Y, :rows] + _PAD, picture.height_ratios, height)
-        known = [frame.numbers for frame in frames]
+        room_x = pad[X, :columns]
+        room_y = pad[Y, :rows]
+        x = _edges(before[X, :columns] + room_x, after[X, :columns] + room_x, picture.width_ratios, width)
+        y = _edges(before[Y, :rows] + room_y, after[Y, :rows] + room_y, picture.height_ratios, height)
         frames = [
             _framed(picture, panel, x[:, panel.place[1]], y[:, panel.place[0]]) for panel in picture.panels
         ]
-        # Measured again only where a panel has other numbers at its new size.
-        if [frame.numbers for frame in frames] == known:
-            break
+        known = np.concatenate([before, after])
         before[:] = 0.0
         after[:] = 0.0
         labels = np.zeros(columns)  # under each other, beside the widest numbers of the column
@@ -304,6 +336,9 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
             after[Y, row] = max(after[Y, row], bottom)
             labels[column] = max(labels[column], frame.label_room())
         before[X, :columns] += labels
+        # Words that stand at a place in the data need another room at every size of their panel.
+        if np.max(np.abs(np.concatenate([before, after]) - known)) < _SAME_ROOM:
+            break
     return frames
 
 
@@ -326,12 +361,25 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
         box = np.concatenate([middle - half, middle + half])
     along, up = box[2] - box[0], box[3] - box[1]
     size = panel.tick_size
+    y_ticks = ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, 9)))
+    if panel.y.named is not None:
+        longest = _LONGEST_NAME * picture.width_in * POINT
+        words = [_wrapped(word, size[Y], longest) for word in y_ticks.words]
+        y_ticks = replace(y_ticks, words=words)
     frame = _Frame(
         panel,
         box,
         _fitting(panel.x, float(along), size[X]),
-        ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, 9))),
+        y_ticks,
         numbered=(picture.numbered(panel, X), picture.numbered(panel, Y)),
+        title=_wrapped(
+            panel.title,
+            panel.title_size,
+            picture.width_in * POINT - float(box[0]) - _PAD,
+            bold=panel.title_bold,
+        ),
+        x_label=_wrapped(panel.labels[X], panel.label_size[X], picture.width_in * POINT - 2 * _PAD),
+        coarser=_COARSER if picture.width_in <= NARROW_WIDTH_IN else 1.0,
     )
     if panel.hertz:
         low, high = np.array(panel.x.limits()) / (2 * np.pi)
@@ -458,14 +506,17 @@ def _held(points: Real) -> Real:
 
 
 class _Writer:
-    """Writes a picture; classes: looks of the page by what they say, added to."""
+    """Writes a picture; number: of the picture in the page, unlike that of all others; classes: looks of the
+    page by what they say, added to; entries: what the legend names, of all panels that it stands for."""
 
-    def __init__(self, picture: Picture, number: int, classes: dict[str, str]) -> None:
+    def __init__(
+        self, picture: Picture, number: str, classes: dict[str, str], entries: dict[str, Mark]
+    ) -> None:
         self.picture = picture
         self.number = number
         self.classes = classes
         self.markers: dict[tuple[str, str], str] = {}
-        self.entries = picture.legend()
+        self.entries = entries
         self.entry_of_look = {
             looks.key(mark): k for k, mark in reversed(list(enumerate(self.entries.values())))
         }
@@ -638,7 +689,8 @@ class _Writer:
                 if which == X:
                     parts.append(_text(word, place, bottom + _TO_NUMBERS + _ASCENT * size, look, size=size))
                 else:
-                    parts.append(_text(word, beside, place + 0.36 * size, look))
+                    foot = place + (0.36 - (_lines(word) - 1) * _LINE / 2) * size
+                    parts.append(_text(word, beside, foot, look, size=size))
         group = f'<g class="{"xy"[which]} {side}">{"".join(parts)}</g>'
         if ticks.power and frame.numbered[which]:
             if which == X:
@@ -652,7 +704,11 @@ class _Writer:
         look = "lb" if letters == 9.5 else self.named(f"font-size:{letters:g}px;fill:#000")
         if which == X:
             foot = bottom + frame.number_room(X) + _TO_LABEL + _ASCENT * letters
-            return group + _text(label, (left + right) / 2, foot, look, "center")
+            # Below the middle of its panel, but inside of the picture.
+            half = text_width(frame.x_label, letters) / 2
+            most = self.picture.width_in * POINT - _PAD - half
+            middle = max(min((left + right) / 2, most), _PAD + half)
+            return group + _text(frame.x_label, middle, foot, look, "center", letters)
         # Labels of a column stand under each other: beside the widest numbers of all its panels.
         outer = left - self.number_rooms[panel.place[1]] - _TO_LABEL
         foot = outer - 0.24 * letters - (_lines(label) - 1) * letters * _LINE
@@ -693,15 +749,15 @@ class _Writer:
 
     def title(self, frame: _Frame) -> str:
         panel = frame.panel
-        if not panel.title:
+        if not frame.title:
             return ""
         look = "ti"
         if panel.title_size != 10.5 or not panel.title_bold:
             weight = "bold" if panel.title_bold else "normal"
             look = self.named(f"font-weight:{weight};font-size:{panel.title_size:g}px;fill:#000")
         raised = max(panel.title_raised, frame.above() + _TO_TITLE)
-        lines = (_lines(panel.title) - 1) * panel.title_size * _LINE
-        return _text(panel.title, frame.box[0], frame.box[1] - raised - lines, look, "left", panel.title_size)
+        lines = (_lines(frame.title) - 1) * panel.title_size * _LINE
+        return _text(frame.title, frame.box[0], frame.box[1] - raised - lines, look, "left", panel.title_size)
 
     def sample(self, mark: Mark) -> str:
         """What stands before a word of the legend: a line, an area or a marker around the middle of a box
@@ -856,20 +912,55 @@ def _legend_height(picture: Picture) -> float:
 def drawn(picture: Picture, label: str, number: int, classes: dict[str, str]) -> Drawn:
     """A picture for a page. label: what is read aloud in its place; number: of the picture in the page;
     classes: looks of the page by what they say, added to."""
-    writer = _Writer(picture, number, classes)
-    width = picture.width_in * POINT
+    entries = picture.legend()
     height = picture.height_in * POINT - _legend_height(picture)
+    made, frames = _written(picture, label, height, _Writer(picture, str(number), classes, entries))
+    for k, part in enumerate(_narrow_parts(picture, frames, height)):
+        writer = _Writer(part, f"{number}n{k}", classes, entries)
+        made.narrow.append(_written(part, label, height, writer)[0])
+    return made
+
+
+def _written(picture: Picture, label: str, height: float, writer: _Writer) -> tuple[Drawn, list[_Frame]]:
+    """A picture of this height [pt] without its legend, as laid out and written, and its panels in place."""
     frames = _laid_out(picture, height)
     body, read = writer.body(frames)
     plot = {
         "axes": read,
         "cuts": _cuts(frames),
         "height": round(height, 1),
-        "width": round(width, 1),
+        "width": round(picture.width_in * POINT, 1),
         "legend": list(writer.entries),
     }
     samples = [(writer.sample(mark), words) for words, mark in writer.entries.items()]
-    return Drawn(picture, label, body, samples, plot)
+    return Drawn(picture, label, body, samples, plot), frames
+
+
+def _narrow_parts(picture: Picture, frames: list[_Frame], height: float) -> list[Picture]:
+    """The parts of a picture as pictures for a narrow screen; none where each can be read there as it is.
+
+    Parameters
+    ----------
+    picture : Picture
+        The whole, as for a wide screen.
+    frames : list
+        Its panels in their places.
+    height : float
+        Of the whole without its legend [pt]; that of each part as well.
+
+    Returns
+    -------
+    list of Picture
+        One for each run of columns between the cuts, from left to right.
+    """
+    edges = [0.0, *_cuts(frames), picture.width_in * POINT]
+    if max(np.diff(edges)) <= _WIDEST_PART:
+        return []
+    parts = []
+    for left, right in pairwise(edges):
+        columns = {frame.panel.place[1] for frame in frames if left <= frame.box[0] < right}
+        parts.append(picture.of_columns(columns, width_in=NARROW_WIDTH_IN, height_in=height / POINT))
+    return parts
 
 
 def svg_file(made: Drawn, classes: Mapping[str, str]) -> bytes:

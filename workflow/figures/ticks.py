@@ -50,6 +50,8 @@ def ticks_of(axis: Axis, most: int) -> Ticks:
         return Ticks(np.array([place for place, _ in named]), [words for _, words in named], none)
     if axis.every is not None:
         places = _multiples(low, high, axis.every)
+        if places.size > most + 1:
+            places = _multiples(low, high, axis.every * -(-(places.size - 1) // most))
         return Ticks(places, [number(value) for value in places], none)
     if axis.kind == "log":
         return log_ticks(low, high, most)

@@ -68,12 +68,14 @@ def render_page(
 
 @dataclass(frozen=True)
 class Embedded:
-    """What the macro `picture` puts: image, samples and words of the legend, JSON for the script."""
+    """What the macro `picture` puts: image, samples and words of the legend, JSON for the script, and the
+    same of each part for a narrow screen."""
 
     name: str
     image: Markup
     legend: list[tuple[Markup, str]]
     plot: Markup
+    narrow: list[Embedded] = field(default_factory=list)
 
 
 def embedded(name: str, made: Drawn) -> Embedded:
@@ -82,4 +84,5 @@ def embedded(name: str, made: Drawn) -> Embedded:
     # For an attribute in single quotes: there are a thousand double ones.
     quoted = Markup(plot.replace("&", "&amp;").replace("'", "&#39;").replace("<", "&lt;"))
     legend = [(Markup(sample), words) for sample, words in made.samples]
-    return Embedded(name, Markup(made.svg), legend, quoted)
+    narrow = [embedded(name, part) for part in made.narrow]
+    return Embedded(name, Markup(made.svg), legend, quoted, narrow)

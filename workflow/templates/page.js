@@ -73,9 +73,11 @@ class Plot {
     this.listen(this.svg);
     const figure = holder.closest("figure");
     for (const item of figure.querySelectorAll("[data-entry]")) this.entry(item);
-    const tools = make("p", figure, "", "tools");
-    for (const [words, act] of [["whole", () => this.whole()], ["SVG", () => this.save("svg")], ["PNG", () => this.save("png")]])
-      make("button", tools, words).addEventListener("click", act);
+    // A figure is saved as it is on a wide screen: parts of it for a narrow one are only seen as a whole again.
+    const isPart = holder.classList.contains("narrow");
+    const tools = make("p", isPart ? holder : figure, "", "tools"), acts = [["whole", () => this.whole()]];
+    if (!isPart) acts.push(["SVG", () => this.save("svg")], ["PNG", () => this.save("png")]);
+    for (const [words, act] of acts) make("button", tools, words).addEventListener("click", act);
     tools.firstChild.hidden = true;
     this.reset = tools.firstChild;
   }
@@ -103,7 +105,7 @@ class Plot {
   }
   // On a narrow screen columns of panels stand below each other, each as a copy of its part of the picture.
   part() {
-    if (this.svgs.length > 1 || !this.plot.cuts.length) return;
+    if (this.svgs.length > 1 || !this.plot.cuts.length || /wide|narrow/.test(this.holder.className)) return;
     const edges = [0, ...this.plot.cuts, this.plot.width];
     for (let k = 1; k < edges.length; k++) {
       const copy = this.svg.cloneNode(true);
