@@ -185,7 +185,8 @@ def boxes_of_words(made):
 
 
 def test_long_names_and_labels_leave_room_for_bars_on_a_narrow_screen():
-    """Names beside bars go on in a second line, the label below moves inwards, numbers at the ends are whole."""
+    """Names beside bars go on in a second line, the label below moves inwards, numbers at the ends are
+    whole."""
     names = ["a delay of the command and output offset", "something else that is missing here", "short"]
     picture, panel = new_picture(3.0)
     panel.y.named = [(float(k), name) for k, name in enumerate(names)]

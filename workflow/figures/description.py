@@ -23,8 +23,8 @@ Y = 1
 
 # Width of a picture: a page is 1000 pixels wide, and looks right at 100 pixels an inch.
 WIDTH_IN = 10.0
-# Width of a picture on a narrow screen: letters of 9 pt are then 11.6 pixels high where 372 pixels are left for
-# it (a screen of 400). Twice as much shrinks them to 5.8 pixels, which nobody reads.
+# Width of a picture on a narrow screen: letters of 9 pt are then 11.6 pixels high where 372 pixels are left
+# for it (a screen of 400). Twice as much shrinks them to 5.8 pixels, which nobody reads.
 NARROW_WIDTH_IN = 4.0
 # Room between data and the ends of an axis that nobody stated, share of the data's range: as of matplotlib.
 _MARGIN = 0.05

@@ -94,12 +94,12 @@ _EDGE = 3.0
 _SPECK = 0.4
 # A pixel of a page that is 1000 pixels wide [pt].
 _PIXEL = 0.72
-# A picture is laid out anew for a narrow screen where a part of it that cannot be parted further is wider than
-# this [pt]: letters of 9 pt would be less than 8.4 pixels high on a screen of 400. Half of a picture, with the
-# words that reach into its other half, is just not. Twice as much lets letters of 4 pixels pass.
+# A picture is laid out anew for a narrow screen where a part of it that cannot be parted further is wider
+# than this [pt]: letters of 9 pt would be less than 8.4 pixels high on a screen of 400. Half of a picture,
+# with the words that reach into its other half, is just not. Twice as much lets letters of 4 pixels pass.
 _WIDEST_PART = 400.0
-# Panels are laid out in the room that the words of the layout before need: three are usual, six end what would
-# go on.
+# Panels are laid out in the room that the words of the layout before need: three are usual, six end what
+# would go on.
 _MOST_LAYOUTS = 6
 # Rooms that differ by less are the same [pt]: what is seen at most, a pixel.
 _SAME_ROOM = 0.72
@@ -286,7 +286,8 @@ def _lines(text: str) -> int:
 
 
 def _wrapped(text: str, size: float, room: float, *, bold: bool = False) -> str:
-    """A text in lines that are no longer than `room` [pt], parted between words; a longer word stays whole."""
+    """A text in lines that are no longer than `room` [pt], parted between words; a longer word stays
+    whole."""
     lines: list[str] = []
     for given in text.split("\n"):
         line = ""
