@@ -4,6 +4,7 @@ import ctypes
 import json
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import control
 import numpy as np
@@ -14,6 +15,7 @@ from control_design.controllers.engineers_numbers import engineers_numbers
 from tests.compiler import compiled, needs_compiler
 from tests.workflow.test_design_sources import DT_S, QUICK, arm, document, write_json
 from workflow.commands.tuning import TuningSession
+from workflow.commands.tuning_views import bode
 from workflow.config.design_file import read_design_file
 
 WISH = """
@@ -100,6 +102,25 @@ def test_a_controller_that_is_brought_is_shown_in_these_numbers(flexlink, tmp_pa
     assert "gain crossover" in answer.out
 
 
+@pytest.mark.parametrize("slope_deg", [-300.0, -90.0, 0.0, 60.0, 250.0])
+def test_the_phase_that_tune_draws_shows_the_phase_margin(slope_deg):
+    """Whatever turn the phase begins in: the loop is a margin above -180 degrees where its gain is one."""
+    omega = np.geomspace(0.05, 500, 400)
+    decades = np.log10(omega / 5.0)
+    loop = 10.0 ** (-1.5 * decades) * np.exp(1j * np.radians(-140.0 + slope_deg * decades))
+    law = Controller.proportional(2.0, 1e-3, computational_delay_samples=0)
+    plant = SimpleNamespace(at=lambda omega_rad_s: SimpleNamespace(centre=loop / 2.0))
+    seen = bode(law, plant, omega, ("V", "rad"))
+    of_loop, of_plant, of_controller = seen["curves"]
+    assert [curve["unit"] for curve in seen["curves"]] == ["1", "rad / V", "V / rad"]
+    crossover = int(np.argmin(np.abs(decades)))
+    assert of_loop["deg"][crossover] == pytest.approx(-140.0, abs=5)
+    assert of_plant["deg"] == pytest.approx(of_loop["deg"], abs=0.02)
+    assert np.ptp(of_loop["deg"]) == pytest.approx(4.0 * abs(slope_deg), abs=0.1)
+    assert set(of_controller["gain"]) == {2.0}
+    assert set(of_controller["deg"]) == {0.0}
+
+
 def test_tune_keeps_the_notch_and_draws_the_loop(tmp_path):
     plant, _, spec = _asked(tmp_path)
     session = TuningSession([plant], read_design_file(spec), tmp_path / "saved", 2006)
@@ -110,12 +131,15 @@ def test_tune_keeps_the_notch_and_draws_the_loop(tmp_path):
     assert "notch 1.9 Hz, 10 dB deep" in numbers["controller"]
     assert numbers["controller order"] == "6"
     (seen,) = found["plants"]
-    bode = seen["bode"]
-    assert len(bode["x"]) == len(bode["loop"]) == len(bode["plant_deg"])
+    drawn = seen["bode"]
+    loop, of_plant, controller = drawn["curves"]
+    assert [one["symbol"] for one in drawn["curves"]] == ["K G", "G", "K"]
+    assert len(drawn["x"]) == len(loop["gain"]) == len(of_plant["deg"])
     nominal = arm()
-    at = len(bode["x"]) // 2
-    gain = abs(nominal(np.exp(1j * bode["x"][at] * DT_S)))
-    assert bode["plant"][at] == pytest.approx(gain, rel=1e-3)
+    at = len(drawn["x"]) // 2
+    gain = abs(nominal(np.exp(1j * drawn["x"][at] * DT_S)))
+    assert of_plant["gain"][at] == pytest.approx(gain, rel=1e-3)
+    assert loop["gain"][at] == pytest.approx(gain * controller["gain"][at], rel=1e-3)
     real, imaginary = seen["roots"]["plant poles"]
     poles = np.sort_complex(np.array(real) + 1j * np.array(imaginary))
     np.testing.assert_allclose(poles, np.sort_complex(nominal.poles()), atol=1e-4)

@@ -94,6 +94,11 @@ class TuningSession:
         self._plants, self._units = [source.plant for source in sources], sources[0].units
         self.drawable = all(level_can_change(plant) for plant in self._plants)
         self._last = None if found is None else found.design.controller
+        self._performance_unit = ""
+        config = sources[0].config
+        if found is not None and isinstance(config, RunConfig) and config.performance_index is not None:
+            performance_output = config.channels[config.performance_index].output
+            self._performance_unit = found.records.unit(performance_output)
         # Overshoot, settling time and command are those of the run's reference step, through its filter.
         self.step_size, self.filter = 1.0, None
         self._friction: FrictionStep | None = None
@@ -101,8 +106,8 @@ class TuningSession:
             self.step_size = found.closed_loop.check.reference_step
             self.filter = found.reference_filter.filter
             friction = found.identify.friction
-            if friction is not None and isinstance(sources[0].config, RunConfig):
-                steps = converter_steps(sources[0].config.closed_loop)
+            if friction is not None and isinstance(config, RunConfig):
+                steps = converter_steps(config.closed_loop)
                 self._friction = FrictionStep(friction, self.step_size, steps)
         self.output_unit = self._units[1]
         self.step_words = si(self.step_size, self.output_unit or "in the unit of the output", 4)
@@ -312,9 +317,9 @@ class TuningSession:
             curves.append(
                 {
                     "name": plant.name,
-                    "gains": _gains(law, plant, specification),
+                    "gains": _gains(law, plant, specification, self._units, self._performance_unit),
                     "nyquist": _nyquist(law, plant),
-                    "bode": bode(law, plant, _shown_grid(law, plant, specification)),
+                    "bode": bode(law, plant, _shown_grid(law, plant, specification), self._units),
                     "roots": roots(law, plant),
                     "step": {
                         "end": float(nominal.time_s[shown - 1]),
@@ -370,12 +375,34 @@ def _shown_grid(law: Controller, plant: UncertainPlant, specification: Specifica
     return omega[omega >= lowest]
 
 
-def _gains(law: Controller, plant: UncertainPlant, specification: Specification) -> list[dict[str, Any]]:
-    curves = sensitivity_curves(plant, law, specification, _shown_grid(law, plant, specification))
+def _gains(
+    law: Controller,
+    plant: UncertainPlant,
+    specification: Specification,
+    units: tuple[str, str] = ("", ""),
+    performance_unit: str = "",
+) -> list[dict[str, Any]]:
+    """Closed-loop gains of a plant with their units.
+
+    units: of input and output; performance_unit: of the output that is wanted, where it is another one; ""
+    where nobody stated them.
+    """
+    if plant.performance is not None and not performance_unit:
+        performance_unit = "?"
+    curves = sensitivity_curves(
+        plant,
+        law,
+        specification,
+        _shown_grid(law, plant, specification),
+        input_unit=units[0],
+        output_unit=units[1],
+        performance_unit=performance_unit,
+    )
     return [
         {
             "symbol": one.symbol,
             "meaning": one.meaning,
+            "unit": one.unit,
             "x": short(one.omega_rad_s),
             "nominal": short(one.nominal),
             "worst": short(np.where(one.worst < 1e200, one.worst, np.nan)),

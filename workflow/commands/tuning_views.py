@@ -20,6 +20,7 @@ from control_design.plants.plant_set import UncertainPlant
 from ident.friction import FrictionFit
 from ident.resampling import resampled_friction
 from workflow.figures.bands import outline
+from workflow.figures.style import ratio_unit
 from workflow.tasks.friction_loop import FrictionLoop, friction_feedforward
 from workflow.text.templates import said
 
@@ -34,18 +35,43 @@ def short(values: Real | Sequence[float]) -> list[float | None]:
     return [float(f"{value:.5g}") if math.isfinite(value) else None for value in numbers]
 
 
-def bode(law: Controller, plant: UncertainPlant, omega_rad_s: Real) -> dict[str, Any]:
-    """Gain and phase in degrees of the loop K G, with its delay, and of the plant's centres G.
+def bode(law: Controller, plant: UncertainPlant, omega_rad_s: Real, units: tuple[str, str]) -> dict[str, Any]:
+    """Gain, its unit, and phase of the loop K G, of the plant G and of the controller K with its delay.
 
-    omega_rad_s: (F,), ascending, where the plant is known. Phases run on without jumps of a turn.
+    Parameters
+    ----------
+    law : Controller
+        K, with its computational delay.
+    plant : UncertainPlant
+        Its centres are G.
+    omega_rad_s : (F,) array
+        Ascending, where the plant is known.
+    units : (str, str)
+        Of input and output of the plant; "" where nobody stated it.
+
+    Returns
+    -------
+    dict
+        `x`: the frequencies; `curves`: of each response its symbol, unit, `gain` (F,) and `deg` (F,). Phases
+        run on without jumps of a turn. Those of loop and plant lie between -360 and 0 degrees where the loop
+        is nearest to a gain of one, so that a phase margin is the distance to -180 degrees that is seen.
     """
+    controller = law.response(omega_rad_s)
     centre = plant.at(omega_rad_s).centre
-    loop = law.response(omega_rad_s) * centre
-    found: dict[str, Any] = {"x": short(omega_rad_s)}
-    for name, values in (("loop", loop), ("plant", centre)):
-        found[name] = short(np.abs(values))
-        found[f"{name}_deg"] = short(np.degrees(np.unwrap(np.angle(values))))
-    return found
+    loop = controller * centre
+    # A response of zero has no logarithm; it is not where the loop crosses.
+    crossover = int(np.argmin(np.abs(np.log(np.maximum(np.abs(loop), np.finfo(float).tiny)))))
+    curves = []
+    for symbol, unit, values, shifted in (
+        ("K G", "1", loop, True),
+        ("G", ratio_unit(*reversed(units)), centre, True),
+        ("K", ratio_unit(*units), controller, False),
+    ):
+        degrees = np.degrees(np.unwrap(np.angle(values)))
+        if shifted:
+            degrees = degrees - 360.0 * np.ceil(degrees[crossover] / 360.0)
+        curves.append({"symbol": symbol, "unit": unit, "gain": short(np.abs(values)), "deg": short(degrees)})
+    return {"x": short(omega_rad_s), "curves": curves}
 
 
 def roots(law: Controller, plant: UncertainPlant) -> dict[str, list[list[float | None]]]:

@@ -263,23 +263,27 @@ const path = (xs, ys, x, y) => {
   });
   return d;
 };
-// Bode of loop and plant, and poles and zeros.
+// Bode of loop, plant and controller, a panel for each gain, as each has a unit of its own; and poles and zeros.
 const views = (plant, other) => {
   const bode = plant.bode, ends = [bode.x[0], bode.x.at(-1), true], span = curves => {
     const seen = curves.flat().filter(v => v != null);
     return [Math.min(...seen), Math.max(...seen)];
   };
-  const [least, most] = span([bode.loop, bode.plant]);
-  for (const [title, suffix, ys, words] of [
-    ["Bode: gain of K G (solid) and G (dotted)", "", [Math.max(least / 1.5, most * 1e-6), most * 1.5, true], 1],
-    ["Bode: phase of K G (solid) and G (dotted) [deg]", "_deg", span([bode.loop_deg, bode.plant_deg]).map((v, k) => v + (k ? 10 : -10)).concat(false), -180],
-  ]) {
-    const [x, y, group] = panel(title, ends, ys, "frequency [rad/s]");
-    draw("path", group, {class: "curve limit", d: `M${x(ends[0])} ${y(words)}H${x(ends[1])}`});
-    draw("path", group, {class: "curve dotted", d: path(bode.x, bode["plant" + suffix], x, y)});
-    if (other) draw("path", group, {class: "curve pinned", d: path(other.bode.x, other.bode["loop" + suffix], x, y)});
-    draw("path", group, {class: "curve nominal", d: path(bode.x, bode["loop" + suffix], x, y)});
-  }
+  const level = (x, y, group, at) => draw("path", group, {class: "curve limit", d: `M${x(ends[0])} ${y(at)}H${x(ends[1])}`});
+  bode.curves.forEach((one, k) => {
+    // Whole but for what rounding leaves of a zero.
+    const [least, most] = span([one.gain.filter(v => v > 0)]);
+    const [x, y, group] = panel(`Bode: gain of ${one.symbol} [${one.unit}]`, ends, [Math.max(least / 1.5, most * 1e-13), most * 1.5, true], "frequency [rad/s]");
+    if (one.symbol === "K G") level(x, y, group, 1);
+    if (other) draw("path", group, {class: "curve pinned", d: path(other.bode.x, other.bode.curves[k].gain, x, y)});
+    draw("path", group, {class: "curve nominal", d: path(bode.x, one.gain, x, y)});
+  });
+  const looks = ["nominal", "dotted", "worst"], [least, most] = span(bode.curves.map(one => one.deg));
+  const [px, py, phases] = panel("Bode: phase [deg]", ends, [Math.min(least, -180) - 10, most + 10, false], "frequency [rad/s]", false,
+    bode.curves.map((one, k) => [looks[k], one.symbol]));
+  level(px, py, phases, -180);
+  if (other) draw("path", phases, {class: "curve pinned", d: path(other.bode.x, other.bode.curves[0].deg, px, py)});
+  bode.curves.forEach((one, k) => draw("path", phases, {class: "curve " + looks[k], d: path(bode.x, one.deg, px, py)}));
   const [x, y, group] = panel("Poles (×) and zeros (○) in z: imaginary over real part", [-1.2, 1.2, false], [-1.15, 1.15, false], "real part", true,
     [["worst", "closed loop"], ["nominal", "controller"], ["dotted", "plant"], ["pinned", "unit circle"]]);
   const turn = [...Array(61).keys()].map(k => k * Math.PI / 30);
@@ -293,6 +297,11 @@ const views = (plant, other) => {
     });
   }
 };
+// Ends of an axis with a little room beside the values, in whatever unit these are.
+const around = values => {
+  const [low, high] = [Math.min(...values), Math.max(...values)], room = .06 * (high - low || Math.abs(high) || 1);
+  return [low - room, high + room, false];
+};
 const panels = () => {
   const at = Math.max(0, $("plant").selectedIndex), plant = shown.plants?.[at], other = pinned?.plants?.[at];
   const top = scrollY;
@@ -301,7 +310,7 @@ const panels = () => {
   plant.gains.forEach((one, k) => {
     const seen = [...one.nominal, ...one.worst, ...one.limit].filter(v => v > 0), most = 2 * Math.max(...one.nominal, ...one.worst.filter(v => v < 300 * Math.max(...one.nominal)));
     const ys = [Math.max(Math.min(...seen) / 1.5, most * 1e-5), most, true];
-    const [x, y, group] = panel(`${one.symbol}: ${one.meaning}`, [one.x[0], one.x.at(-1), true], ys, "frequency [rad/s]");
+    const [x, y, group] = panel(`${one.symbol} [${one.unit}]: ${one.meaning}`, [one.x[0], one.x.at(-1), true], ys, "frequency [rad/s]");
     const back = [...one.x].reverse(), low = path(back, [...one.nominal].reverse(), x, y).replace("M", "L");
     draw("path", group, {class: "band", d: path(one.x, one.worst.map(v => v ?? most), x, y) + low + "Z"});
     if (other) draw("path", group, {class: "curve pinned", d: path(other.gains[k].x, other.gains[k].worst, x, y)});
@@ -318,14 +327,14 @@ const panels = () => {
   const step = plant.step;
   if (step.end) {
     const all = [...step.nominal.y, ...step.samples.flatMap(one => one.y), 0], end = step.end;
-    const [x, y, inside] = panel("Step of the reference, models from the posterior" + UNIT, [0, end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]");
+    const [x, y, inside] = panel("Step of the reference, models from the posterior" + UNIT, [0, end, false], around(all), "time [s]");
     for (const one of step.samples) draw("path", inside, {class: "curve thin", d: path(one.x, one.y, x, y)});
     if (other?.step.end) draw("path", inside, {class: "curve pinned", d: path(other.step.nominal.x, other.step.nominal.y, x, y)});
     draw("path", inside, {class: "curve nominal", d: path(step.nominal.x, step.nominal.y, x, y)});
   }
   if (step.friction.length) {
     const all = [...step.nominal.y, ...step.friction.flatMap(one => one.y), 0];
-    const [x, y, inside] = panel("Step with dry friction" + UNIT, [0, step.end, false], [Math.min(...all) - .05, Math.max(...all) * 1.08 + .01, false], "time [s]", false,
+    const [x, y, inside] = panel("Step with dry friction" + UNIT, [0, step.end, false], around(all), "time [s]", false,
       [["limit", "without feed-forward"], ["nominal", "with feed-forward"], ["worst thin", "nominal, no friction"], ["pinned", "reference"]]);
     draw("path", inside, {class: "curve pinned", d: `M${x(0)} ${y(STEP)}H${x(step.end)}`});
     draw("path", inside, {class: "curve thin", d: path(step.nominal.x, step.nominal.y, x, y)});
