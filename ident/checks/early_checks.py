@@ -34,6 +34,11 @@ from ident.data.wrapping import spikes_in, wraps_at
 # samples a lag: with fewer no identification ends, whatever the order of its model.
 FEWEST_SAMPLES = 2 * WHITE_LAGS
 
+# The same of a log of a loop: 96. What its noise does in the command comes back, so that it is described by
+# an autoregression of up to 32 coefficients (`NOISE_ORDERS`), fitted on the rows that have 32 before them;
+# that needs two equations a coefficient.
+FEWEST_IN_LOOP = 96
+
 # Relative to its motion: a column that differs by no more from a multiple of another one is its copy. Text
 # logs have six digits or more, of which rounding leaves 2e-6 of a motion about a level of its own size; the
 # best servo follows its reference ten times worse, say 1e-4.
@@ -41,6 +46,10 @@ _COPY_ERROR = 1e-5
 # Rows by which a copy may be late: as a value that went over a bus or through a buffer. Chosen: a tenth of a
 # second at 500 Hz; twice as many take twice as long, 0.1 s for a log of 100 000 rows.
 _LATEST_COPY = 50
+
+# Relative to its changes: a command that a law of the output leaves no more of is that law's. A command of
+# five digits keeps 1e-4 of changes a tenth of its size; what moves it by more tells of the machine.
+_LAW_ERROR = 1e-3
 
 # Readings of an output that takes fewer different values are doubted: so few steps of a sensor hide what a
 # light mode does. As in `clipped_share`, which takes a signal of fewer levels for one of few levels by
@@ -137,29 +146,33 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
 
 
 def early_doubts(records: Sequence[Record]) -> list[Finding]:
-    """Findings SATURATED, then FEW_READINGS, on records that can be used but hardly are what was meant.
+    """Findings SATURATED, REFERENCE_STILL, then FEW_READINGS, on records that can be used but hardly are what
+    was meant.
 
-    A command of a loop that mostly stands at its ends, an output of few readings; one input and one output
-    each (not checked). Empty where nothing is doubted.
+    A command of a loop that mostly stands at its ends, a reference that stands still, an output of few
+    readings; one input and one output each (not checked). Empty where nothing is doubted.
     """
-    return [*saturated(records), *few_readings(records)]
+    return [*saturated(records), *still_references(records), *few_readings(records)]
 
 
-def too_few_samples(records: Sequence[Record], order: int = 0) -> str:
-    """The complaint that no record has more than `FEWEST_SAMPLES` rows, or "".
+def too_few_samples(records: Sequence[Record], order: int = 0, *, in_loop: bool = False) -> str:
+    """The complaint that no record has more than `FEWEST_SAMPLES` rows, `FEWEST_IN_LOOP` of a loop, or "".
 
-    order: of the model, where it is stated (else 0); it stands in the complaint and decides nothing.
-    ValueError of `max` without records.
+    order: of the model, where it is stated (else 0); it stands in the complaint and decides nothing. in_loop:
+    the logs were made in a loop. ValueError of `max` without records.
     """
     longest = max(records, key=lambda record: record.n_samples)
-    if longest.n_samples > FEWEST_SAMPLES:
+    fewest = FEWEST_IN_LOOP if in_loop else FEWEST_SAMPLES
+    if longest.n_samples > fewest:
         return ""
     asked = ""
     if order:
         asked = f" for order {order}"
+    elif in_loop:
+        asked = " to tell a machine from the loop around it"
     return (
         f"{longest.label}: {longest.n_samples} samples are too few{asked}; expected more than "
-        f"{FEWEST_SAMPLES} in one log, better some thousand: record longer, or log faster"
+        f"{fewest} in one log, better some thousand: record longer, or log faster"
     )
 
 
@@ -328,20 +341,91 @@ def few_lines(records: Sequence[Record]) -> str:
         power += periodogram / max(float(periodogram.sum()), np.finfo(np.float64).tiny)
     count = power.sum() ** 2 / (power @ power)
     references = [record.reference for record in records if record.reference is not None]
+    line = 1 + int(power.argmax())
+    command = f"the command '{records[0].input_names[0]}'"
+    stuck = saturated(records)
     if references and not any(np.any(np.ptp(reference, axis=0)) for reference in references):
         why = f"the reference '{records[0].reference_names[0]}' of these logs stands still"
-    elif count < FEWEST_LINES:
-        largest_Hz = (1 + power.argmax()) / (shortest * dt_s)
-        why = (
-            f"the command '{records[0].input_names[0]}' is concentrated near {largest_Hz:.3g} Hz, as of a "
-            "sine or a limit cycle"
+    elif count >= FEWEST_LINES:
+        return ""
+    elif stuck:
+        # What the limits leave of a command has few frequencies whatever the reference asks for.
+        values = stuck[0].values
+        return (
+            f"{values['record']}: {command} stands at {values['low']:.6g} or {values['high']:.6g}, the ends "
+            f"of its range, in {100 * float(values['share']):.3g} % of the samples, and turns too seldom to "
+            "tell a machine from its loop: record the loop with a smaller reference"
+        )
+    elif line < FEWEST_LINES:
+        # So few lines lie below that no band could have shown beside it.
+        times = "time" if line == 1 else "times"
+        return (
+            f"{records[0].label}: {command} swings hardly more than {line} {times} in "
+            f"{shortest * dt_s:.3g} s ({shortest} samples), too few to tell a machine from its loop: "
+            "record longer, with a reference that moves more often (flexlink excite --closed-loop LOG...)"
         )
     else:
-        return ""
+        largest_Hz = line / (shortest * dt_s)
+        why = f"{command} is concentrated near {largest_Hz:.3g} Hz, as of a sine or a limit cycle"
     return (
         f"{records[0].label}: {why}: too little to tell a machine from its loop; record logs that excite "
         "a band: flexlink excite --closed-loop LOG..."
     )
+
+
+def undriven_loop(records: Sequence[Record]) -> str:
+    """The complaint that a loop's reference stands still and its command is the controller's alone, or "".
+
+    Such a command follows from the output, so that it tells the controller and not the machine (Soderstrom,
+    Gustavsson and Ljung, Int. J. Control 21(2), 1975). Said where in every record the reference stands still,
+    as recorded or as the reader left it out (REFERENCE_STILL), and changes of the command are those of a law
+    of `_PAST_OF_CAUSE` values of the output but for rounding. A command that something else moves, or a
+    limit cuts, is no such law: nothing is said of it. IndexError without records.
+    """
+    names = []
+    for record in records:
+        if record.reference is None:
+            still = [note for note in record.doubts if note.kind is FindingKind.REFERENCE_STILL]
+        else:
+            still = still_references([record])
+        if not still or not _is_law_of_output(record.input[:, 0], record.output[:, 0]):
+            return ""
+        names.append(str(still[0].values["name"]))
+    return (
+        f"{records[0].label}: the reference '{names[0]}' stands still, and the command "
+        f"'{records[0].input_names[0]}' is what the controller makes of '{records[0].output_names[0]}' "
+        "alone: that tells the controller, not the machine. Record with a reference that moves: "
+        "flexlink excite --closed-loop LOG..."
+    )
+
+
+def _is_law_of_output(command: RealArray, output: RealArray) -> bool:
+    """Whether changes of a command (T,) are a linear law of an output (T,), now and before, but for
+    `_COPY_ERROR`.
+
+    Changes: a controller with an integrator is one, too. False for fewer rows than two a coefficient, and for
+    a command that its own past tells as well: a step or a few sines, that nothing has to follow.
+    """
+    changes = np.diff(command)[:_MOST_AVERAGES]
+    motion = _averages(output, 1, output.size)[: _MOST_AVERAGES + 1]
+    n_equations = changes.size - _OWN_PAST
+    if n_equations < 4 * _PAST_OF_CAUSE:
+        return False
+    lags = range(_PAST_OF_CAUSE)
+    # What an integrator adds while the output stays beside the reference is constant.
+    steady = np.ones(n_equations)
+    past_of_output = [motion[1 + _OWN_PAST - lag : motion.size - lag] for lag in lags]
+    of_output = np.column_stack([steady, *past_of_output])
+    of_itself = np.column_stack(
+        [changes[_OWN_PAST - lag : changes.size - lag] for lag in range(1, _PAST_OF_CAUSE + 1)]
+    )
+    target = changes[_OWN_PAST:]
+    unexplained = []
+    for rows in (of_output, of_itself):
+        solution = np.linalg.lstsq(rows, target, rcond=None)[0]
+        unexplained.append(float(np.linalg.norm(target - rows @ solution)))
+    size = float(np.linalg.norm(target))
+    return unexplained[0] <= _LAW_ERROR * size and unexplained[0] <= 0.1 * unexplained[1]
 
 
 def _without_line(signal: RealArray) -> RealArray:
@@ -617,6 +701,25 @@ def saturated(records: Sequence[Record]) -> list[Finding]:
     return findings
 
 
+def still_references(records: Sequence[Record]) -> list[Finding]:
+    """Findings REFERENCE_STILL, on every record whose references all stand still; often empty.
+
+    A loop is opened by its reference only where that moves in every record.
+    """
+    findings = []
+    for record in records:
+        if record.reference is not None and not np.any(np.ptp(record.reference, axis=0)):
+            findings.append(
+                finding(
+                    FindingKind.REFERENCE_STILL,
+                    record=record.label,
+                    name=record.reference_names[0],
+                    value=float(record.reference[0, 0]),
+                )
+            )
+    return findings
+
+
 def few_readings(records: Sequence[Record]) -> list[Finding]:
     """Findings FEW_READINGS, on every record whose output takes fewer than `_FEW_READINGS` values; often
     empty."""
@@ -674,15 +777,19 @@ def early_checks(order: int = 0, *, loop: bool = False) -> list[EarlyCheck]:
     Returns
     -------
     list of EarlyCheck
-        Eight, or nine with the one of a loop.
+        Nine, or ten with the one of a loop.
     """
     checks = [
-        EarlyCheck("more samples than a residual test needs", partial(too_few_samples, order=order)),
+        EarlyCheck(
+            "more samples than a residual test needs", partial(too_few_samples, order=order, in_loop=loop)
+        ),
         STILL_INPUT,
         STILL_OUTPUT,
         EarlyCheck("the command moves before the end", late_command),
         EarlyCheck("more than one step of the sensor", two_readings),
         EarlyCheck("the output leaves its place", resting_output),
+        # Before copies: of a P controller alone the command is the output's copy.
+        EarlyCheck("something moves a loop", undriven_loop),
         EarlyCheck("the output is no other column again", copied_column),
         EarlyCheck("the output answers", no_answer),
     ]

@@ -71,6 +71,7 @@ class FindingKind(Enum):
     EXCHANGED = auto()
     OPPOSITE = auto()
     UNIT_OF_REFERENCE = auto()
+    REFERENCE_STILL = auto()
     FEW_SAMPLES = auto()
     UNKNOWN_TIME_CONSTANT = auto()
     UNKNOWN_DAMPING = auto()

@@ -304,7 +304,8 @@ def _local_ratio(spectra: Spectra, groups: IntArray, level: float) -> tuple[Comp
 def over_lines(power: RealArray) -> RealArray:
     """Return the mean of every line of a power spectrum (F,) and its 24 neighbours, (F,).
 
-    Lines beyond the ends count as zero, so that the mean falls off within 12 lines of them. Fewer than 25
-    lines give 25 values, not F; not checked.
+    Lines beyond the ends count as zero, so that the mean falls off within 12 lines of them. Of fewer than 25
+    lines the mean is over as many as there are. ValueError of NumPy for none.
     """
-    return np.convolve(power, np.full(SMOOTHED_LINES, 1 / SMOOTHED_LINES), "same")
+    width = min(SMOOTHED_LINES, power.size)
+    return np.convolve(power, np.full(width, 1 / width), "same")

@@ -115,7 +115,7 @@ class Roles:
     reference : str or None
         What the output should be; None where no column looks like it.
     doubts : tuple of Finding
-        On a column that would be the reference, were it in the output's unit.
+        On a column that would be the reference, were it in the output's unit, or did it not stand still.
     """
 
     time: str | None
@@ -215,9 +215,34 @@ def roles_of(table: Table, log: str, command: str = "identify", **stated: str | 
         _ask(table, f"flexlink {command} {log}", named, inputs, outputs, wished, left)
 
     roles = Roles(time, input_, output, stated.get("reference"))
-    if roles.reference or not wished:
+    if roles.reference:
         return roles
+    if not wished:
+        return replace(roles, doubts=tuple(_still_references(table, roles, stated)))
     return _with_reference(table, roles, wished, f"flexlink {command} {log} {_typed(stated)}".rstrip())
+
+
+def _still_references(table: Table, roles: Roles, stated: Mapping[str, str | None]) -> list[Finding]:
+    """Findings REFERENCE_STILL, on columns that a name calls a set point of the output's kind, and that stand
+    still: they are no signal, and the loop that they tell of is not opened by them.
+
+    Set points of another quantity, as of a current, and columns that the user stated are passed over.
+    """
+    findings = []
+    for name in table.names:
+        if name in (roles.time, roles.input, roles.output, *stated.values()) or is_time(table, name):
+            continue
+        if (
+            _is_signal(table, name)
+            or not _is_wished(table, name)
+            or kind_of(table.unit(name)) in _DRIVEN_KINDS
+        ):
+            continue
+        if _quantity(table, name) != _quantity(table, roles.output):
+            continue
+        value = float(table.columns([name])[name][0])
+        findings.append(finding(FindingKind.REFERENCE_STILL, name=name, value=value, record=""))
+    return findings
 
 
 def _with_reference(table: Table, roles: Roles, wished: Sequence[str], typed: str) -> Roles:

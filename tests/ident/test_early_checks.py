@@ -10,6 +10,8 @@ from ident import Record
 from ident.checks import early_checks
 from ident.checks.early_checks import copied_column, early_doubts, refuse_hopeless
 from ident.data.finding import FindingKind
+from ident.data.record_files import read_table
+from ident.data.roles import roles_of
 
 N = 3000
 DT_S = 0.005
@@ -222,3 +224,104 @@ def test_a_reference_that_was_logged_as_the_output_is_told_however_late(late, wh
     # A servo that follows to a thousandth is none.
     near = replace(record, output=record.output * (1 + 1e-3 * rng.standard_normal((3000, 1))))
     assert copied_column([near]) == ""
+
+
+def of_loop(seed=0, *, drive=0.0, integral=0.0, rows=N):
+    """A loop whose reference stands still after row 0; the sensor's noise, and `drive`, move its command."""
+    rng = np.random.default_rng(seed)
+    added = drive * held(rng, 4)
+    signals = {"r": np.full(N, 0.7), "u": np.zeros(N), "y": np.zeros(N)}
+    position = speed = summed = 0.0
+    for k in range(N):
+        signals["y"][k] = position + 1e-2 * rng.standard_normal()
+        error = signals["r"][k] - signals["y"][k]
+        summed += integral * error
+        signals["u"][k] = 0.3 * error + summed + added[k]
+        speed += 0.1 * (signals["u"][k] - speed)
+        position += 0.2 * speed + 0.01 * rng.standard_normal()
+    return {name: column[:rows] for name, column in signals.items()}
+
+
+@pytest.mark.parametrize("integral", [0.0, 0.003])
+@pytest.mark.parametrize("digits", [9, 6])
+def test_a_command_that_the_controller_makes_of_the_output_alone_tells_no_machine(integral, digits):
+    """A P and a PI loop at a standing reference, moved by noise and an unseen load."""
+    still = {name: np.round(column, digits) for name, column in of_loop(integral=integral).items()}
+    said = complaint(record(still))
+    assert "the reference 'r' stands still" in said
+    assert "makes of 'y' alone" in said
+    # What is added to the command tells of the machine: no refusal, but a word.
+    driven = record(of_loop(integral=integral, drive=0.5))
+    assert complaint(driven) == ""
+    (doubt,) = [found for found in early_doubts([driven]) if found.kind is FindingKind.REFERENCE_STILL]
+    assert doubt.values["name"] == "r"
+    assert doubt.values["value"] == pytest.approx(0.7)
+
+
+def test_one_still_reference_among_moving_ones_is_doubted():
+    records = [record(looped(1)), record(of_loop(2, drive=0.5)), record(looped(3))]
+    assert complaint(*records) == ""
+    kinds = [found.kind for found in early_doubts(records)]
+    assert kinds == [FindingKind.REFERENCE_STILL]
+
+
+@pytest.mark.parametrize(
+    ("rows", "in_loop", "words"),
+    [
+        (60, True, "60 samples are too few to tell a machine from the loop"),
+        (96, True, "expected more than 96 in one log"),
+        (50, False, "50 samples are too few"),
+        (60, False, ""),
+    ],
+)
+def test_a_loop_needs_more_samples_than_a_machine_alone(rows, in_loop, words):
+    signals = looped() if in_loop else opened()
+    said = complaint(record({name: column[:rows] for name, column in signals.items()}), loop=in_loop)
+    assert words in said
+    assert bool(said) == bool(words)
+
+
+def test_a_short_loop_is_not_called_a_limit_cycle():
+    """A hundred rows of a fast log hold a swing or two: that is too short, whatever its spectrum."""
+    turn = 2 * np.pi * 2 * np.arange(120) / 120
+    fast = {"r": np.sin(turn), "u": np.sin(turn + 1), "y": np.sin(turn - 1)}
+    said = complaint(record(fast), loop=True)
+    assert "120 samples" in said
+    assert "record longer" in said
+    assert "limit cycle" not in said
+
+
+def test_a_command_that_stands_at_its_ends_is_named_as_the_reason_where_it_turns_seldom():
+    """Saturated by huge slow steps; saturated by fast ones it turns often, and a model can be found."""
+    rng = np.random.default_rng(4)
+    slow = looped(limit=0.05) | {"r": 30 * held(rng, 1000)}
+    fast = looped(limit=0.05)
+    for signals in (slow, fast):
+        position = speed = 0.0
+        for k in range(N):
+            signals["y"][k] = position + 1e-3 * rng.standard_normal()
+            signals["u"][k] = np.clip(0.5 * (signals["r"][k] - signals["y"][k]), -0.05, 0.05)
+            speed += 0.1 * (signals["u"][k] - speed)
+            position += 0.2 * speed
+    said = complaint(record(slow), loop=True)
+    assert "stands at -0.05 or 0.05" in said
+    assert "smaller reference" in said
+    assert complaint(record(fast), loop=True) == ""
+    assert [found.kind for found in early_doubts([record(fast)])] == [FindingKind.SATURATED]
+
+
+@pytest.mark.parametrize(
+    ("name", "is_named"), [("ref_rad", True), ("pos_soll_rad", True), ("i_ref_A", False), ("gear", False)]
+)
+def test_a_set_point_of_the_output_that_stands_still_is_not_dropped_in_silence(tmp_path, name, is_named):
+    """A constant column is no reference, but one that is called so is named; others are passed over."""
+    path = tmp_path / "log.csv"
+    rows = np.column_stack(
+        [np.arange(200) * DT_S, opened()["u"][:200], opened()["y"][:200], np.full(200, 0.25)]
+    )
+    np.savetxt(path, rows, delimiter=",", header=f"t_s,u_V,pos_rad,{name}", comments="")
+    roles = roles_of(read_table(path), str(path))
+    assert (roles.input, roles.output, roles.reference) == ("u_V", "pos_rad", None)
+    assert [dict(doubt.values) for doubt in roles.doubts] == [
+        {"name": name, "value": 0.25, "record": ""} for _ in range(is_named)
+    ]

@@ -51,6 +51,7 @@ OTHERWISE = {
     "TIME_UNIT": [{"in_header": ""}, {"in_header": "ms", "dt_s": 2e-6}],
     "UNIT_OF_LOOP": [{"options": "--scale y=57.3 --unit y=rad"}],
     "UNIT_OF_REFERENCE": [{"same": True, "options": "--reference y --unit y=deg"}],
+    "REFERENCE_STILL": [{"record": ""}],
     "REPAIRED": [{"missing": 0}],
     "SKIPPED_ROWS": [{"rows": 1}],
     "CONTROLLER_PERIOD": [{"reference": ""}, {"repeats": True}],

@@ -31,6 +31,7 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.changed_specification import with_typed
 from workflow.tasks.early_refusals import (
+    fitted_records,
     naming_readings,
     refuse_constant_input,
     refuse_hopeless_logs,
@@ -318,7 +319,7 @@ def read_channel(
         how = how.model_copy(update={"resample_s": float(f"{repeats * records[0].dt_s:.9g}")})
         records = how.records(tables)
     if drafted:
-        fitted = records[:-1] or records
+        fitted = fitted_records(records)
         in_loop = all(record.reference is not None for record in fitted)
         with naming_readings(fitted):
             refuse_hopeless_logs(fitted, progress, loop=in_loop)

@@ -16,6 +16,7 @@ from ident.command_timing import CommandTiming, timing_of
 from ident.data.arrays import clipped_share
 from ident.data.record import Record
 from ident.friction import recorded_in_loop
+from workflow.tasks.early_refusals import split_sample
 from workflow.tasks.first_look import (
     TOLD,
     FirstLook,
@@ -39,9 +40,6 @@ _EFFORT_GIVES_WAY = 4.0
 _PEAK_GIVES_WAY = 2.0
 # An unstable pole has to be left behind by the bandwidth, by this factor.
 _BEYOND_UNSTABLE = 2.5
-# Of one log the last part validates, where that leaves so many samples and the parts are driven alike within
-# a factor of two.
-_FITTED, _FEWEST = 0.7, 1000
 # Both ends of the command stand at one limit within this.
 _SAME_LIMIT = 1e-3
 # A limit that the motion shows is known to this share.
@@ -117,7 +115,7 @@ def draft_of(
         look,
         position,
         in_loop,
-        _split(records[0]) if len(records) == 1 else None,
+        split_sample(records[0]) if len(records) == 1 else None,
         reached,
         at_limit is not None,
         unseen is not None,
@@ -191,15 +189,6 @@ def _limit(records: Sequence[Record]) -> float | None:
         return None
     low, high = min(float(u.min()) for u in clipped), max(float(u.max()) for u in clipped)
     return high if abs(high + low) <= _SAME_LIMIT * high else None
-
-
-def _split(record: Record) -> int | None:
-    """First sample of the part of one log that validates; None where a part would be too short or still."""
-    at = round(_FITTED * record.n_samples)
-    if record.n_samples - at < _FEWEST:
-        return None
-    first, second = (float(np.std(part)) for part in (record.input[:at], record.input[at:]))
-    return at if 0.5 < second / first < 2 else None
 
 
 def _unstable_per_s(look: FirstLook) -> float:

@@ -29,12 +29,45 @@ _SAID_AT_ONCE = frozenset(
         FindingKind.EXCHANGED,
         FindingKind.OPPOSITE,
         FindingKind.UNIT_OF_REFERENCE,
+        FindingKind.REFERENCE_STILL,
         FindingKind.UNIT_CONTRADICTED,
     }
 )
 
 # Findings on readings that are none: what is identified from them is of no machine.
 _NO_READINGS = frozenset({FindingKind.SPIKES, FindingKind.NO_READING})
+
+
+# Share of one log that is fitted: its last part validates. Chosen, as is usual for one log.
+_FITTED_SHARE = 0.7
+# Samples of that last part at least: of fewer a free run says little. Chosen; half as many validate on part
+# of a period of a slow reference.
+_FEWEST_VALIDATING = 1000
+
+
+def split_sample(record: Record) -> int | None:
+    """First sample of the part of one log that validates; None where there is none.
+
+    That is where the part would have fewer than `_FEWEST_VALIDATING` samples, or its input not half to twice
+    the standard deviation of the first part. An input that stands still in the first part divides by zero.
+    """
+    at = round(_FITTED_SHARE * record.n_samples)
+    if record.n_samples - at < _FEWEST_VALIDATING:
+        return None
+    first = float(np.std(record.input[:at]))
+    second = float(np.std(record.input[at:]))
+    return at if 0.5 < second / first < 2 else None
+
+
+def fitted_records(records: Sequence[Record]) -> list[Record]:
+    """Of logs without stated roles those that a model is fitted to: all but the last, which validates, or the
+    first part of a single one; a single one whose input stands still as it is."""
+    if len(records) > 1:
+        return list(records[:-1])
+    record = records[0]
+    if np.ptp(record.input) == 0 or np.ptp(record.input[: round(_FITTED_SHARE * record.n_samples)]) == 0:
+        return [record]
+    return [record.slice(0, split_sample(record) or record.n_samples)]
 
 
 @contextmanager

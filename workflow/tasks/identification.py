@@ -10,7 +10,7 @@ import numpy as np
 
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.checks.distortion_findings import amplitude_effects
-from ident.checks.early_checks import clipped, few_readings, saturated
+from ident.checks.early_checks import clipped, early_doubts
 from ident.checks.plausible_modes import pairs_outside
 from ident.checks.residual_tests import fed_back, independence_test
 from ident.checks.validation import fit_in_windows, fit_on_fresh_data
@@ -205,7 +205,7 @@ def identify_channel(
     fresh = [(as_fitted(record, channel, friction), role) for record, role in unseen]
     doubted = (*measured, *(record for record, _ in unseen))
     doubts = [doubt for record in doubted for doubt in record.doubts]
-    doubts = list(distinct([*doubts, *saturated(measured), *few_readings(measured)]))
+    doubts = list(distinct([*doubts, *early_doubts(measured)]))
 
     def fitted(opened: TwoStage | None, closed_loop: Finding | None = None) -> IdentifiedChannel:
         if opened is None:
