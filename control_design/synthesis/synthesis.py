@@ -18,13 +18,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from control_design.analysis.certificate import loop_margins
 from control_design.analysis.limited_loop import limited_loops, with_safe_limits
 from control_design.analysis.stability import closed_loop_poles
+from control_design.analysis.worst_case import worst_case
 from control_design.controllers.biquads import Cascade, Section
 from control_design.controllers.controller import Controller
 from control_design.controllers.parts import NotchPart
 from control_design.convex.convex_options import YoulaOptions
-from control_design.plants.ellipses import Real, scale_to_minus_one
+from control_design.plants.ellipses import Complex, Real, scale_to_minus_one
 from control_design.plants.frequency_grid import local_maxima
 from control_design.plants.guards import Guard
 from control_design.plants.plant_set import UncertainPlant, modes_of
@@ -273,18 +275,51 @@ def _of_lowest_order(problem: Problem, root: int, tell: Progress, *, thorough: b
         reports += search.reports
         if again.best is not None and again.best.gamma < chosen.gamma:
             result = again
-    if not _damps_modes(problem, search.cascade, result):
-        # Gamma does not see the damping of the nominal loop's modes, which the certificate asks for. An order
-        # that meets both is known, if not as near to the bound.
+    if not _meets_beside_gamma(problem, search.cascade, result):
+        # Gamma does not see the damping of the nominal loop's modes and the delay margin, which the
+        # certificate asks for. An order that meets all may be known, if not as near to the bound.
         meeting = [
             number
             for number, attempt in tried_orders.items()
-            if attempt.gamma <= 1.0 and _damps_modes(problem, attempt.search.cascade, attempt.result)
+            if attempt.gamma <= 1.0 and _meets_beside_gamma(problem, attempt.search.cascade, attempt.result)
         ]
         if meeting:
             search = tried_orders[min(meeting)].search
             result = tried_orders[min(meeting)].result
     return _result(problem, search.cascade, result, tuple(reports), tell)
+
+
+def _meets_beside_gamma(problem: Problem, cascade: Cascade, result: OrderResult) -> bool:
+    """Whether a controller meets what the certificate asks for and gamma does not hold.
+
+    That is the damping of the nominal loops' modes, and the delay margin over the ellipses. False without a
+    controller, where either is asked.
+    """
+    return _damps_modes(problem, cascade, result) and _bears_delay(problem, cascade, result)
+
+
+def _bears_delay(problem: Problem, cascade: Cascade, result: OrderResult) -> bool:
+    """Whether the worst delay margin over the ellipses is the one that is asked, as the certificate checks.
+
+    True where none is asked, False without a controller.
+    """
+    asked_s = problem.spec.delay_margin_s
+    if asked_s is None:
+        return True
+    if result.best is None:
+        return False
+    controller = problem.controller(cascade, result.best.parameters)
+
+    def response(omega_rad_s: Real) -> Complex:
+        """The controller without its delay."""
+        return controller.response(omega_rad_s, with_delay=False)
+
+    for plant, data in zip(problem.plants, problem.dense, strict=True):
+        worst = worst_case(response, plant, problem.spec, data.ellipses.omega_rad_s)
+        # A loop that is not stable has a margin of nan.
+        if not loop_margins(controller, plant, worst)[1].delay_s >= asked_s:
+            return False
+    return True
 
 
 def _damps_modes(problem: Problem, cascade: Cascade, result: OrderResult) -> bool:
@@ -577,6 +612,13 @@ def what_destabilises(problem: Problem, cascade: Cascade, parameters: Real) -> t
             frequency = float(np.abs(np.log(pole))) / problem.dt_s
             point = BlockingPoint(plant.name, NOMINAL, frequency, np.inf)
             unstable_poles.append((-float(np.abs(pole)), point))
+
+    if not unstable_poles:
+        for number, poles in problem.unstable_when_late(cascade, parameters):
+            for pole in poles[(np.abs(poles) >= 1.0) & (poles.imag >= 0) & np.isfinite(poles)]:
+                frequency = float(np.abs(np.log(pole))) / problem.dt_s
+                point = BlockingPoint(problem.plants[number].name, DELAYED, frequency, np.inf)
+                unstable_poles.append((-float(np.abs(pole)), point))
 
     ellipses_over: list[tuple[float, BlockingPoint]] = []
     for _, data in problem.checks(cascade, parameters):

@@ -6,6 +6,7 @@ import control
 import numpy as np
 import pytest
 
+from control_design.analysis.certificate import certify
 from control_design.convex.youla import youla_bracket
 from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.stated_uncertainty import StatedDiscs
@@ -129,3 +130,40 @@ def test_an_order_that_misses_the_damping_of_the_modes_gives_way_to_one_that_mee
     found = synthesise([lag(0.5)], auto(WISH), rng=np.random.default_rng(7))
     assert found.controller.order != free
     assert found.gamma <= 1.0
+
+
+def resonance(seed: int) -> tuple[UncertainPlant, Specification]:
+    """A lag with a mode at random, 5 % around it, and a delay margin that is asked in vain of a fast loop."""
+    rng = np.random.default_rng(seed)
+    mode_rad_s = 10 ** rng.uniform(0.3, 1.0)
+    damping = 10 ** rng.uniform(-2.0, -0.5)
+    bandwidth_rad_s = 10 ** rng.uniform(-0.3, 0.3)
+    lagging = control.tf([1.0], [10 ** rng.uniform(-1.0, 0.3), 1.0])
+    mode = control.tf([mode_rad_s**2], [1.0, 2 * damping * mode_rad_s, mode_rad_s**2])
+    nominal = control.sample_system(control.ss(lagging + 0.3 * mode), 0.02)
+    discs = StatedDiscs(nominal, RationalWeight(numerator=(0.05,), denominator=(1.0,)), "multiplicative")
+    asked = Specification(
+        bandwidth_rad_s=bandwidth_rad_s,
+        modulus_margin=0.4,
+        effort_limit=30.0,
+        integrator=True,
+        delay_margin_s=0.6 / bandwidth_rad_s,
+        controller_order="auto",
+    )
+    return UncertainPlant("arm", nominal, discs), asked
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.long) for k in (1, 3))])
+def test_a_delay_margin_that_is_stated_is_met_at_the_order_that_is_chosen(seed):
+    """A loop may keep away from -1 behind the whole delay, and have turned around it at a shorter one."""
+    plant, asked = resonance(seed)
+    found = synthesise([plant], asked, rng=np.random.default_rng(seed), thorough=False)
+    assert found.gamma <= 1.0
+    (item,) = [one for one in certify(found.controller, [plant], asked).items if "delay" in one.requirement]
+    assert item.met
+    # Without the margin a simpler or faster loop is found, that does not bear the delay.
+    free = auto(asked, delay_margin_s=None)
+    quicker = synthesise([plant], free, rng=np.random.default_rng(seed), thorough=False)
+    items = certify(quicker.controller, [plant], asked).items
+    assert not all(one.met for one in items if "delay" in one.requirement)
