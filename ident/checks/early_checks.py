@@ -56,6 +56,11 @@ _LAW_ERROR = 1e-3
 # design.
 _FEW_READINGS = 10
 
+# Rows over which half of the readings are held at least, for a sensor that holds them: of one row none is.
+_FEWEST_HELD = 2
+# Changes of up to so many times the smallest one are a step of an encoder: between one step and two.
+_STEPS_OF_ONE = 1.5
+
 # Share of samples (half): a command of a loop that stands at its ends more often than not follows no linear
 # law there.
 _MOSTLY = 0.5
@@ -146,13 +151,19 @@ def refuse_hopeless(records: Sequence[Record], checks: Sequence[EarlyCheck]) -> 
 
 
 def early_doubts(records: Sequence[Record]) -> list[Finding]:
-    """Findings SATURATED, REFERENCE_STILL, then FEW_READINGS, on records that can be used but hardly are what
-    was meant.
+    """Findings SATURATED, REFERENCE_STILL, READINGS_HELD, then FEW_READINGS, on records that can be used but
+    hardly are what was meant.
 
-    A command of a loop that mostly stands at its ends, a reference that stands still, an output of few
-    readings; one input and one output each (not checked). Empty where nothing is doubted.
+    A command of a loop that mostly stands at its ends, a reference that stands still, an output that a sensor
+    holds, an output of few readings; one input and one output each (not checked). Empty where nothing is
+    doubted.
     """
-    return [*saturated(records), *still_references(records), *few_readings(records)]
+    return [
+        *saturated(records),
+        *still_references(records),
+        *held_readings(records),
+        *few_readings(records),
+    ]
 
 
 def too_few_samples(records: Sequence[Record], order: int = 0, *, in_loop: bool = False) -> str:
@@ -715,6 +726,45 @@ def still_references(records: Sequence[Record]) -> list[Finding]:
                     record=record.label,
                     name=record.reference_names[0],
                     value=float(record.reference[0, 0]),
+                )
+            )
+    return findings
+
+
+def held_readings(records: Sequence[Record]) -> list[Finding]:
+    """Findings READINGS_HELD, on every record whose output is a sensor's last reading, held over varying
+    numbers of rows.
+
+    Attributes of each: `fewest` and `most` rows (of nine holds in ten), `from_rad_s`: above it nothing is
+    told, the inverse of the longest of these holds, where a hold alone turns the phase by a radian. Empty
+    where there is none.
+
+    Notes
+    -----
+    A coarse encoder repeats its readings, too, but then moves on by one of its steps; what a sensor held
+    meanwhile jumps by several of them, or has no steps. A reading that is held over one and the same number
+    of rows is a logger's, which the reader takes as a coarser log.
+    """
+    findings = []
+    for record in records:
+        output = record.output[:, 0]
+        changes = np.flatnonzero(np.diff(output))
+        rows = np.diff(changes)
+        if rows.size < FEWEST_SAMPLES:
+            continue
+        fewest, usual, most = (int(np.percentile(rows, share)) for share in (5, 50, 95))
+        jumps = np.abs(np.diff(output)[changes])
+        # The step of a coarse encoder is the size of most of its changes; rounding is no step.
+        steps = np.count_nonzero(jumps < _STEPS_OF_ONE * jumps.min())
+        if usual >= _FEWEST_HELD and most > fewest and steps < _MOSTLY * jumps.size:
+            findings.append(
+                finding(
+                    FindingKind.READINGS_HELD,
+                    record=record.label,
+                    name=record.output_names[0],
+                    fewest=fewest,
+                    most=most,
+                    from_rad_s=1 / (most * record.dt_s),
                 )
             )
     return findings

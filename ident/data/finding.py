@@ -80,6 +80,7 @@ class FindingKind(Enum):
     CLIPPED = auto()
     SATURATED = auto()
     FEW_READINGS = auto()
+    READINGS_HELD = auto()
     SLOW_POLE_IS_DRIFT = auto()
     DRIFT = auto()
     FAR_FROM_ZERO = auto()

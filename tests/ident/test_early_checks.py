@@ -325,3 +325,42 @@ def test_a_set_point_of_the_output_that_stands_still_is_not_dropped_in_silence(t
     assert [dict(doubt.values) for doubt in roles.doubts] == [
         {"name": name, "value": 0.25, "record": ""} for _ in range(is_named)
     ]
+
+
+def held_speed(edges, *, seed=0, rows=4000):
+    """Speed of a driven shaft (u to v), and what a Hall sensor with so many edges a turn tells of it."""
+    rng = np.random.default_rng(seed)
+    command = 1.0 + 0.1 * held(rng, 40, rows)
+    speed = 40 * lfilter([0.005], [1, -0.995], command - 1.0) + 40.0
+    angle = np.cumsum(speed) * DT_S / 10
+    edge = np.floor(angle / (2 * np.pi / edges))
+    signals = {"u": command, "y": speed.copy()}
+    last = 0
+    reading = speed[0]
+    for k in range(1, rows):
+        if edge[k] > edge[k - 1]:
+            reading = (angle[k] - angle[last]) / (k - last)
+            last = k
+        signals["y"][k] = reading
+    return signals
+
+
+@pytest.mark.parametrize("edges", [24, 42, 60])
+def test_readings_that_a_sensor_holds_are_doubted_with_the_rate_it_tells(edges):
+    logged = record(held_speed(edges))
+    assert complaint(logged) == ""
+    (doubt,) = [found for found in early_doubts([logged]) if found.kind is FindingKind.READINGS_HELD]
+    rows = 2 * np.pi / edges / (40.0 * DT_S / 10)  # between two edges at the mean speed
+    assert doubt.values["fewest"] <= rows <= doubt.values["most"] + 1
+    assert doubt.values["from_rad_s"] == pytest.approx(1 / (doubt.values["most"] * DT_S))
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-3, 0.05])
+def test_a_coarse_encoder_holds_nothing(step):
+    """It repeats readings, too, near standstill; but goes on by a step."""
+    signals = opened()
+    output = lfilter([0.02], [1, -0.98], signals["u"])
+    if step:
+        output = step * np.round(output / step)
+    kinds = [found.kind for found in early_doubts([record(signals | {"y": output})])]
+    assert FindingKind.READINGS_HELD not in kinds

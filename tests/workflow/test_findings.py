@@ -43,7 +43,7 @@ VALUES = {
     "nyquist_rad_s": 1571.0, "largest_below": 1.2, "gain_at_high": 0.0063, "gain_at_nyquist": 0.0007,
     "largest_above": 0.0063, "largest_above_rad_s": 400.0, "direct_term": 0.000366,
     "outside_percent": 51.0, "at_rad_s": 12.0, "same": False, "step_s": 0.002, "repeats": False,
-    "level_std": 0.02, "ratio": 1.4,
+    "level_std": 0.02, "ratio": 1.4, "fewest": 6, "most": 13, "from_rad_s": 143.2,
 }  # fmt: skip
 # Other values that lead to other words.
 OTHERWISE = {

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
-from ident.checks.early_checks import refuse_few_lines
+from ident.checks.early_checks import held_readings, refuse_few_lines
 from ident.checks.plausible_modes import LIGHT
 from ident.command_timing import CommandTiming, timing_of
 from ident.data.arrays import clipped_share
@@ -54,7 +54,8 @@ class Draft:
     the output's quantisation, 0 without one. specification: keys of [specification]. reference_step: half the
     rms motion, or, beside an unstable pole, what the effort limit answers with the largest command.
     timing: of the command between two rows. recorded_rad_s: bandwidth of the loop that made the logs, 0 where
-    they do not tell it."""
+    they do not tell it. held_rad_s: above it a sensor that holds its readings tells no mode, 0 where none
+    does."""
 
     look: FirstLook
     position: bool
@@ -69,6 +70,7 @@ class Draft:
     unstable_per_s: float
     timing: CommandTiming
     recorded_rad_s: float = 0.0
+    held_rad_s: float = 0.0
 
     @property
     def friction(self) -> bool:
@@ -124,6 +126,7 @@ def draft_of(
         _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
         unstable,
         timing,
+        held_rad_s=min((float(held.values["from_rad_s"]) for held in held_readings(fitted)), default=0.0),
     )
 
 
