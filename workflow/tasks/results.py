@@ -208,6 +208,13 @@ class IdentifyResult:
     channels: tuple[IdentifiedChannel, ...]
     friction: FrictionFit | None = None
 
+    @property
+    def modes_rad_s(self) -> tuple[float, ...]:
+        """Frequencies of the pole pairs of all channels' models that can be modes."""
+        return tuple(
+            mode.omega_rad_s for channel in self.channels for mode in channel.modes if channel.is_mode(mode)
+        )
+
 
 # Ellipses
 

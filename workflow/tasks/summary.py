@@ -94,6 +94,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> tuple[dict[str, Any]
             untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
             conditions,
             config.specification,
+            results.identify.modes_rad_s,
         ),
     )
 
@@ -137,18 +138,30 @@ def verdict_of(
     untold_rad_s: float = 0.0,
     conditions: Sequence[Finding] = (),
     asked: Specification | None = None,
+    modes_rad_s: Sequence[float] | None = None,
 ) -> str:
     """One line: certified, or what is missed, by how much and at which frequency; where the achievable
     performance is given, whether a higher order would help; up to where the ellipses are wider than the
     gain, if they are; what the certificate stands or falls with; and where less than asked was designed for,
-    both."""
+    both. modes_rad_s: of the identified models, of which lost damping is said; None: of all of the plant."""
     advice, untold = "", said("untold", untold_rad_s)
     if achievable is not None and order is not None and design.gamma is not None:
         structure = "biquads" if asked is None else asked.structure
         advice = said("order_advice", achievable, design.gamma, order, structure)
     told = ". Also, ".join(words(doubt) for doubt in conditions)
     given_way = () if asked is None else gave_way(asked, design.specification)
-    return said("run_verdict", design, certify, loop, untold or advice, untold, told, asked, given_way)
+    return said(
+        "run_verdict",
+        design,
+        certify,
+        loop,
+        untold or advice,
+        untold,
+        told,
+        asked,
+        given_way,
+        modes_rad_s,
+    )
 
 
 def timing_numbers(timing: CommandTiming | None) -> dict[str, Any] | None:
