@@ -58,6 +58,37 @@ def behind_drive(fit: FrictionFit) -> GobfModel:
     return replace(empty, coefficients=coefficients)
 
 
+def with_bias_of_free_runs(fit: FrictionFit, records: Sequence[Record]) -> FrictionFit:
+    """A fit whose bias is the one with which free runs of its arm follow the records best.
+
+    Parameters
+    ----------
+    fit : FrictionFit
+        With an observer; in its prediction errors a bias stands for what the start of a record leaves as
+        well, for an observer corrects what a wrong constant force does.
+    records : sequence of Record
+        One input, and the shaft's position as the one output.
+
+    Returns
+    -------
+    FrictionFit
+        The same but for the bias, by least squares over windows (`fit_in_windows`), which are linear in it.
+        The fit itself where a constant force does nothing.
+    """
+    model = behind_drive(fit)
+    free = [fit.taken_off(record) for record in records]
+    before = np.concatenate([fit_in_windows(model, record).residual for record in free])
+    change = max(fit.level, float(np.std(records[0].input)))
+    pushed = [replace(record, input=record.input + change) for record in free]
+    moved = np.concatenate([fit_in_windows(model, record).residual for record in pushed]) - before
+    size = float(moved @ moved)
+    if not size > 0:
+        return fit
+    # A force that is missing in the free run is a bias that was taken off too much.
+    missing = -change * float(moved @ before) / size
+    return replace(fit, bias=fit.bias - missing)
+
+
 def identify_behind(
     found: FrictionFit,
     records: Sequence[Record],

@@ -72,9 +72,6 @@ _CHANGE_OF_LEVEL = 2e-3
 _CHANGE_OF_RESPONSE = 1e-3
 # Factor by which a change grows or shrinks at most from one set of derivatives to the next. Chosen.
 _CHANGE_GROWS = 10.0
-# Error of the mean friction over all logs by the measured direction of the motion, one standard deviation as
-# a share of its level. Chosen: while a shaft sticks its friction is not known.
-_MEAN_FRICTION = 0.1
 # Parts that are levels of a force.
 _LEVELS = ("coulomb_level", "level_at_load", "stribeck_excess", "bias")
 # Part in which the prediction errors are rough: a shaft sticks and slips at other times. A wrong step of it
@@ -286,18 +283,13 @@ class _Problem:
             largest_fall=logs.rms_speed,
             dt_s=logs.dt_s,
         )
-        # Known beforehand: logarithms of the law to their deviation, a bias within the command's rms. An
-        # observer corrects what a wrong bias does, so that its errors hardly tell it; of an integrating arm
-        # the balance of forces over whole records does.
+        # Known beforehand: logarithms of the law to their deviation, a bias within the command's rms.
         expected = parameters.pack()
         expected[names == "log_presliding"] = np.log(logs.presliding)
         expected[names == "bias"] = 0.0
         known_std = np.full(names.size, np.inf)
         known_std[np.isin(names, ("log_presliding", "log_stribeck_speed"))] = STD_LOG
         known_std[names == "bias"] = logs.input_rms
-        if fit.arm.structure.integrators:
-            expected[names == "bias"] = logs.mean_input - fit.level * logs.mean_direction
-            known_std[names == "bias"] = np.hypot(logs.unbalanced, _MEAN_FRICTION * fit.level)
         return cls(logs, parameters, names, lowest, highest, expected, known_std)
 
     def first_changes(self, fit: FrictionFit) -> RealArray:

@@ -20,6 +20,7 @@ from dataclasses import replace
 from ident.basis.options import IdentOptions
 from ident.checks.early_checks import refuse_few_lines
 from ident.data.record import Record
+from ident.friction.behind import with_bias_of_free_runs
 from ident.friction.descent import converged
 from ident.friction.gauss_newton import FrictionFit, LostError, started
 from ident.friction.logs import LoopLogs
@@ -124,7 +125,8 @@ def fit_friction_in_loop(
     fit = converged(fit, whole.thinned(least_steps, best.delay_samples), options).fit
     if least_steps > 1:
         fit = observed(at_step(fit, whole.dt_s), whole.thinned(1, best.delay_samples).records)
-    return with_widths(_complete(fit, best.delay_samples), whole, every=least_steps)
+    fit = with_widths(_complete(fit, best.delay_samples), whole, every=least_steps)
+    return with_bias_of_free_runs(fit, whole.records)
 
 
 def _complete(fit: FrictionFit, delay_samples: int) -> FrictionFit:

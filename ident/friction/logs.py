@@ -16,7 +16,7 @@ import numpy as np
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 from ident.friction.gauss_newton import FrictionFit
-from ident.friction.inverse_dynamics import direction_of, presliding_of, rms_speed, smoothed
+from ident.friction.inverse_dynamics import presliding_of, rms_speed
 from ident.friction.observer import command_per_noise
 
 # Smallest level, as a share of the rms command. A level of a millionth is none: only logarithms and shares of
@@ -74,33 +74,6 @@ class LoopLogs:
         """Rows over which the sensor reads the same while the shaft moves: in the record where these are the
         fewest, the median over its readings."""
         return min(_rows_of_a_reading(record.output[:, 0]) for record in self.records)
-
-    @cached_property
-    def mean_input(self) -> float:
-        """Mean command over all records, units of the input."""
-        return float(np.mean(np.concatenate([record.input[:, 0] for record in self.records])))
-
-    @cached_property
-    def mean_direction(self) -> float:
-        """Mean friction of unit level, in the measured direction of the motion, over all records."""
-        directions = [direction_of(smoothed(record.output[:, 0]), self.presliding) for record in self.records]
-        return float(np.mean(np.concatenate(directions)))
-
-    @cached_property
-    def unbalanced(self) -> float:
-        """How far the mean force on an integrating arm may be from zero, one standard deviation in units of
-        the input.
-
-        It is (J dv + d dq) / T over a record of T seconds, v and q the speed and position at its ends. For a
-        motion of the angular frequency w = v_rms / q_rms both terms are at most about the rms command over
-        w T.
-        """
-        shares = list[float]()
-        for record in self.records:
-            q_rms = float(np.std(record.output[:, 0]))
-            w_rad_s = rms_speed([record]) / max(q_rms, np.finfo(np.float64).tiny)
-            shares.append(1 / max(w_rad_s * record.n_samples * record.dt_s, 1.0))
-        return self.input_rms * float(np.mean(shares))
 
     @property
     def dt_s(self) -> float:
