@@ -73,19 +73,19 @@ def with_bias_of_free_runs(fit: FrictionFit, records: Sequence[Record]) -> Frict
     -------
     FrictionFit
         The same but for the bias, by least squares over windows (`fit_in_windows`), which are linear in it.
-        The fit itself where a constant force does nothing.
+        The fit itself for an arm that does not integrate: there a constant force is an offset of the
+        position.
     """
+    if not fit.arm.structure.integrators:
+        return fit
     model = behind_drive(fit)
     free = [fit.taken_off(record) for record in records]
     before = np.concatenate([fit_in_windows(model, record).residual for record in free])
     change = max(fit.level, float(np.std(records[0].input)))
     pushed = [replace(record, input=record.input + change) for record in free]
     moved = np.concatenate([fit_in_windows(model, record).residual for record in pushed]) - before
-    size = float(moved @ moved)
-    if not size > 0:
-        return fit
     # A force that is missing in the free run is a bias that was taken off too much.
-    missing = -change * float(moved @ before) / size
+    missing = -change * float(moved @ before) / float(moved @ moved)
     return replace(fit, bias=fit.bias - missing)
 
 

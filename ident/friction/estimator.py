@@ -83,9 +83,7 @@ def fit_friction_in_loop(
     starts = list[tuple[IdentOptions, FrictionFit]]()
     for possible in possible_structures(options):
         with suppress(LostError):
-            simple_start = simplest(coarse, possible)
-            if simple_start is not None:
-                starts.append(simple_start)
+            starts.append(simplest(coarse, possible))
     steps = least_steps * min((steps_for(fit, stated, coarse.dt_s) for stated, fit in starts), default=1)
     begun = list[tuple[Search, Candidate]]()
     for structure_options, start_fit in starts:

@@ -33,41 +33,22 @@ LONGEST_DELAY = 20
 _DELAYS_BEYOND = 4
 
 
-class PossibleStructure(NamedTuple):
-    """A structure of the arm that is tried: `thrown_over` where it is one only with an unstable pole."""
-
-    options: IdentOptions
-    thrown_over: bool
-
-
-def possible_structures(options: IdentOptions) -> list[PossibleStructure]:
-    """Each structure of the arm that is possible: that stated, or one integrator, or a weight that throws
-    the arm over."""
+def possible_structures(options: IdentOptions) -> list[IdentOptions]:
+    """Options with each structure of the arm that is possible: that stated, or one integrator, or none: a
+    spring or a weight holds the arm, or throws it over."""
     if options.states("integrators", "unstable_poles"):
-        return [PossibleStructure(options, thrown_over=False)]
-    integrating = options.model_copy(update={"integrators": 1})
-    held_by_weight = options.model_copy(update={"integrators": 0})
-    return [
-        PossibleStructure(integrating, thrown_over=False),
-        PossibleStructure(held_by_weight, thrown_over=True),
-    ]
+        return [options]
+    return [options.model_copy(update={"integrators": integrators}) for integrators in (1, 0)]
 
 
-def simplest(logs: LoopLogs, possible: PossibleStructure) -> tuple[IdentOptions, FrictionFit] | None:
+def simplest(logs: LoopLogs, options: IdentOptions) -> tuple[IdentOptions, FrictionFit]:
     """Options with the unstable poles that show, and a start with the fewest poles, each once, from the
-    measured direction of the motion; without observer.
-
-    None where a weight must throw the arm over and no unstable pole shows, at first or behind the better
-    friction of the start.
-    """
-    options = possible.options
+    measured direction of the motion; without observer."""
     undelayed = options.model_copy(update={"input_delay_samples": 0})
     unstable_sought = not options.integrators and not options.unstable_poles
     if unstable_sought:
         used = _by_direction(logs.thinned(1, options.input_delay_samples), options)[1]
         undelayed = undelayed.with_unstable(find_unstable(used, undelayed))
-        if possible.thrown_over and not undelayed.unstable_poles:
-            return None
 
     # Dead time and lag of the drive together, as a dead time: the arm's poles would take the place of them.
     few = few_poles(undelayed)
@@ -105,8 +86,6 @@ def simplest(logs: LoopLogs, possible: PossibleStructure) -> tuple[IdentOptions,
         fit = converged(fit, shifted, undelayed).fit
         used = [fit.forced(record) for record in shifted.records]
         undelayed = undelayed.with_unstable(find_unstable(used, undelayed))
-        if possible.thrown_over and not undelayed.unstable_poles:
-            return None
         few = few_poles(undelayed)
         model = untested_model([prewhitened(one, long_arx_filter(used, few)) for one in used], moving(few))
         begun = started(model, few.structure(), fit.law)

@@ -21,7 +21,7 @@ from ident.friction.estimator import fit_friction_in_loop
 from ident.friction.gauss_newton import FrictionFit, lag_filter, started
 from ident.friction.kernel import behind_motor
 from ident.friction.logs import LoopLogs
-from ident.friction.loop_start import PossibleStructure, possible_structures, simplest
+from ident.friction.loop_start import simplest
 from ident.friction.observer import observed
 from ident.friction.parameters import FrictionParameters, has_least_damping
 from ident.friction.structure_steps import with_dead_time, with_poles, with_stribeck
@@ -339,24 +339,14 @@ def test_the_bias_is_the_one_of_free_runs() -> None:
     assert abs(told.bias) < 0.1 * fit.level, told.bias
 
 
-def test_an_arm_that_integrates_is_not_thrown_over() -> None:
-    stated = possible_structures(IdentOptions(integrators=0))
-    assert [possible.thrown_over for possible in stated] == [False]
-    integrating, thrown = possible_structures(IdentOptions())
-    assert (integrating.options.integrators, thrown.options.integrators) == (1, 0)
-    assert thrown.thrown_over
-    assert simplest(logs(), thrown) is None
-
-
 def test_a_dead_time_of_five_samples_is_found_from_none() -> None:
     """Poles first take the place of a part of it, so that the next dead time explains less."""
     one = drafted("late", 1, 21)
     got, begin = one.record(0, one.rng(0))
     signals = got["u"][begin:, None], got["y"][begin:, None]
     record = Record("log", *signals, one.plant.dt_s, ("u",), ("y",))
-    started_with = simplest(LoopLogs.of([record]), PossibleStructure(IdentOptions(integrators=1), False))
-    assert started_with is not None
-    assert started_with[0].input_delay_samples == one.plant.delay == 5
+    stated, _ = simplest(LoopLogs.of([record]), IdentOptions(integrators=1))
+    assert stated.input_delay_samples == one.plant.delay == 5
 
 
 def test_a_pair_without_damping_is_a_line_unless_it_was_stated() -> None:

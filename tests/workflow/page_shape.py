@@ -16,8 +16,8 @@ _FIRST = """(() => {
     numbers: [...document.querySelectorAll(".numbers > div")].length,
     numbers_end: place(".numbers")?.bottom ?? 0,
     bullets: document.querySelectorAll(".bullets > li").length,
-    picture: [place(".plot > svg.part, .plot > svg:not(.part)"), place(".plot > svg.part")]
-      .filter(box => box?.height).map(box => box.bottom)[0] ?? 1e9,
+    picture: [...document.querySelectorAll(".plot > svg")].map(image => image.getBoundingClientRect())
+      .filter(box => box.height).map(box => box.bottom)[0] ?? 1e9,
     headline: lines.getBoundingClientRect().height / parseFloat(getComputedStyle(lines).lineHeight),
   };
 })()"""

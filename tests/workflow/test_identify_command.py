@@ -338,7 +338,10 @@ def test_integers_called_seconds_are_doubted(refused, tmp_path):
         (("--input-limit", "0"), "--input-limit: input should be greater than 0"),
         (("--level", "0.2"), "flexlink: --level: input should be greater than 0.5"),
         (("--pairs", "13"), "flexlink: --pairs: input should be less than or equal to 12, got 13"),
-        (("--response", "amplitude 2"), "should be 'as recorded', 'without friction' or 'this amplitude'"),
+        (
+            ("--response", "amplitude 2"),
+            "should be 'as recorded', 'without friction', 'without remote friction' or 'this amplitude'",
+        ),
         (("--response", "this amplitude", "--band", "10", "20"), "takes records as measured: no increments"),
         (("--band", "50", "20"), "a band needs 0 < low < high in rad/s; got 50, 20"),
         (("--band", "50", "2000"), "the band must lie in (0, 628"),
