@@ -28,7 +28,7 @@ import numpy as np
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.plausible_modes import LIGHT
+from ident.checks.plausible_modes import FEWEST_PERIODS, LIGHT
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.friction.arm import less_friction
@@ -160,7 +160,8 @@ def remote_friction(records: Sequence[Record], model: GobfModel) -> RemoteFricti
         One line: the model has no light mode, or no friction is found.
     """
     name = records[0].output_names[0]
-    first_Hz = _first_Hz(model)
+    longest_s = max(record.n_samples for record in records) * model.dt_s
+    first_Hz = _first_Hz(model, longest_s)
     if first_Hz is None:
         raise ValueError(f"no light mode lies between a shaft with friction and '{name}'")
     presliding = _COARSE * presliding_of(records)
@@ -198,10 +199,12 @@ def remote_friction(records: Sequence[Record], model: GobfModel) -> RemoteFricti
     return _of_level(motions, ratio, presliding, level, std_share, delay_samples, is_told)
 
 
-def _first_Hz(model: GobfModel) -> float | None:
-    """Frequency of the first light mode, Hz; None where there is none."""
+def _first_Hz(model: GobfModel, longest_s: float) -> float | None:
+    """Frequency of the first light mode that has some periods in a record of so many seconds, Hz; None where
+    there is none."""
     rates = model.poles.omega_rad_s(model.dt_s)
-    light = rates[model.poles.zeta() < LIGHT]
+    is_mode = (model.poles.zeta() < LIGHT) & (rates * longest_s >= 2 * np.pi * FEWEST_PERIODS)
+    light = rates[is_mode]
     if not light.size:
         return None
     return float(np.min(light)) / (2 * np.pi)

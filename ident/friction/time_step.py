@@ -61,7 +61,7 @@ def at_step(fit: FrictionFit, dt_s: float) -> FrictionFit:
     Parameters
     ----------
     fit : FrictionFit
-        Without dead time and unstable poles.
+        Without dead time.
     dt_s : float
         The new step, s.
 
@@ -74,14 +74,17 @@ def at_step(fit: FrictionFit, dt_s: float) -> FrictionFit:
     ratio = dt_s / fit.model.dt_s
     if ratio == 1:
         return fit
-    arm = SteppedArm.of(_power(fit.model.poles, ratio), fit.arm.structure, dt_s, doubled=False)
+    structure = replace(fit.arm.structure, unstable=_power(fit.arm.structure.unstable, ratio))
+    arm = SteppedArm.of(_power(fit.model.poles, ratio), structure, dt_s, doubled=False)
     # Both arms are sums of the same states in continuous time, but for those that are gone within a sample.
     omega = np.geomspace(*_FITTED_SHARES, _N_FITTED) * np.pi / max(dt_s, fit.model.dt_s)
     response = fit.arm.continuous_response(omega) @ fit.coefficients
     basis = arm.continuous_response(omega) / response[:, None]
     target = np.ones(omega.size, np.complex128)
     coefficients = np.asarray(np.linalg.lstsq(real_rows(basis), real_rows(target), rcond=None)[0])
-    model = replace(fit.model, poles=arm.poles, coefficients=coefficients, dt_s=dt_s)
+    model = replace(
+        fit.model, poles=arm.poles, coefficients=coefficients, dt_s=dt_s, unstable=structure.unstable
+    )
     return replace(
         fit,
         model=model,
