@@ -354,3 +354,19 @@ def test_a_pair_without_damping_is_a_line_unless_it_was_stated() -> None:
     assert has_least_damping(zeta, IdentOptions()).tolist() == [True, False]
     assert not has_least_damping(zeta, IdentOptions(n_pairs=2)).any()
     assert not has_least_damping(zeta, IdentOptions(zeta_min=1e-3)).any()
+
+
+def test_an_arm_that_is_thrown_over_grows_as_fast_at_another_step() -> None:
+    """Growth of 2 / s and a pole that decays at 5 / s, at a step five times as long and back."""
+    image = Poles(np.array([np.exp(-2.0 * DT_S)]))
+    structure = IdentOptions(integrators=0).with_unstable(image).structure()
+    poles = Poles(np.exp(-np.array([2.0, 5.0]) * DT_S))
+    model = GobfModel(poles, np.array([0.1, 0.05]), DT_S, unstable=image)
+    fit = with_each_pole_once(started(model, structure, FrictionLaw(0.3, 1e-5)))
+    longer = at_step(fit, 5 * DT_S)
+    assert longer.model.unstable.real == pytest.approx(np.exp(-2.0 * 5 * DT_S))
+    assert longer.arm.structure.unstable.real == pytest.approx(longer.model.unstable.real)
+    back = at_step(longer, DT_S)
+    omega = np.geomspace(1.0, 50.0, 20)
+    ratio = back.model.frequency_response(omega) / fit.model.frequency_response(omega)
+    assert np.max(np.abs(ratio - 1)) < 0.02
