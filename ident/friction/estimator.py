@@ -6,7 +6,8 @@ method of a loop (Ljung, System Identification, 2nd ed., section 13.4: no bias i
 From a start by inverse dynamics, the steps of `STEPS` propose other structures: dead time and lag of the
 drive, friction at the load, friction that falls with speed, other poles. Each proposal is brought to its own
 optimum before it is compared, by the Bayesian information criterion; the steps end when none of them finds a
-better structure. They see thinned logs (`ident.friction.logs`); the last descent sees the whole ones.
+better structure. They see logs thinned for the highest mode (`ident.friction.logs`); the last descent sees
+the whole ones, or those thinned to one row of each reading of a coarse sensor.
 
 Neglected: a level that depends on position or load; what the sensor's noise does to the friction itself.
 """
@@ -117,7 +118,7 @@ def fit_friction_in_loop(
         ends.append(candidate)
     best = min(ends, key=lambda end: end.criterion)
 
-    # The last descent sees the whole logs.
+    # The last descent sees every row in which the sensor may read something new.
     report(0.9, "friction: all samples")
     fit = at_step(without_empty_parts(best.fit, whole.rms_speed), least_steps * whole.dt_s)
     fit = converged(fit, whole.thinned(least_steps, best.delay_samples), options).fit

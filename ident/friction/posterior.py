@@ -20,7 +20,6 @@ from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
-from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.arrays import ComplexArray, RealArray, real_rows
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.data.record import Record
@@ -29,8 +28,7 @@ from ident.friction.fit import moved_to
 from ident.friction.further_poles import frequencies_of, on_further_poles
 from ident.friction.gauss_newton import STD_LOG, FrictionFit, driven_by_law, linearised
 from ident.friction.inverse_dynamics import smoothed, speed_classes
-from ident.friction.logs import LoopLogs
-from ident.friction.rate_members import RateMember, rate_members
+from ident.friction.rate_members import RateMember, below_modes, rate_members
 from ident.friction.widths import heterogeneity
 from ident.response_uncertainty import NOISE_ORDERS
 from ident.uncertainty.embedding import tangent_beside
@@ -225,8 +223,7 @@ def _behind_observed(
 
     # Wider by what parts of the logs differ in, and by forces that no residual shows.
     noise = response.report.noise if response.report else WHITE_NOISE
-    every = LoopLogs.of(records).rows_of_a_reading
-    wider = np.sqrt(heterogeneity(found, records, noise.without_start, every=every))
+    wider = np.sqrt(heterogeneity(found, records, noise.without_start))
     by_force = _by_linear_force(found, records, frictionless, response)
     response = replace(response, covariance_factor=np.hstack([wider * response.covariance_factor, by_force]))
     longest_s = max(record.n_samples for record in frictionless) * model.dt_s
@@ -279,12 +276,8 @@ def of_force(
     moved = rows @ response.covariance_factor
     change = moved / gain[:, None]
 
-    # Directions that move the gain most at low frequency. Above the frequency where the gain is known best it
-    # is no longer the force of a slow motion.
-    is_mode = poles.zeta() < LARGEST_DAMPING
-    modes_rad_s = poles.omega_rad_s(response.dt_s)[is_mode]
-    best_known = omega[np.argmin(np.linalg.norm(change, axis=1))]
-    low = omega < np.min(modes_rad_s, initial=best_known)
+    # Directions that move the gain most at low frequency.
+    low = below_modes(omega, change, poles, response.dt_s)
     low_change = real_rows(np.where(low[:, None], change, 0.0))
     directions = np.linalg.svd(low_change, full_matrices=False)[2][:_MOST_CURVED]
 

@@ -172,8 +172,8 @@ def _edges(undamped: float, x: ComplexArray) -> RealArray:
 
 
 def below_modes(omega: RealArray, change: ComplexArray, poles: Poles, dt_s: float) -> BoolArray:
-    """Frequencies (F,) of omega, rad/s, below the first light mode; of an arm without one, below the
-    frequency where the gain is known best, as above it is no longer the force of a slow motion.
+    """Mask (F,) of the frequencies omega, rad/s, below the first light mode, and below the one where the gain
+    is known best: above it a change is no longer one of the force of a slow motion.
 
     change (F, P'): of the gain by unit normals, relative.
     """

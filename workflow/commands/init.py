@@ -168,7 +168,7 @@ def decided(
                 config, text = written(found, file)
                 with suppress(InputError):
                     identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
-                    if _is_described(RunResults(run)):
+                    if _is_described(RunResults(run), config.control_index):
                         break
             else:
                 raise
@@ -182,15 +182,17 @@ def decided(
     return (*written(found, file), found)
 
 
-def _is_described(results: RunResults) -> bool:
-    """Whether a model explains a log, and its ellipses are narrow somewhere: what is fallen back on when no
-    model with friction explains the logs must explain more than that did."""
-    from workflow.tasks.first_look import TOLD
-    from workflow.tasks.uncertainty import EXPLAINED_PERCENT
+def _is_described(results: RunResults, at: int) -> bool:
+    """Whether the model of the channel of a number explains a log, and its ellipses are narrow somewhere.
 
-    bands = results.uncertainty.channels[0].bands
+    What is fallen back on when no model with friction explains the logs must explain more than that did.
+    """
+    from workflow.tasks.first_look import TOLD
+    from workflow.tasks.uncertainty import LEAST_FIT_PERCENT
+
+    bands = results.uncertainty.channels[at].bands
     is_narrow = min(band.median_radius_percent for band in bands) <= 100 * TOLD
-    return is_narrow and results.identify.channels[0].best_fit_percent >= EXPLAINED_PERCENT
+    return is_narrow and results.identify.channels[at].best_fit_percent >= LEAST_FIT_PERCENT
 
 
 def _best_linear(channel: IdentifiedChannel) -> str:

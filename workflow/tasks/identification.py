@@ -21,7 +21,6 @@ from ident.data.record import Record
 from ident.data.signal_filter import band_limited, increments, settling_time_s
 from ident.friction import (
     FrictionFit,
-    RemoteFriction,
     fit_friction,
     identify_behind,
     recorded_in_loop,
@@ -119,23 +118,13 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
             measured = records.fitted(channel)
             loop = config.closed_loop_data if in_loop else None
             units = scale.get(channel.input, 1.0) / scale.get(channel.output, 1.0)
-            seen = unseen
-            if channel.uncertainty.friction_remote:
-                remote = shaft_friction_of_load(channel, measured, loop, report)
-                measured = [without_remote_friction(record, remote) for record in measured]
-                seen = [
-                    (without_remote_friction(record.siso(channel.input, channel.output), remote), role)
-                    for record, role in unseen
-                ]
             # The law is that of the output that is fed back.
             timing = records.timing if k == config.control_index else None
-            if channel.uncertainty.friction_remote:
-                timing = None  # the law made the command, not what friction leaves of it
             channels.append(
                 identify_channel(
                     channel,
                     measured,
-                    seen,
+                    unseen,
                     loop,
                     report,
                     friction=known,
@@ -165,20 +154,6 @@ def shaft_friction(
     return found
 
 
-def shaft_friction_of_load(
-    channel: Channel, measured: Sequence[Record], loop: ClosedLoopData | None, report: Progress
-) -> RemoteFriction:
-    """Friction of a shaft behind a spring from the position of a load.
-
-    channel, measured, loop: as of `identify_channel`. Raises ValueError, one line, where the logs were not
-    made in a loop or do not tell such a friction.
-    """
-    if loop is None:
-        raise ValueError("response = 'without remote friction' is for logs of a loop; none was seen in these")
-    as_recorded = identify_channel(channel, measured, [], loop, report, with_plot=False)
-    return remote_friction(measured, as_recorded.model)
-
-
 def identify_channel(
     channel: Channel,
     measured: Sequence[Record],
@@ -198,6 +173,10 @@ def identify_channel(
     `with_stated_controller`; law: that repeats the command of these records, where one is known. Raises
     ValueError, one line, where the logs cannot carry it.
     """
+    if channel.uncertainty.friction_remote:
+        return _behind_remote_friction(
+            channel, measured, unseen, loop, report, with_plot=with_plot, units=units
+        )
     options, given = _searched_around(channel, measured[0].dt_s), None
     # The arm with friction was fitted without delay, and a closed loop looks like one.
     as_logged = options if friction is None and loop is None else options.with_delay_stated()
@@ -274,6 +253,37 @@ def identify_channel(
             return fitted(opened, finding(kind, **opened.finding.values))
     assert given is not None
     raise ValueError(said("loop_refused", given.values, controlled))
+
+
+def _behind_remote_friction(
+    channel: Channel,
+    measured: Sequence[Record],
+    unseen: Sequence[tuple[Record, Role]],
+    loop: ClosedLoopData | None,
+    report: Progress,
+    *,
+    with_plot: bool,
+    units: float,
+) -> IdentifiedChannel:
+    """The channel from records without the friction of a shaft that the sensor does not see, with that
+    friction; arguments as of `identify_channel`.
+
+    The law of a controller made the command, not what friction leaves of it, so it is of no use here. Raises
+    ValueError, one line, where the logs were not made in a loop or do not tell such a friction.
+    """
+    if loop is None:
+        raise ValueError("response = 'without remote friction' is for logs of a loop; none was seen in these")
+    described = channel.uncertainty.model_copy(update={"response": "as recorded"})
+    plain = channel.model_copy(update={"uncertainty": described})
+    as_recorded = identify_channel(plain, measured, [], loop, report, with_plot=False, units=units)
+    remote = remote_friction(measured, as_recorded.model)
+    free = [without_remote_friction(record, remote) for record in measured]
+    free_unseen = [
+        (without_remote_friction(record.siso(channel.input, channel.output), remote), role)
+        for record, role in unseen
+    ]
+    found = identify_channel(plain, free, free_unseen, loop, report, with_plot=with_plot, units=units)
+    return replace(found, remote=remote)
 
 
 def _in_recorded_loop(

@@ -32,7 +32,7 @@ from ident.data.arrays import BoolArray, RealArray
 from ident.data.ellipses import chi2_radius
 from ident.data.finding import Finding, distinct
 from ident.data.record import Record
-from ident.friction import EquivalentFriction, FrictionFit
+from ident.friction import EquivalentFriction, FrictionFit, RemoteFriction
 from ident.identification import Identification
 from ident.resampling import ratio_of, resampled, resampled_poles
 from ident.response_uncertainty import Tests
@@ -116,7 +116,7 @@ class IdentifiedChannel:
 
     used: SISO estimation records as the fit saw them; bounded: the same as the ellipses see them; fresh: free
     runs, fresh_roles the role of each; closed_loop: how logs made in a loop were used and why, None for
-    others.
+    others; remote: friction of a shaft that the sensor does not see, which was taken off the records.
     """
 
     name: str
@@ -130,6 +130,7 @@ class IdentifiedChannel:
     band_rad_s: Interval | None = None
     bounds_band_rad_s: Interval | None = None
     closed_loop: Finding | None = None
+    remote: RemoteFriction | None = field(default=None, metadata={"since": 10})
 
     @property
     def model(self) -> GobfModel:

@@ -32,7 +32,6 @@ from ident.friction import (
     at_amplitude,
     equivalent_friction,
     other_output_without_friction,
-    remote_friction,
     with_remote_friction,
     without_friction,
 )
@@ -63,7 +62,7 @@ _FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal mod
 _SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
 # A model explains nothing whose best fit to a log is below this, in percent: right ones had 90 and more,
 # wrong ones 75 and less.
-EXPLAINED_PERCENT = 80.0
+LEAST_FIT_PERCENT = 80.0
 # With friction, the arm's free run is only doubted where it leaves more than so many times the sensor's
 # noise.
 _BEYOND_NOISE = 3.0
@@ -155,9 +154,8 @@ def uncertainty_of(
         elif behind.members and (in_parts or len(behind.members) == 1):
             members = behind.members
             posterior, poles = members[0].response, members[0].poles
-    remote = None
-    if channel.uncertainty.friction_remote:
-        remote = remote_friction(measured, result.model)
+    remote = result.remote
+    if remote is not None:
         longest_s = max(record.n_samples for record in measured) * result.model.dt_s
         posterior, linear = with_remote_friction(posterior, remote, poles, longest_s)
     if timing is not None:
@@ -296,7 +294,7 @@ def refuse_unexplained(
     if agreement.share_inside_percent < MOST_INSIDE_PERCENT:
         outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
-    elif friction is not None and best < EXPLAINED_PERCENT:
+    elif friction is not None and best < LEAST_FIT_PERCENT:
         times = found.noise_std / friction.noise_std
         if times > _BEYOND_NOISE:
             why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
