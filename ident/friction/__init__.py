@@ -4,7 +4,7 @@ from ident.friction.amplitude import EquivalentFriction, at_amplitude, equivalen
 from ident.friction.arm import FrictionLaw
 from ident.friction.behind import identify_behind
 from ident.friction.command_causes import recorded_in_loop, with_commands_in_time
-from ident.friction.fit import fit_friction, refuse_unseen_shaft
+from ident.friction.fit import fit_friction, refuse_missed_friction, refuse_unseen_shaft
 from ident.friction.gauss_newton import FrictionFit
 from ident.friction.posterior import BehindFriction, other_output_without_friction, without_friction
 from ident.friction.rate_members import RateMember
@@ -28,6 +28,7 @@ __all__ = [
     "identify_behind",
     "other_output_without_friction",
     "recorded_in_loop",
+    "refuse_missed_friction",
     "refuse_unseen_shaft",
     "remote_friction",
     "with_commands_in_time",

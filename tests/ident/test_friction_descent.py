@@ -14,6 +14,7 @@ from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
 from ident.data.record import Record
+from ident.friction import refuse_missed_friction
 from ident.friction.arm import FrictionLaw, SteppedArm
 from ident.friction.behind import behind_drive, with_bias_of_free_runs
 from ident.friction.descent import converged, with_each_pole_once
@@ -370,3 +371,11 @@ def test_an_arm_that_is_thrown_over_grows_as_fast_at_another_step() -> None:
     omega = np.geomspace(1.0, 50.0, 20)
     ratio = back.model.frequency_response(omega) / fit.model.frequency_response(omega)
     assert np.max(np.abs(ratio - 1)) < 0.02
+
+
+def test_friction_that_shows_and_is_not_found_acts_elsewhere() -> None:
+    fit = begun(level=0.3)
+    refuse_missed_friction(fit, 0.9, "y")
+    refuse_missed_friction(fit, 0.0, "y")
+    with pytest.raises(ValueError, match="does not act where 'y' is measured; response = 'as recorded'"):
+        refuse_missed_friction(begun(level=0.003), 0.3, "y")

@@ -157,6 +157,7 @@ def decided(
     with naming_readings(found.read.records):
         try:
             identify_only(config, run.path, config_text=text, earlier=earlier, progress=progress)
+            _refuse_missed_friction(RunResults(run), found)
         except InputError as refused:
             if not config.control_channel.uncertainty.friction_identified:
                 raise
@@ -180,6 +181,20 @@ def decided(
         draft = replace(draft, specification=with_typed(draft.specification, typed))
     found = replace(found, draft=draft, before=found.draft, typed=frozenset(typed or ()))
     return (*written(found, file), found)
+
+
+def _refuse_missed_friction(results: RunResults, found: Found) -> None:
+    """Raises InputError, one line, where the draft has friction identified because the motion shows it, and
+    the fit misses it."""
+    from ident.friction import refuse_missed_friction
+
+    friction = results.identify.friction
+    motion = found.draft.look.motion
+    if friction is None or motion is None or not found.draft.friction:
+        return
+    output = found.read.roles.output
+    with naming(f"channel {output!r}"):
+        refuse_missed_friction(friction, motion.friction.value, output)
 
 
 def _is_described(results: RunResults, at: int) -> bool:
