@@ -166,7 +166,11 @@ def minimax_step(
 
     first_level = float(np.max(value)) + _FIRST_SLACK
     v = np.append(np.zeros(n), first_level)
-    z, gap = _interior_point(matrix, limit, hessian, v, rows)
+    try:
+        z, gap = _interior_point(matrix, limit, hessian, v, rows)
+    except np.linalg.LinAlgError:
+        # Slacks so near their bounds that rounding takes the last of the diagonal.
+        return None
     d = v[:n]
     solved = gap < _USABLE_GAP and np.all(np.isfinite(v))
     not_above = np.all(d <= high + _ROUNDING)
@@ -200,7 +204,7 @@ def _interior_point(matrix: Real, limit: Real, hessian: Real, v: Real, rows: int
         if missed < _ACCURACY and np.max(np.abs(dual)) < _STATIONARY:
             break
         # Normal equations, with a trace of 1e-12, some thousand times rounding, on the diagonal where rows
-        # leave a direction free: without it the solution would raise LinAlgError.
+        # leave a direction free: without it the solution would raise LinAlgError, as it still may at the end.
         ratio = z / slack
         centre = slack * z
         normal = hessian + (matrix.T * ratio) @ matrix

@@ -128,3 +128,18 @@ def test_no_step_where_the_side_conditions_exclude_each_other():
     a = np.vstack([np.eye(n)[:1], -np.eye(n)[:1]])
     box = np.ones(n)
     assert minimax_step(value, slope, np.zeros((n, n)), -box, box, a, np.array([-0.5, -0.5])) is None
+
+
+def test_a_step_that_rounding_spoils_is_none(monkeypatch):
+    """A start that runs away has rows of 1e8, whose normal equations are singular to rounding: it ends
+    itself, not the design. By a stand-in, as which rows do so depends on the order of the sums."""
+
+    def singular(*_):
+        raise np.linalg.LinAlgError
+
+    monkeypatch.setattr("control_design.synthesis.minimax_step._interior_point", singular)
+    none = np.zeros((0, 2))
+    assert (
+        minimax_step(np.ones(1), np.ones((1, 2)), np.eye(2), -np.ones(2), np.ones(2), none, none[:, 0])
+        is None
+    )
