@@ -36,7 +36,7 @@ from ident.data.ellipses import LEVEL, chi2_radius
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 from ident.recorded_law import RecordedLaw, law_of
-from ident.response_coefficients import coefficients_of
+from ident.response_coefficients import coefficients_of, slow_angles
 
 # Rows before and after one that its equivalent command is made of. With four on each side the filter is
 # within .1 % of 1 / S up to 1 rad of w T, and within .5 % up to half the Nyquist frequency.
@@ -51,11 +51,6 @@ TAPS = 8
 # Frequencies at which the filter of the command is fitted: forty for each of its taps, so that the fit is one
 # of the curve and not of its points. Chosen.
 FILTER_POINTS = 400
-# Lowest frequency times step at which an ellipse is fitted, rad: a motion of two hours in a log at 100 Hz,
-# longer than most logs.
-LOWEST_ANGLE_RAD = 1e-5
-# Frequencies of a logarithmic grid from the lowest to the highest: ninety in a decade, 2.6 % apart. Chosen.
-SLOW_POINTS = 500
 # Frequencies of a linear grid beside those for the taps. Chosen: enough without any tap.
 EVEN_POINTS = 200
 # Further ones of that grid for each tap: the last tap, which turns round half as often as there are taps up
@@ -514,7 +509,7 @@ def with_unknown_timing(posterior: ResponsePosterior, timing: CommandTiming) -> 
         return posterior
 
     # Slow motions, and points between which no tap of the kernel turns round.
-    slow = np.geomspace(LOWEST_ANGLE_RAD, HIGHEST_ANGLE_RAD, SLOW_POINTS)
+    slow = slow_angles(posterior.poles, HIGHEST_ANGLE_RAD)
     n_even = EVEN_POINTS_PER_TAP * (posterior.fir_length + TAPS) + EVEN_POINTS
     even = np.linspace(0.0, HIGHEST_ANGLE_RAD, n_even)[1:]
     angle = np.union1d(slow, even)

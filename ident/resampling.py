@@ -29,7 +29,7 @@ from ident.command_timing import Hold
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.ellipses import LEVEL, chi2_radius
 from ident.friction import FrictionFit
-from ident.response_coefficients import coefficients_of
+from ident.response_coefficients import coefficients_of, slow_angles
 
 # Whole multiples and parts of a step agree within this share of it: steps are stated with three digits or
 # more.
@@ -54,15 +54,9 @@ LEAST_FOLDED = 1e-4
 # Weight of a response of this size above the log's Nyquist frequency, beside relative errors below: it
 # decides only what the data leave open. Halved or doubled, no test of resampling moves.
 FALLS_WEIGHT = 0.02
-# Lowest frequency that is fitted, times the longer step: a motion of a week in a log at 10 Hz, far below what
-# a loop is designed for.
-LOWEST_ANGLE_RAD = 1e-6
 # Highest frequency that is fitted, as a share of pi over the longer step: at the Nyquist frequency itself
 # responses are real, so that a complex one may not be met.
 HIGHEST_SHARE = 0.99
-# Frequencies of a logarithmic grid from the lowest to the highest one: ninety in a decade, 2.6 % apart.
-# Chosen.
-SLOW_POINTS = 600
 # Frequencies of a linear grid from zero to the highest one, beside those for the taps. Chosen: enough without
 # any tap.
 EVEN_POINTS = 200
@@ -230,7 +224,7 @@ def resampled(posterior: ResponsePosterior, controller_dt_s: float) -> ResponseP
     # Frequencies up to the lower of both Nyquist frequencies, dense where responses turn.
     slower_dt_s = max(posterior.dt_s, controller_dt_s)
     # Just below the highest frequency, where the linear grid is the denser one.
-    slow_angle = np.geomspace(LOWEST_ANGLE_RAD, 0.98 * np.pi, SLOW_POINTS)
+    slow_angle = slow_angles(posterior.poles, 0.98 * np.pi)
     slow = slow_angle / slower_dt_s
     n_even = EVEN_POINTS_PER_TAP * n_taps + EVEN_POINTS
     even_angle = np.linspace(0.0, HIGHEST_SHARE * np.pi, n_even)[1:]
@@ -333,7 +327,7 @@ def _unknown_above(posterior: ResponsePosterior, log_dt_s: float, up: int) -> Re
     """
     n_even = EVEN_POINTS_PER_TAP * posterior.fir_length + EVEN_POINTS
     even = np.linspace(0.0, HIGHEST_SHARE * np.pi, n_even)[1:]
-    angle = np.union1d(np.geomspace(LOWEST_ANGLE_RAD, HIGHEST_SHARE * np.pi, SLOW_POINTS), even)
+    angle = np.union1d(slow_angles(posterior.poles, HIGHEST_SHARE * np.pi), even)
     omega = angle / posterior.dt_s
     delay = np.exp(-1j * omega * posterior.dt_s)
     change = 1 - delay

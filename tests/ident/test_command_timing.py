@@ -277,6 +277,33 @@ def test_ellipses_of_an_unknown_period_hold_the_response_of_each(integrators):
     assert with_unknown_timing(narrow, known) is narrow
 
 
+def test_ellipses_stay_as_wide_below_poles_that_are_slower_than_a_record():
+    """Far below the slowest pole ellipses are as wide over their centre as around it; a fit that begins above
+    a pole is free to turn there."""
+    rates = np.geomspace(2e-4, 5.0, 12)
+    poles = Poles(np.exp(-rates * STEP_S), [np.exp((-6 + 120j) * STEP_S)])
+    empty = ResponsePosterior(poles, np.ones(14), np.eye(14), STEP_S, integrators=1)
+    grid = np.geomspace(1e-6, 1000.0, 600)
+    arm = response(STEP_S, grid) / (1j * grid)
+    # Columns: a tenth of the gain, behind lags and leads of all rates.
+    slow = 1 / (1 + 1j * grid[:, None] / np.geomspace(1e-3, 100.0, 8))
+    wanted = np.column_stack([np.ones(grid.size), 0.1 * slow])
+    rows = real_rows(empty.frequency_rows(grid) / arm[:, None])
+    found = np.linalg.lstsq(rows, real_rows(wanted), rcond=1e-10)[0]
+    narrow = replace(empty, mean=found[:, 0], covariance_factor=found[:, 1:])
+    timing = CommandTiming(
+        TimingSource.UNKNOWN, STEP_S, None, possible=(HELD, Hold(0.0, averaged=True)), middle=Hold(0.0)
+    )
+
+    def width(posterior, omega):
+        ellipses = posterior.at(np.array([omega]))
+        return float(ellipses.ellipse().semi_major[0] / np.abs(ellipses.centre[0]))
+
+    wide = with_unknown_timing(narrow, timing)
+    for omega in (1e-6, 1e-5, 1e-4, 1e-3):
+        assert width(wide, omega) == pytest.approx(width(narrow, omega), rel=0.02)
+
+
 @pytest.mark.parametrize("first", [0, 1, 2, 3])
 def test_a_record_that_was_not_seen_is_used_from_the_row_at_which_its_command_changes(first):
     rng = np.random.default_rng(first)
