@@ -74,10 +74,11 @@ def nominals_near(
     Yields
     ------
     GobfModel
-        On the given poles; on each taken twice; on those refined from the given ones on the posterior's
-        response (`PoleSearch.descend`); then with one pair more each time (`PoleSearch.add_pair`), until the
-        order exceeds twice the given one; unstable poles stay. Not every one need be nearer than the one
-        before: the caller judges.
+        On the given poles; on those refined from the given ones on the posterior's response
+        (`PoleSearch.descend`); on each given one taken twice; then on the refined ones with one pair more
+        each time (`PoleSearch.add_pair`), until the order exceeds twice the given one; unstable poles stay.
+        Not every one need be nearer than the one before: the caller judges. A pole that is taken twice, or
+        is added, brings a zero, which below the data may lie anywhere: outside the circle as well.
 
     Raises
     ------
@@ -100,10 +101,10 @@ def nominals_near(
     search = PoleSearch(data, known)
 
     yield _nearest(data, poles, posterior)
-    yield _nearest(data, poles.doubled(), posterior)
     start = held.appended(poles.without(held))
     moved = search.descend(start, "nominal").poles
     yield _nearest(data, moved, posterior)
+    yield _nearest(data, poles.doubled(), posterior)
     # Up to about twice the order, which is what each pole taken twice has. Chosen.
     while moved.order <= 2 * poles.order:
         moved = search.add_pair(moved).poles
