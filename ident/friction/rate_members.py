@@ -46,6 +46,9 @@ _ACROSS = 1.05
 # at the arc's ends have nearly the width across that the others have. Chosen: gains are far from zero there.
 # Doubled, draws of the highest rates lie outside over an octave more.
 _LONGER_FROM = 4
+# Factor by which the gain is known less again, over itself, where slow motions end. Chosen: towards a zero it
+# grows without end, and a decade of slow motion does not let it grow at all.
+_KNOWN_LESS_AGAIN = 2
 # Octaves over which a change of the force turns into one of the gain, from three below the first light mode
 # to one. Chosen: over one octave the poles of the arm follow it less well.
 _TURNS_OVER = 2
@@ -111,16 +114,18 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     if not (low.any() and deviation > 0):
         return ()
 
-    # Where an ellipse to first order would hold zero. Above, the sign of the inertia is known.
+    # Where an ellipse to first order would hold zero. Above, or where one does so least, the sign of the
+    # inertia is known.
     x = change @ (at_rest / deviation)
     size = chi2_radius(LEVEL) * np.abs(x)
-    holds_zero = low & (size >= 1)
-    if not holds_zero[0]:
+    if size[0] < 1:
         return ()
-    first_known = int(np.argmin(holds_zero))
+    not_zero = low & (size < 1)
+    first_known = int(np.argmax(not_zero)) if not_zero.any() else int(np.argmin(np.where(low, size, np.inf)))
     # Force over speed, without the delay of the input and of the hold.
     delay_s = (response.input_delay_samples + 0.5) * response.dt_s
     force = np.exp(-1j * omega * delay_s) / (1j * omega * gain)
+    # An inertia is positive.
     force = force * np.copysign(1.0, force[first_known].imag)
 
     # A unit normal whose growth takes force away, and its values that leave a damping.
@@ -172,14 +177,20 @@ def _edges(undamped: float, x: ComplexArray) -> RealArray:
 
 
 def below_modes(omega: RealArray, change: ComplexArray, poles: Poles, dt_s: float) -> BoolArray:
-    """Mask (F,) of the frequencies omega, rad/s, below the first light mode, and below the one where the gain
-    is known best: above it a change is no longer one of the force of a slow motion.
+    """Mask (F,) of the frequencies omega, rad/s, at which a change of the gain is one of the force of a slow
+    motion.
 
-    change (F, P'): of the gain by unit normals, relative.
+    They end where the gain is known best, the first time: towards a light zero it is known less again, over
+    the gain, and at the latest at the first light mode. change (F, P'): of the gain by unit normals,
+    relative.
     """
+    unknown = np.linalg.norm(change, axis=1)
+    least_so_far = np.minimum.accumulate(unknown)
+    rises = unknown > _KNOWN_LESS_AGAIN * least_so_far
+    first_rise = int(np.argmax(rises)) if rises.any() else omega.size
+    best_known = omega[np.argmin(unknown[:first_rise])]
     is_mode = poles.zeta() < LARGEST_DAMPING
     modes_rad_s = poles.omega_rad_s(dt_s)[is_mode]
-    best_known = omega[np.argmin(np.linalg.norm(change, axis=1))]
     return np.asarray(omega < np.min(modes_rad_s, initial=best_known))
 
 

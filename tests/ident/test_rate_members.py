@@ -15,7 +15,7 @@ from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, real_rows
 from ident.data.ellipses import chi2_radius
 from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.friction.rate_members import RateMember, rate_members
+from ident.friction.rate_members import RateMember, below_modes, rate_members
 
 DT_S = 0.01
 LONGEST_S = 100.0
@@ -110,6 +110,20 @@ def test_an_arm_on_a_spring_has_no_parts() -> None:
 
 def test_a_damping_that_the_data_deny_is_not_taken_for_granted() -> None:
     assert parts_of(-3.0, 1.0) == ()
+
+
+def test_slow_motions_end_before_a_light_zero_and_not_at_the_mode_behind_it() -> None:
+    """Over the gain a response is known less again towards a zero; between it and the mode the motion has
+    turned round, so that an inertia looks negative there."""
+    zero_rad_s, mode_rad_s = 30.0, 60.0
+    s = 1j * OMEGA
+    notch = 1 + 0.02 * s / zero_rad_s + (s / zero_rad_s) ** 2
+    known_to = (0.5 / s + 0.01 / notch)[:, None]
+    poles = Poles(np.zeros(0), [np.exp((-1.0 + 1j * mode_rad_s) * DT_S)])
+    low = below_modes(OMEGA, known_to, poles, DT_S)
+    assert 5.0 < OMEGA[low].max() < zero_rad_s
+    without_zero = below_modes(OMEGA, (0.5 / s)[:, None], poles, DT_S)
+    assert OMEGA[without_zero].max() == pytest.approx(mode_rad_s, rel=0.1)
 
 
 def test_parts_meet_where_they_say() -> None:
