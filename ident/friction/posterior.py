@@ -56,6 +56,9 @@ _LARGEST = 0.9
 _ABOVE_MODES = 1.1
 # Largest change of the logarithm of a decay rate in a round: a factor of e.
 _LARGEST_LOG_STEP = 1
+# Logarithm of the factor by which a tangent raises a decay rate at most. Chosen: with twice the rate the
+# gain at rest is halved, and a tangent has it at none.
+_LINEAR_LOG_STEP = 0.7
 # Rounds in which real poles are moved, at most. Chosen: they end where none is outside its interval.
 _ROUNDS = 6
 # Powers of s that a part of the friction may look like: stiffness, damping, inertia.
@@ -190,7 +193,9 @@ def _behind_observed(
     missed_above = _ABOVE_MODES * float(np.max(np.abs(np.log(highest)), initial=0.0))
 
     # Viscous and dry friction trade: a pole moved far beyond its interval would turn the tangent round below
-    # the data. So real poles are moved, and the regression is repeated, until each is within its interval.
+    # the data. So real poles are moved, and the regression is repeated, until each is within its interval,
+    # and is not raised by more than a tangent follows: a slow axis about a rate that is far too low gets a
+    # mean with a zero below the data. A rate that falls towards none has no better tangent.
     classes = [speed_classes(record) for record in records]
     for rounds_left in reversed(range(_ROUNDS)):
         response, change, factor = tangent_beside(
@@ -214,7 +219,9 @@ def _behind_observed(
         log_change = double / simple / (real[decays] * np.log(real[decays]))
         rate = -np.log(real[decays]) / model.dt_s
         upper = pole_intervals(response, stable).decay_per_s[decays, 1]
-        outside = np.abs(log_change) > np.log(upper / rate)
+        half_width = np.log(upper / rate)
+        rises = log_change > np.minimum(half_width, _LINEAR_LOG_STEP)
+        outside = rises | (log_change < -half_width)
         if rounds_left == 0 or not outside.any():
             break
         steps = np.where(outside, np.clip(log_change, -_LARGEST_LOG_STEP, _LARGEST_LOG_STEP), 0.0)

@@ -145,6 +145,25 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     assert behind.poles.real.max() == pytest.approx(poles.real.max(), abs=0.2 * (1 - poles.real.max()))
 
 
+@pytest.mark.parametrize("times", [12, 40])
+def test_a_hardly_known_rate_is_raised_to_where_a_tangent_follows(belt, times: int) -> None:
+    """.4 s of a log tell a rate of .57 / s to a factor of some ten, so that a tenth of it lies within its
+    interval; but a tangent there has a mean that no arm has."""
+    one, records, found = belt
+    about = identify_behind(
+        found, [found.taken_off(record) for record in records], IdentOptions(integrators=1)
+    )
+    poles = about.model.poles
+    slow = Poles(poles.real ** np.where(poles.real > 0.9, 1 / times, 1.0), poles.pairs)
+    short = [record.slice(0, record.n_samples // 5) for record in records]
+    behind = without_friction(short, found, replace(about.model, poles=slow))
+    assert np.log(behind.poles.real.max()) / np.log(poles.real.max()) == pytest.approx(1, abs=0.6)
+    omega = np.geomspace(0.3, 200.0, 80)
+    true = response(*one.plant.sampled(0.0), omega, one.plant.dt_s)
+    holds = [part.response.at(omega).contains(true) for part in behind.members or [behind]]
+    assert np.mean(np.any(holds, axis=0)) > 0.9
+
+
 def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(belt) -> None:
     """5 % of the friction, one standard deviation: no residual shows it where it moves with the speed."""
     one, records, found = belt
