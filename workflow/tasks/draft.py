@@ -229,7 +229,8 @@ def _specification(
     }
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
-        "lowest_bandwidth_rad_s": _rounded(max(min(base / _LEAST_PART, recorded or np.inf), unstable)),
+        # Below an unstable pole, too: the loop has to cross above it, tracking need not reach so far.
+        "lowest_bandwidth_rad_s": _rounded(min(base / _LEAST_PART, recorded or np.inf)),
         "modulus_margin": 0.5,
         "effort_limit": _rounded(effort),
         "highest_effort_limit": _rounded(_EFFORT_GIVES_WAY * _rounded(effort)),
