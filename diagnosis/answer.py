@@ -127,6 +127,41 @@ class Shares:
         return min(1 - after / before, 1.0) if before > 0 else float("nan")
 
 
+@dataclass(frozen=True)
+class Prediction:
+    """How well the repaired model predicts logs that it was not fitted to.
+
+    Such logs are the validation records and, where there are two or more, the estimation records, each left
+    out of the fit in turn. Errors are RMS of (measured - model) / noise over all of them.
+
+    Attributes
+    ----------
+    effects : tuple of str
+        Of the repaired model: the smallest set that predicts as well as the best one tried, within one
+        standard error.
+    values : tuple of str
+        Nominal values that are moved in it; all others are as stated.
+    error_nominal, error, error_best : float
+        Without effects, the better of all nominal values moved and none; with the repair; with the best set
+        of effects that was tried.
+    standard_error : float
+        Of the difference between the first two, as a share of the energy of the first.
+    unexplained : float
+        Share of the validation error beyond noise that the repair leaves, 0 to 1; nan without an error.
+    tried : tuple of (effects, error)
+        Sets that were compared, the nominal model first.
+    """
+
+    effects: tuple[str, ...]
+    values: tuple[str, ...]
+    error_nominal: float
+    error: float
+    error_best: float
+    standard_error: float
+    unexplained: float
+    tried: tuple[tuple[tuple[str, ...], float], ...]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Shown):
     """What is wrong with a model, as far as its records tell.
@@ -157,8 +192,9 @@ class Diagnosis(Shown):
         answers (none was fitted to them).
     unlisted : tuple of effects. What explains the records where the answer is unknown and yet can be named: a
         cause beyond the list that looks like one of it, with whatever it acts beside.
-    partial_model : tuple of str. Effects of the repaired model where the answer is unknown: they close most
-        of the held-out gap, and nobody says that they are the cause.
+    partial_model : tuple of str. Effects of the repaired model where the answer is none or unknown: with them
+        it predicts better, and nobody says that they are the cause.
+    prediction : what the repaired model is worth in logs that it was not fitted to.
     completeness : whether that is all.
     noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
         noise than is stated, in whose place it was counted.
@@ -203,11 +239,14 @@ class Diagnosis(Shown):
     competing: tuple[CompetingHypothesis, ...] = ()
     shares: Shares | None = None
     white: Real | None = None
+    prediction: Prediction | None = None
 
     @property
     def added(self) -> tuple[str, ...]:
-        """Effects of the repaired model, whether they are the answer or only close most of the gap."""
-        return self.combination or self.partial_model
+        """Effects of the repaired model, whether they are the answer or only make it predict better."""
+        if self.prediction is None:
+            return self.combination or self.partial_model
+        return self.prediction.effects
 
     @property
     def probability(self) -> float:

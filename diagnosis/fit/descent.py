@@ -13,6 +13,7 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from diagnosis.fit.coordinates import box, effects_at, non_smooth, quotients, solved
 from diagnosis.fit.likelihood import WORTH_IT
@@ -27,8 +28,8 @@ _STEP, _SMALLEST_STEP = 1e-3, 1e-4
 # The same where contacts switch, deviations as logarithms: the loss is jagged below it, and how one contact
 # fell says nothing of where the others lead.
 _COARSE_STEP = {"log": 0.1, "angle": 0.1, "linear": 0.0125}
-# Of a coordinate or deviation in one iteration.
-_LARGEST_STEP = 2.0
+# Of a coordinate or deviation in one iteration: beyond it a linearisation holds no further.
+LARGEST_STEP = 2.0
 # Grids around a size on which the loss does not depend smoothly: how far, points of each.
 _NEAR = tuple(np.linspace(-reach, reach, 9) for reach in (0.1, 0.03))
 _FAR = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
@@ -184,10 +185,13 @@ def descend(
     iterations: int = 10,
     tolerance: float = 0.5,
     touching: bool = False,
+    moved: npt.NDArray[np.bool_] | None = None,
 ) -> Descent:
     """Descend from a point; the Jacobian by the deviations and the start columns may be those of a point
-    nearby, and are renewed on the way. touching: the latter feel contacts (`settled`)."""
+    nearby, and are renewed on the way. touching: the latter feel contacts (`settled`). moved (P,): deviations
+    that may change; None: all."""
     P, A = deviations.size, coordinates.size
+    fixed = np.zeros(0, dtype=np.int64) if moved is None else np.flatnonzero(~moved)
     low, high = box(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
     deviation_step, steps = steps_of(candidates)
@@ -215,14 +219,15 @@ def descend(
         normal = NormalEquations.of(records, records.likelihood.weights(e), jacobian, columns, d)
         H, g = normal.hessian, normal.gradient(start, e)
         held = ((x <= low) & (g[P : P + A] > 0)) | ((x >= high) & (g[P : P + A] < 0))
-        free, reached = np.setdiff1d(np.arange(g.size), P + np.flatnonzero(held)), None
+        free = np.setdiff1d(np.arange(g.size), np.concatenate([fixed, P + np.flatnonzero(held)]))
+        reached = None
         for _ in range(7):
             damped = H + damping * np.diag(np.diag(H) + 1e-9)
             damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
             step = np.zeros(g.size)
             step[free] = -solved(damped[np.ix_(free, free)], g[free])
-            d2 = records.nominal.within(d + np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP))
-            x2 = np.clip(x + np.clip(step[P : P + A], -_LARGEST_STEP, _LARGEST_STEP), low, high)
+            d2 = records.nominal.within(d + np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP))
+            x2 = np.clip(x + np.clip(step[P : P + A], -LARGEST_STEP, LARGEST_STEP), low, high)
             start2 = columns.moved(start, step[P + A :])
             e2 = left(d2, x2, start2)
             loss2, prior2 = loss_at(records, e2, d2, start2)
@@ -327,7 +332,7 @@ def follow(records: RecordsToFit, around: Descent, e: Real, start: FittedStart) 
     P, normal = around.deviations.size, around.normal(records)
     H = normal.hessian + np.diag(1e-9 * np.diag(normal.hessian) + 1e-12)
     step = -solved(H, normal.gradient(start, e))
-    step[:P] = np.clip(step[:P], -_LARGEST_STEP, _LARGEST_STEP)
+    step[:P] = np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP)
     moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
     d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])
     S, first = start.states.shape[1], step.size - start.states.size

@@ -29,7 +29,7 @@ from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 _LOWEST = 4  # coefficients in the lowest band: of fewer a variance says nothing
 _MOST = 16.0  # of one band, see above: its variance is then known to a third, sqrt(2 / 16)
 # Share of the stated model error below which a gain is none: what does not interest is not fitted.
-_UNINTERESTING = 0.4
+UNINTERESTING = 0.4
 # Noise is allowed half as much again as a data sheet says.
 _NOISE_ALLOWED = 1.5
 
@@ -93,7 +93,7 @@ class Levels:
             samples = np.bincount(octave).astype(np.float64)
             whole = T * np.var(record.output, axis=0)
             motion = windows.motion(record.output) if windows else whole
-            floor = (_UNINTERESTING * model_error) ** 2 * motion / octaves
+            floor = (UNINTERESTING * model_error) ** 2 * motion / octaves
             rows.append(
                 (
                     first + (octave[:, None] * Y + np.arange(Y)).ravel(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Generic
 
@@ -17,6 +17,7 @@ from diagnosis.answer import (
     DetailVerdict,
     Diagnosis,
     NamedEffect,
+    Prediction,
     Verdict,
     best_first,
     completeness_of,
@@ -29,6 +30,7 @@ from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.fit.coordinates import parameter_intervals, widened_by
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import Rounding, rounding_effect
+from diagnosis.repair.repair import Trial
 from diagnosis.search.loop import SearchLoop
 
 
@@ -85,6 +87,7 @@ class Judge(ABC, Generic[E]):
     """Weighs what a search has fitted, in `said`, and records it.
 
     stated, refit, repaired : the models to compare: as stated, nominal values re-estimated, effects added.
+    repair : the repaired model with how well it predicts; trials : sets of effects that it was chosen from.
     complete : probability that these effects are all.
     """
 
@@ -93,6 +96,8 @@ class Judge(ABC, Generic[E]):
     stated: E
     refit: E
     repaired: E
+    repair: Trial[E]
+    trials: Sequence[Trial[E]]
     complete: float
 
     @abstractmethod
@@ -122,8 +127,11 @@ class Judge(ABC, Generic[E]):
         floor = NOISE_FLOOR if of_sensor is None else of_sensor.floor
         closed, interval = share_closed(case, refit, after, rng, floor)
         named = {name: self._entry(name, keys, after, rng) for name in weighed.presence}
-        for name in ("none", "unknown"):
-            named[name] = NamedEffect(name, weighed.cause[name], weighed.cause[name], {}, {}, float("nan"))
+        # "Unknown" is about what the repair leaves.
+        unexplained = (1 - closed, 1 - interval[1], 1 - interval[0])
+        for name, explains in (("none", (float("nan"),) * 3), ("unknown", unexplained)):
+            probability = weighed.cause[name]
+            named[name] = NamedEffect(name, probability, probability, {}, {}, float("nan"), explains)
 
         def off(found: E) -> dict[str, float]:
             return dict(zip(keys, map(float, found.end.deviations), strict=True))
@@ -153,7 +161,26 @@ class Judge(ABC, Generic[E]):
             residuals_after=after,
             simulations=simulations,
             completeness=completeness_of(case, self.complete, after),
+            partial_model=() if said.verdict == "effect" else tuple(sorted(self.repair.names)),
+            prediction=self._prediction(closed),
             **more,
+        )
+
+    def _prediction(self, closed: float) -> Prediction:
+        """What the repair is worth; closed: share of the validation error that it explains."""
+        keys = self.search.records.nominal.keys
+        best = min(self.trials, key=lambda trial: trial.error.rms)
+        nominal = self.trials[0]
+        _, standard_error = self.repair.error.beyond(nominal.error)
+        return Prediction(
+            effects=self.repair.names,
+            values=tuple(key for key, moved in zip(keys, self.repair.moved, strict=True) if moved),
+            error_nominal=nominal.error.rms,
+            error=self.repair.error.rms,
+            error_best=best.error.rms,
+            standard_error=standard_error / max(float(np.sum(nominal.error.energy)), np.finfo(float).tiny),
+            unexplained=float(np.clip(1 - closed, 0.0, 1.0)),
+            tried=tuple((trial.names, trial.error.rms) for trial in self.trials),
         )
 
     def _entry(

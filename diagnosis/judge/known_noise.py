@@ -9,10 +9,11 @@ import numpy as np
 
 from diagnosis.answer import NOISE_FLOOR, POSSIBLE, Diagnosis, held_out_gap
 from diagnosis.evidence.hypotheses import DISAGREEMENT, Hypothesis, probabilities
-from diagnosis.fit.descent import FINE
 from diagnosis.fit.likelihood import SUBSTANTIAL
+from diagnosis.judge.by_prediction import presence_by_prediction
 from diagnosis.judge.confirmation import confronted
 from diagnosis.judge.judgement import Judge, Judgement
+from diagnosis.judge.verdict import LISTED, genuine_beside
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import leads_over, rounding_effect
@@ -22,6 +23,8 @@ from diagnosis.next_experiment.discrimination import (
     competing_hypotheses,
     competing_hypothesis,
 )
+from diagnosis.repair.repair import Repairs
+from diagnosis.repair.stability import share_of_repairs
 from diagnosis.search.white import WhiteSearch
 from plant.effects import LOOK_ALIKES
 
@@ -46,12 +49,14 @@ class KnownNoise(Judge[Hypothesis]):
             self.found = seen
             weighed = probabilities(self.found)
             accepted = _accepted(self.found, weighed.answer)
-        last = accepted.end
-        if not late and (last.candidates or last.deviations.size):
-            last = min(last.on(model, model.start, **FINE), last, key=lambda one: one.loss)
         nothing = np.zeros(model.nominal.count)
         self.stated = replace(base, end=replace(base.end, deviations=nothing))
-        self.refit, self.repaired = base, replace(accepted, end=last)
+        self.refit = base
+        repairs = Repairs(search, base)
+        self.repair = repairs.best(accepted.names)
+        self.trials = repairs.trials
+        self.repaired = self.repair.explanation
+        converged = self.repaired.end.converged
         rounding, together = rounding_effect(case), accepted.names
         self.floor = NOISE_FLOOR if rounding is None else rounding.floor
         if rounding is not None:
@@ -68,10 +73,35 @@ class KnownNoise(Judge[Hypothesis]):
         near = [h for h in sets if h.end.loss <= accepted.end.loss + SUBSTANTIAL and answer != "unknown"]
         alike = tuple(name for h in sorted(near, key=lambda h: h.end.loss) for name in h.names)
         self.said = Judgement(
-            weighed, answer, together, untried, rounding, alike, converged=last.converged or late
+            weighed, answer, together, untried, rounding, alike, converged=converged or late
         )
         self.complete = 1 - sum(weighed.cause[name] for name in ("unknown", *untried))
         self.gap_refit = held_out_gap(case, search.whitened(base, case.held_out))
+        if answer == "unknown":
+            presence = {**weighed.presence, **self._presence_by_prediction()}
+            self.said = replace(self.said, probabilities=replace(weighed, presence=presence))
+
+    def _presence_by_prediction(self) -> dict[str, float]:
+        """Effect of the repair -> probability that it is there, where prediction has more than evidence.
+
+        The main cause stays unknown: where simulation and sensors are exact, an effect that leaves anything
+        is not the whole cause.
+        """
+        gap_after = self._gap(self.repaired)
+        beyond_noise = self.gap_refit**2 - self.floor**2
+        if not beyond_noise > 0:
+            return {}
+        left = max(gap_after**2 - self.floor**2, 0.0) / beyond_noise
+        in_repairs = share_of_repairs(self.trials)
+        presence = {}
+        for name in self.repaired.names:
+            if name not in self.said.probabilities.presence:
+                continue
+            share, _, _ = self.explains(self.repaired, name, gap_after)
+            if np.isfinite(share):
+                there = presence_by_prediction(in_repairs.get(name, 0.0), genuine_beside(share, left), LISTED)
+                presence[name] = max(there, self.said.probabilities.presence[name])
+        return presence
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
         likeliest = max(self.found, key=lambda h: h.unknown_weight)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from diagnosis.answer import Diagnosis
+from diagnosis.answer import Diagnosis, Shares
 from diagnosis.evidence.explanation import Explanation, best_of_sets
 from diagnosis.fit.descent import Descent
 from diagnosis.judge import verdict as judging
+from diagnosis.judge.by_prediction import presence_by_prediction, raised
 from diagnosis.judge.carried import closed_by, shares_of
 from diagnosis.judge.judgement import Judge
 from diagnosis.judge.verdict import JudgedSets
@@ -18,6 +20,8 @@ from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
+from diagnosis.repair.repair import Repairs, Trial
+from diagnosis.repair.stability import share_of_repairs
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
@@ -70,42 +74,47 @@ class BesideModelError(Judge[Explanation]):
     def __init__(self, search: Search, rng: np.random.Generator) -> None:
         """Validation records have a veto: what certainly makes these worse is something else. Without such an
         effect everything is judged anew."""
-        self.search, case = search, search.case
-        noise, listed = case.noise, case.machine.weighing.listed
+        self.search = search
+        listed = search.case.machine.weighing.listed
+        repairs: Repairs[Explanation] | None = None
         while True:
-            self.said = found = judging.judged(search)
+            judged = judging.judged(search)
             search.progress(1.0, "done")
-            refit, best = found.nominal, found.judged[0]
-            accepted, self.partial, self.looks_like = refit, tuple[str, ...](), False
-            if found.answer == "unknown":
-                self.looks_like = best.explains > 0.5 and not set(best.explanation.names) <= set(listed)
-                accepted = _in_part(search, found, looks_like=self.looks_like)
-                self.partial = tuple(sorted(accepted.names))
-            elif found.accepted:
-                fitted = found.fitted(found.accepted)
-                whole = next(one for one in found.judged if fitted <= {p.name for p in one.parts})
-                accepted = _kept(search, whole, found.accepted)
-                if accepted.pooled_held_out(noise) > refit.pooled_held_out(noise):
-                    accepted = whole.explanation
-            if accepted.names:
-                # Values are re-estimated beside effects too only where that serves validation records.
-                accepted = min(accepted, search.stated(accepted), key=lambda e: e.pooled_held_out(noise))
-            self.shares = shares_of(search, found.accepted or self.partial, accepted, refit, rng)
-            worse = {n for n, (*_, most) in self.shares.carried.items() if most <= 0 and n in found.accepted}
-            if not (worse := worse - search.refuted - {*self.shares.silent}):
+            if repairs is None:
+                repairs = Repairs(search, judged.nominal)
+            self.repair = repairs.best(judged.fitted(judged.accepted))
+            names = self.repair.names
+            matter = judged.accepted or names
+            repaired = self.repair.explanation
+            self.shares = shares_of(search, matter, repaired, judged.nominal, rng)
+            surely_worse = {
+                name
+                for name, (*_, most) in self.shares.carried.items()
+                if most <= 0 and name in judged.accepted and name not in self.shares.silent
+            }
+            surely_worse -= search.refuted
+            if not surely_worse:
                 break
-            search.refuted |= worse
-        self.stated, self.refit, self.repaired = search.stated(), refit, accepted
-        self.complete = judging.below_threshold(search, accepted)
+            search.refuted |= surely_worse
+        likeliest = judged.judged[0]
+        self.looks_like = (
+            judged.answer == "unknown"
+            and likeliest.explains > 0.5
+            and not set(likeliest.explanation.names) <= set(listed)
+        )
+        self.trials = repairs.trials
+        self.said = by_repair(search, judged, self.trials, repaired, self.shares)
+        self.stated = search.stated()
+        self.refit = judged.nominal
+        self.repaired = repaired
+        self.complete = judging.below_threshold(search, repaired)
         self.sets = best_of_sets(search.found)
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
         """What a time limit left out is said."""
-        named = self.repaired if self.partial else self.said.judged[0].explanation
         return self.recorded(
             rng,
-            unlisted=named.end.effects if self.looks_like else (),
-            partial_model=self.partial,
+            unlisted=self.said.judged[0].explanation.end.effects if self.looks_like else (),
             shares=self.shares,
             competing=_competing(self.search, self.said),
         )
@@ -129,39 +138,48 @@ class BesideModelError(Judge[Explanation]):
     def explains(self, found: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
         rest = judging.best_without(self.sets, found, name)
         closes = [closed_by(self.search, e, self.refit) for e in (found, rest)]
-        alone = (max(closes[0] - closes[1], 0.0), float("nan"), float("nan"))
+        alone = (float(np.clip(closes[0] - closes[1], 0.0, 1.0)), float("nan"), float("nan"))
         return self.shares.carried.get(name) or alone
 
 
-def _kept(search: Search, whole: judging.Judged, accepted: Iterable[str]) -> Explanation:
-    """A set without what is not accepted and carries next to nothing, fitted to its end.
+def by_repair(
+    search: Search,
+    judged: JudgedSets,
+    trials: Sequence[Trial[Explanation]],
+    repaired: Explanation,
+    shares: Shares,
+) -> JudgedSets:
+    """What evidence says, with no effect of the repair less probable than prediction has it.
 
-    Nor is kept what stands at an end of its range: a size that is no answer, and moves those that are.
+    Where evidence answers "unknown" and an effect becomes likelier than that, it is the answer. An answer
+    "none" stays: what is left does not interest, whatever explains it.
     """
-    least = judging.LITTLE * search.case.machine.weighing.model_error
-    accepted = set(accepted)
-    small = {part.name for part in whole.parts if part.share > least and part.by_name < 1}
-    kept = [n for n in whole.explanation.names if n in accepted | small]
-    if search.out_of_time:
-        return whole.explanation
-    return search.finished(search.by_these(kept, whole.explanation))
-
-
-def _in_part(search: Search, found: JudgedSets, *, looks_like: bool) -> Explanation:
-    """What the records look like, or the likeliest set of listed effects.
-
-    The nominal re-estimated where that does not close most of the held-out gap, leaves half of the motion
-    there, or as much as the nominal as stated.
-    """
-    listed = (one for one in found.judged if one.parts and len(one.parts) == len(one.explanation.names))
-    whole = found.judged[0] if looks_like else next(listed, None)
-    if whole is None:
-        return found.nominal
-    unlisted = set(whole.explanation.names) - {part.name for part in whole.parts}
-    part, noise = _kept(search, whole, unlisted), search.case.noise
-    closes = closed_by(search, part, found.nominal) > judging.MOST_OF_IT
-    nearer = part.pooled_held_out(noise) < found.nominal.pooled_held_out(noise)
-    return part if closes and nearer and np.max(part.shares[1]) < 1 - judging.MOST_OF_IT else found.nominal
+    weighing = search.case.machine.weighing
+    if judged.answer == "none" or not shares.carried:
+        return judged
+    carried = {name: share for name, (share, _, _) in shares.carried.items()}
+    closed = closed_by(search, repaired, judged.nominal)
+    in_repairs = share_of_repairs(trials)
+    presence = {}
+    for name, share in carried.items():
+        if name not in weighing.listed or name in search.refuted or share <= 0:
+            continue
+        there = presence_by_prediction(
+            in_repairs.get(name, 0.0), judging.genuine_beside(share, 1 - closed), judging.LISTED
+        )
+        if weighing.counted:
+            there *= 1 - judging.acts_like(name, weighing.listed, weighing.counted)
+        presence[name] = there
+    probabilities = raised(judged.probabilities, presence, carried)
+    answer = judged.answer
+    accepted = judged.accepted
+    if answer == "unknown":
+        answer = probabilities.counting_as_unknown(judged.untried).answer
+    if answer != judged.answer:
+        sets_with_it = [names for names in probabilities.sets if answer in names]
+        likeliest = max(sets_with_it, key=lambda names: probabilities.sets[names])
+        accepted = tuple(sorted(likeliest, key=lambda name: -carried.get(name, 0.0)))
+    return replace(judged, probabilities=probabilities, answer=answer, accepted=accepted)
 
 
 def _competing(search: Search, found: JudgedSets) -> tuple[CompetingHypothesis, ...]:

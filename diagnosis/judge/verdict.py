@@ -52,6 +52,8 @@ _FAR_OFF = 4.4
 # of shares of the motion, normal; any size above its median for an unknown cause), prior of the latter.
 _IMPERFECTIONS, _IMPERFECTIONS_WIDTH = 0.6, 0.65
 _UNKNOWN, _UNKNOWN_WIDTH, _PRIOR_UNKNOWN = 2.2, 0.6, 0.15
+# Prior probability that what acts like an effect of the list is one, not a cause beyond it.
+LISTED = _PRIOR_COUNT[1] / (_PRIOR_COUNT[1] + _PRIOR_UNKNOWN)
 # Share of the motion that is nothing.
 _NOTHING = 1e-4
 # How far off (logarithm) the usual model error may be which stands for one nobody has stated: a judgement.
@@ -548,6 +550,15 @@ def _genuine(part: Part, one: Judged) -> float:
     other carry no more than the set does."""
     share = min(part.share, one.carries)
     return (1 - part.by_name) * _soft(share / _STANDS_IN / max(one.left, _NOTHING), _STANDS_IN_WIDTH)
+
+
+def genuine_beside(share: float, left: float) -> float:
+    """Probability that an effect does not stand in for what its set leaves.
+
+    share, left : of the energy of the error, what it explains and what nothing explains.
+    """
+    size = float(np.sqrt(share / max(left, _NOTHING)))
+    return _soft(size / _STANDS_IN, _STANDS_IN_WIDTH)
 
 
 def subsets(items: Iterable[int]) -> list[tuple[int, ...]]:

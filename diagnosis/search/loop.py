@@ -12,7 +12,7 @@ import numpy as np
 from diagnosis.evidence.explanation import E, best_of_sets
 from diagnosis.fit.descent import Descent, best_following, descend
 from diagnosis.fit.likelihood import DECISIVE
-from diagnosis.fit.records import RecordsToFit
+from diagnosis.fit.records import FittedStart, RecordsToFit
 from diagnosis.fit.starts import StartPoint, point_of
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from plant.effects.search_space import Candidate
@@ -128,6 +128,33 @@ class SearchLoop(ABC, Generic[E]):
     @abstractmethod
     def whitened(self, found: E, experiments: Sequence[RecordOfMachine] | None = None) -> dict[str, Real]:
         """experiment -> (measured - model)/noise (T, Y), of the given ones (default: all)."""
+
+    @property
+    def uninteresting_energy(self) -> float:
+        """Energy, over noise, of what a good model may miss in the logs that repairs are compared in; 0 where
+        the simulation is to be as good as the sensors."""
+        return 0.0
+
+    @abstractmethod
+    def predicted(self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
+        """What a model leaves of an estimation record of which nothing but its start is fitted.
+
+        Parameters
+        ----------
+        log : int
+            Place of the record among the estimation records.
+        deviations : (P,) array
+            Nominal values, in tolerances off.
+        effects : sequence
+            With their sizes.
+        start : FittedStart
+            Of all estimation records; the states of this one are where its own are sought from.
+
+        Returns
+        -------
+        (T, Y) array
+            (measured - model) / noise; not finite where the simulation runs away.
+        """
 
     @abstractmethod
     def looked_for(

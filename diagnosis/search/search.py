@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from diagnosis.evidence.explanation import Explanation
 from diagnosis.fit.descent import FINE, Descent, descend, loss_at, occam, refined
+from diagnosis.fit.levels import UNINTERESTING
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.records import FittedStart, Records, mean_square_left
 from diagnosis.fit.starts import StartPoint, beside
@@ -52,6 +54,8 @@ class Search(SearchLoop[Explanation]):
         self.records = Records(case, case.estimation, windows)
         self.held_out = Records(case, case.held_out, windows)
         self.watched = self.records, self.held_out
+        # Estimation records each by itself, as `predicted` asks for them.
+        self._single_logs: dict[int, Records] = {}
 
     @cached_property
     def horizon(self) -> Windows | None:
@@ -188,6 +192,25 @@ class Search(SearchLoop[Explanation]):
         parts = zip(records, (*found.left, *found.left_held_out), strict=True)
         left = {e.name: part / self.case.noise for e, part in parts}
         return {e.name: left[e.name] for e in experiments or self.case.experiments}
+
+    @cached_property
+    def uninteresting_energy(self) -> float:
+        """See `SearchLoop.uninteresting_energy`: the share of the motion that no fit follows either."""
+        share = UNINTERESTING * self.case.machine.weighing.model_error
+        logs = (self.records, self.held_out) if len(self.case.estimation) > 1 else (self.held_out,)
+        motion = [records.levels.motion.reshape(-1, self.case.noise.size) for records in logs]
+        return share**2 * float(np.sum(np.concatenate(motion) / self.case.noise**2))
+
+    def predicted(self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
+        """See `SearchLoop.predicted`; in windows what is left has no part of what starts of windows do."""
+        record = self.case.estimation[log]
+        if log not in self._single_logs:
+            self._single_logs[log] = Records(self.case, (record,), self.windows)
+            self.watched = (*self.watched, self._single_logs[log])
+        records = self._single_logs[log]
+        near = FittedStart(start.states[log : log + 1], start.zeros)
+        _, e = settled(records, deviations, effects, near)
+        return np.asarray(records.residuals_of(e)[0] / self.case.noise)
 
     def _beginning(self, held: Records, fitted: FittedStart) -> FittedStart:
         """Starts of records as their first samples say, sensors at the zeros that others have."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from diagnosis.evidence.hypotheses import (
 from diagnosis.fit.descent import FINE, Descent, descend, refined
 from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.likelihood import DECISIVE, WORTH_IT
+from diagnosis.fit.records import FittedStart
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
 from diagnosis.fit.starts import StartPoint, beside, superposed
@@ -141,6 +143,11 @@ class WhiteSearch(SearchLoop[Hypothesis]):
         self, found: Hypothesis, experiments: Sequence[RecordOfMachine] | None = None
     ) -> dict[str, Real]:
         return self.records.by_experiment(found.end.deviations, found.end.effects, experiments)
+
+    def predicted(self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
+        """See `SearchLoop.predicted`; starts are known here."""
+        record = self.case.estimation[log]
+        return self.records.by_experiment(deviations, effects, (record,))[record.name]
 
 
 def _beyond_noise(end: Descent) -> float:

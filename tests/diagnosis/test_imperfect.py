@@ -25,7 +25,6 @@ from diagnosis.fit.records import FittedStart, Records, StartColumns
 from diagnosis.fit.starts import StartPoint, points_of
 from diagnosis.judge import verdict
 from diagnosis.judge.carried import shares_of
-from diagnosis.judge.model_error import _in_part
 from diagnosis.judge.verdict import TEMPER, _enough, _weights, is_silent, judged
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Weighing
@@ -813,29 +812,6 @@ def test_below_the_threshold_an_effect_matters_that_is_most_of_the_error(error, 
     found = _judged({(): (0.0, shares[0], shares[0]), ("coulomb_friction",): (400.0, *shares[1:])})
     assert (found.probabilities.presence["coulomb_friction"] > 0.6) == there
     assert found.answer == ("coulomb_friction" if there else "none")
-
-
-@pytest.mark.parametrize(
-    ("names", "left", "stated", "partial"),
-    [
-        pytest.param("gravity", 0.25, 0.3, (), id="less-than-half-of-the-energy"),
-        pytest.param("gravity", 0.2, 0.19, (), id="more-than-the-model-as-stated"),
-        pytest.param("ground_spring", 0.2, 0.3, (), id="not-of-the-list"),
-        pytest.param("ground_spring", 0.02, 0.3, ("ground_spring",), id="what-it-looks-like"),
-    ],
-)
-def test_what_closes_most_of_a_gap_of_unknown_cause_is_told(names, left, stated, partial):
-    # 0.3 of the motion is left without it.
-    search = _searched({(): (0.0, 0.3, 0.3), (names,): (400.0, left, left)}, stated=stated)
-    found = judged(search)
-    assert found.answer == "unknown"
-    assert _in_part(search, found, looks_like=left < 0.05).names == partial
-
-
-def test_a_partial_model_that_leaves_half_of_the_motion_is_none():
-    sets = {(): (0.0, 3.0, 3.0), ("gravity",): (400.0, 0.52, 0.52)}
-    search = _searched(sets)
-    assert _in_part(search, judged(search), looks_like=False) is search.base
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,301 @@
+"""The repair of a model: the effects and values with which it predicts logs best that were not used.
+
+A search has fitted many sets of effects to the estimation records. Which of them makes the simulation predict
+better is asked of logs: every validation record, to which nothing was fitted, and every estimation record,
+left out of the fit in turn (`left_out`). Of the sets that predict as well as the best, within one standard
+error, the smallest is taken (Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984,
+3.4.3), and of its nominal values as few are moved as predict as well. What a good model may miss anyway is no
+reason for a larger set: what a real machine has beyond its model is the same in every log, so that almost any
+effect makes some tiny part of it surely smaller. No probability of a cause has a say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from typing import Generic
+
+import numpy as np
+import numpy.typing as npt
+
+from diagnosis.evidence.explanation import E, best_of_sets
+from diagnosis.fit.coordinates import box, effects_at, solved
+from diagnosis.fit.descent import FINE, Descent, descend, loss_at
+from diagnosis.repair.left_out import SharedUnknowns, fitted_without_each_log
+from diagnosis.repair.prediction_error import PredictionError
+from diagnosis.search.loop import SEVERAL, SearchLoop
+
+# Simulations of a repair, as a share of those of its search: it may cost a fifth of a diagnosis, and the last
+# descent comes on top. With half of it the pendulum and the joints of `real_machine_gaps` have the same
+# repair.
+_SHARE_OF_SEARCH = 0.15
+# Every number of moved values up to this one is tried, beyond it every doubling: a repair that moves more is
+# asked less finely how many.
+_EACH_NUMBER = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Trial(Generic[E]):
+    """A set of effects with some of the nominal values moved, and how well it predicts.
+
+    Attributes
+    ----------
+    explanation : Explanation or Hypothesis
+        With what it leaves of every record.
+    moved : (P,) array of bool
+        Nominal values that were re-estimated; the others are as stated.
+    error : PredictionError
+        Of estimation records left out in turn, where there are two or more, then of validation records.
+    validation : PredictionError
+        Of validation records alone.
+    """
+
+    explanation: E
+    moved: npt.NDArray[np.bool_]
+    error: PredictionError
+    validation: PredictionError
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Effects, in the order in which they were found."""
+        return self.explanation.names
+
+
+class Repairs(Generic[E]):
+    """Repairs from what one search has fitted.
+
+    Attributes
+    ----------
+    trials : list of Trial
+        What was tried, for every set of effects the better of all values moved and none; the nominal first.
+    """
+
+    def __init__(self, search: SearchLoop[E], nominal: E) -> None:
+        """Try the sets of a search until its share of simulations is used or its time is up.
+
+        Parameters
+        ----------
+        search : SearchLoop
+            After its run.
+        nominal : Explanation or Hypothesis
+            The model without effects that a repair has to beat on validation records: as stated or
+            re-estimated.
+        """
+        self.search = search
+        self._budget_end = search.simulations * (1 + _SHARE_OF_SEARCH)
+        validation = self._validation_error(nominal)
+        self._most_energy = float(np.sum(validation.energy))
+        self.trials: list[Trial[E]] = []
+        for explanation in self._shortlist():
+            variants = [self._tried(explanation.end, self._all_moved(), explanation)]
+            # What may be moved and need not.
+            if explanation.end.deviations.size:
+                variants.append(self._tried(explanation.end, ~self._all_moved()))
+            self.trials.append(min(variants, key=lambda trial: trial.error.rms))
+            if search.simulations > self._budget_end or search.out_of_time:
+                break
+
+    def best(self, named: Collection[str]) -> Trial[E]:
+        """The repair: few effects, few values, descended to its end.
+
+        Parameters
+        ----------
+        named : collection of str
+            Effects that are named as the cause. Among sets that predict equally well they go first, so that
+            name and repair agree where the logs allow it.
+        """
+        chosen = self._smallest_set(named)
+        chosen = self._fewest_values(chosen)
+        return self._descended(chosen)
+
+    def _shortlist(self) -> list[E]:
+        """Fitted sets that are worth a look at logs left out: the nominal, then those that leave least.
+
+        For every number of effects the `SEVERAL` that leave least of the validation records and the likeliest
+        one; none that leaves more of these than the nominal does.
+        """
+        likeliest = best_of_sets(self.search.found)
+        energies = {
+            key: float(np.sum(self._validation_error(explanation).energy))
+            for key, explanation in likeliest.items()
+        }
+        shortlist = []
+        for count in range(1, max(len(key) for key in likeliest) + 1):
+            keys = [key for key in likeliest if len(key) == count and energies[key] <= self._most_energy]
+            predicting = sorted(keys, key=lambda key: energies[key])[:SEVERAL]
+            # The dictionary has the likeliest first.
+            shortlist += list(dict.fromkeys([*predicting, *keys[:1]]))
+        shortlist.sort(key=lambda key: energies[key])
+        return [self.search.base, *(likeliest[key] for key in shortlist)]
+
+    def _all_moved(self) -> npt.NDArray[np.bool_]:
+        return np.ones(self.search.records.nominal.count, dtype=bool)
+
+    def _validation_error(self, explanation: E) -> PredictionError:
+        """Of a model as it was fitted, in the validation records."""
+        held_out = self.search.case.held_out
+        residuals = self.search.whitened(explanation, held_out)
+        return PredictionError.of([residuals[record.name] for record in held_out])
+
+    def _tried(self, end: Descent, moved: npt.NDArray[np.bool_], explanation: E | None = None) -> Trial[E]:
+        """The end of a fit with these values moved and the others as stated, and its prediction error.
+
+        explanation : of that end, where all values are moved.
+        """
+        search = self.search
+        if explanation is None:
+            if not np.all(moved):
+                end = self._with_values_as_stated(end, moved)
+            explanation = search.explained(end)
+        held_out = search.case.held_out
+        whitened = search.whitened(explanation, held_out)
+        residuals = [whitened[record.name] for record in held_out]
+        validation = PredictionError.of(residuals)
+        logs = len(search.case.estimation)
+        if logs < 2 or search.out_of_time:
+            return Trial(explanation, moved, validation, validation)
+        left_out = []
+        for log, without in enumerate(fitted_without_each_log(search.records, end, moved)):
+            effects = effects_at(end.candidates, without.coordinates)
+            left_out.append(search.predicted(log, without.deviations, effects, without.start))
+        return Trial(explanation, moved, PredictionError.of([*left_out, *residuals]), validation)
+
+    def _with_values_as_stated(self, end: Descent, moved: npt.NDArray[np.bool_]) -> Descent:
+        """The end of a fit with the other values put back to what is stated, all else following linearly.
+
+        Sizes that stay where they are, are tried too: where the values were far off a linearisation says
+        little.
+        """
+        records = self.search.records
+        normal = end.normal(records)
+        P = end.deviations.size
+        A = end.coordinates.size
+        back = np.zeros(normal.hessian.shape[0])
+        back[:P] = np.where(moved, 0.0, -end.deviations)
+        fixed = np.flatnonzero(~moved)
+        free = np.setdiff1d(np.arange(back.size), fixed)
+        gradient = normal.gradient(end.start, end.left) + normal.hessian @ back
+        following = back.copy()
+        following[free] -= solved(normal.hessian[np.ix_(free, free)], gradient[free])
+
+        low, high = box(end.candidates)
+        ends = []
+        for step in (following, back):
+            deviations = records.nominal.within(end.deviations + step[:P])
+            deviations[fixed] = 0.0
+            point = SharedUnknowns(
+                deviations,
+                np.clip(end.coordinates + step[P : P + A], low, high),
+                end.columns.moved(end.start, step[P + A :]),
+            )
+            left = records.coefficients(
+                point.deviations, effects_at(end.candidates, point.coordinates), point.start
+            )
+            loss, prior = loss_at(records, left, point.deviations, point.start)
+            ends.append(
+                replace(
+                    end,
+                    deviations=point.deviations,
+                    coordinates=point.coordinates,
+                    start=point.start,
+                    left=left,
+                    weights=records.likelihood.weights(left),
+                    loss=loss,
+                    prior=prior,
+                )
+            )
+        return min(ends, key=lambda tried: tried.loss)
+
+    def _smallest_set(self, named: Collection[str]) -> Trial[E]:
+        """Of the sets that predict as well as the best: with most of the named effects, then with fewest
+        effects, then the likeliest."""
+        best = min(self.trials, key=lambda trial: trial.error.rms)
+        as_good = [trial for trial in self.trials if self._as_good(trial, best)]
+
+        def rank(trial: Trial[E]) -> tuple[int, int, float]:
+            named_here = len(set(trial.names) & set(named))
+            return -named_here, len(trial.names), -trial.explanation.evidence
+
+        return min(as_good, key=rank)
+
+    def _as_good(self, trial: Trial[E], best: Trial[E]) -> bool:
+        return trial.error.as_good_as(best.error, self.search.uninteresting_energy)
+
+    def _fewest_values(self, chosen: Trial[E]) -> Trial[E]:
+        """The same effects with as few nominal values moved as predict as well as the best number of them.
+
+        Which value goes back next is told by the fit with all of them moved: the one without which the
+        estimation records lose least.
+        """
+        search = self.search
+        full = best_of_sets(search.found)[chosen.explanation.key].end
+        P = full.deviations.size
+        if not P:
+            return chosen
+        order = _order_of_return(full, full.normal(search.records).hessian)
+        sizes = sorted({*range(min(P, _EACH_NUMBER) + 1), *(2**k for k in range(2, 8) if 2**k < P), P})
+        trials = [chosen]
+        for size in sizes:
+            moved = np.zeros(P, dtype=bool)
+            moved[order[P - size :]] = True
+            if np.array_equal(moved, chosen.moved):
+                continue
+            if search.simulations > self._budget_end or search.out_of_time:
+                break
+            trials.append(self._tried(full, moved))
+        better = [t for t in trials if float(np.sum(t.validation.energy)) <= self._most_energy]
+        best = min(better or trials, key=lambda trial: trial.error.rms)
+        as_good = [trial for trial in better or trials if self._as_good(trial, best)]
+        return min(as_good, key=lambda trial: (int(np.sum(trial.moved)), trial.error.rms))
+
+    def _descended(self, chosen: Trial[E]) -> Trial[E]:
+        """A repair descended to its end, the values that are as stated held; as it was where that predicts
+        worse, or no time is left."""
+        search = self.search
+        end = chosen.explanation.end
+        if search.out_of_time or not (end.candidates or np.any(chosen.moved)):
+            return chosen
+        descended = descend(
+            search.records,
+            end.candidates,
+            end.deviations,
+            end.coordinates,
+            end.start,
+            nominal_jacobian=end.jacobian[:, : end.deviations.size],
+            columns=end.columns,
+            moved=chosen.moved,
+            **FINE,
+        )
+        explanation = search.explained(descended)
+        validation = self._validation_error(explanation)
+        if float(np.sum(validation.energy)) > float(np.sum(chosen.validation.energy)):
+            return chosen
+        return replace(chosen, explanation=explanation, validation=validation)
+
+
+def _order_of_return(end: Descent, hessian: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+    """(P,) nominal values in the order in which they go back to what is stated, the least missed first.
+
+    Parameters
+    ----------
+    end : Descent
+        Of a fit in which all of them were moved.
+    hessian : (M, M) array
+        Of its loss by all unknowns, the P deviations first.
+
+    Notes
+    -----
+    Putting the values of a set S back by -d_S, with all else following, costs 1/2 d_S' [(H^-1)_SS]^-1 d_S to
+    second order. One value at a time is added to S.
+    """
+    P = end.deviations.size
+    inverse = np.linalg.pinv(hessian, hermitian=True)
+    returned: list[int] = []
+    while len(returned) < P:
+        costs = {}
+        for value in set(range(P)) - set(returned):
+            back = [*returned, value]
+            covariance = np.asarray(inverse[np.ix_(back, back)], dtype=np.float64)
+            costs[value] = float(end.deviations[back] @ solved(covariance, end.deviations[back]))
+        returned.append(min(costs, key=lambda value: (costs[value], value)))
+    return np.array(returned, dtype=np.int64)
