@@ -31,13 +31,22 @@ def document_of(
     the main cause (they sum to one), `presence` of being there at all. `presence` has that of every
     candidate, with its size and the share of the validation error that it explains (interval in `explains`);
     `completeness` says whether that is all. gap_* are the pooled root mean square
-    of (measured - model)/noise over the held-out experiments. partial_model: what the repaired model holds of
-    an answer "unknown".
+    of (measured - model)/noise over the held-out experiments. `repair` comes first: values and effects of the
+    repaired model, and in `prediction` what it is worth in logs that nothing was fitted to
+    (`diagnosis.answer.Prediction`). partial_model: its effects where the answer is none or unknown.
     beside: what else was looked at.
     """
     document = {
         "format": FORMAT,
         "case": loaded.case.name,
+        "repair": {
+            "values": {
+                key: {"stated": loaded.case.machine.description.value(key), "repaired": found.rig.value(key)}
+                for key in found.deviations
+            },
+            "effects": [effect.to_dict() for effect in found.repair],
+            "prediction": found.prediction,
+        },
         "verdict": found.verdict,
         "detail_verdict": found.detail_verdict,
         "effects": found.effects,
@@ -85,13 +94,6 @@ def document_of(
         **(beside or {}),
         **({} if found.shares is None else {"shares": found.shares}),
         "deviations": found.deviations,
-        "repair": {
-            "values": {
-                key: {"stated": loaded.case.machine.description.value(key), "repaired": found.rig.value(key)}
-                for key in found.deviations
-            },
-            "effects": [effect.to_dict() for effect in found.repair],
-        },
         "suspected": {name: found.presence(name) for name in loaded.suspected},
         "rig_file": loaded.rig_file,
         "simulations": found.simulations,
