@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from diagnosis.evidence.explanation import E, best_of_sets
 from diagnosis.fit.coordinates import box, effects_at, solved
-from diagnosis.fit.descent import FINE, Descent, descend, loss_at
+from diagnosis.fit.descent import Descent, descend, loss_at
 from diagnosis.repair.left_out import SharedUnknowns, fitted_without_each_log
 from diagnosis.repair.prediction_error import PredictionError
 from diagnosis.search.loop import SEVERAL, SearchLoop
@@ -83,8 +83,7 @@ class Repairs(Generic[E]):
         """
         self.search = search
         self._budget_end = search.simulations * (1 + _SHARE_OF_SEARCH)
-        validation = self._validation_error(nominal)
-        self._most_energy = float(np.sum(validation.energy))
+        self._nominal_validation = self._validation_error(nominal)
         self.trials: list[Trial[E]] = []
         for explanation in self._shortlist():
             variants = [self._tried(explanation.end, self._all_moved(), explanation)]
@@ -105,8 +104,43 @@ class Repairs(Generic[E]):
             name and repair agree where the logs allow it.
         """
         chosen = self._smallest_set(named)
+        missing = [name for name in named if name not in chosen.names]
+        if missing and self._try_with(chosen, missing):
+            chosen = self._smallest_set(named)
         chosen = self._fewest_values(chosen)
         return self._descended(chosen)
+
+    def _try_with(self, chosen: Trial[E], further: Collection[str]) -> bool:
+        """Try a set with further effects, from where these ended elsewhere; whether there was one to try.
+
+        A name and a repair that lacks it may only not have been fitted together. An effect that contains one
+        of the set, or is contained in one, is left out.
+        """
+        search = self.search
+        end = chosen.explanation.end
+        candidates = list(end.candidates)
+        coordinates = [end.coordinates]
+        for name in further:
+            holding = max(
+                (fit for fit in search.found if name in fit.names), key=lambda fit: fit.evidence, default=None
+            )
+            if holding is None:
+                continue
+            place = holding.names.index(name)
+            candidate = holding.end.candidates[place]
+            related = {candidate.kind.contains, *(c.kind.contains for c in candidates)}
+            if related & {candidate.effect, *(c.effect for c in candidates)}:
+                continue
+            candidates.append(candidate)
+            coordinates.append(holding.end.coordinates_of(place))
+        key = tuple(sorted(candidate.effect for candidate in candidates))
+        known = any(trial.explanation.key == key for trial in self.trials)
+        if known or len(candidates) == len(end.candidates) or search.out_of_time:
+            return False
+        fitted = descend(search.records, candidates, end.deviations, np.concatenate(coordinates), end.start)
+        explanation = search.add(fitted)
+        self.trials.append(self._tried(fitted, self._all_moved(), explanation))
+        return True
 
     def _shortlist(self) -> list[E]:
         """Fitted sets that are worth a look at logs left out: the nominal, then those that leave least.
@@ -115,13 +149,14 @@ class Repairs(Generic[E]):
         one; none that leaves more of these than the nominal does.
         """
         likeliest = best_of_sets(self.search.found)
-        energies = {
-            key: float(np.sum(self._validation_error(explanation).energy))
-            for key, explanation in likeliest.items()
-        }
-        shortlist = []
+        energies = {}
+        for key, explanation in likeliest.items():
+            validation = self._validation_error(explanation)
+            if validation.as_good_as(self._nominal_validation):
+                energies[key] = float(np.sum(validation.energy))
+        shortlist: list[tuple[str, ...]] = []
         for count in range(1, max(len(key) for key in likeliest) + 1):
-            keys = [key for key in likeliest if len(key) == count and energies[key] <= self._most_energy]
+            keys = [key for key in energies if len(key) == count]
             predicting = sorted(keys, key=lambda key: energies[key])[:SEVERAL]
             # The dictionary has the likeliest first.
             shortlist += list(dict.fromkeys([*predicting, *keys[:1]]))
@@ -210,16 +245,14 @@ class Repairs(Generic[E]):
         """Of the sets that predict as well as the best: with most of the named effects, then with fewest
         effects, then the likeliest."""
         best = min(self.trials, key=lambda trial: trial.error.rms)
-        as_good = [trial for trial in self.trials if self._as_good(trial, best)]
+        uninteresting = self.search.uninteresting_energy
+        as_good = [trial for trial in self.trials if trial.error.as_good_as(best.error, uninteresting)]
 
         def rank(trial: Trial[E]) -> tuple[int, int, float]:
             named_here = len(set(trial.names) & set(named))
             return -named_here, len(trial.names), -trial.explanation.evidence
 
         return min(as_good, key=rank)
-
-    def _as_good(self, trial: Trial[E], best: Trial[E]) -> bool:
-        return trial.error.as_good_as(best.error, self.search.uninteresting_energy)
 
     def _fewest_values(self, chosen: Trial[E]) -> Trial[E]:
         """The same effects with as few nominal values moved as predict as well as the best number of them.
@@ -243,9 +276,10 @@ class Repairs(Generic[E]):
             if search.simulations > self._budget_end or search.out_of_time:
                 break
             trials.append(self._tried(full, moved))
-        better = [t for t in trials if float(np.sum(t.validation.energy)) <= self._most_energy]
-        best = min(better or trials, key=lambda trial: trial.error.rms)
-        as_good = [trial for trial in better or trials if self._as_good(trial, best)]
+        no_worse = [trial for trial in trials if trial.validation.as_good_as(self._nominal_validation)]
+        best = min(no_worse or trials, key=lambda trial: trial.error.rms)
+        # A value that surely helps is known better now than it was, however little that interests.
+        as_good = [trial for trial in no_worse or trials if trial.error.as_good_as(best.error)]
         return min(as_good, key=lambda trial: (int(np.sum(trial.moved)), trial.error.rms))
 
     def _descended(self, chosen: Trial[E]) -> Trial[E]:
@@ -264,13 +298,11 @@ class Repairs(Generic[E]):
             nominal_jacobian=end.jacobian[:, : end.deviations.size],
             columns=end.columns,
             moved=chosen.moved,
-            **FINE,
         )
-        explanation = search.explained(descended)
-        validation = self._validation_error(explanation)
-        if float(np.sum(validation.energy)) > float(np.sum(chosen.validation.energy)):
+        trial = self._tried(descended, chosen.moved, search.explained(descended))
+        if trial.error.rms > chosen.error.rms:
             return chosen
-        return replace(chosen, explanation=explanation, validation=validation)
+        return trial
 
 
 def _order_of_return(end: Descent, hessian: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
