@@ -25,8 +25,19 @@ def tell(out: Print, found: Diagnosis) -> None:
         f"  noise {noise}; below {100 * found.case.model_error:.0f} % of the motion nothing is named. "
         f"Verdict {found.verdict} ({found.detail_verdict}): {_names(found.combination)}"
     )
-    if found.partial_model:
-        out(f"  in the repaired model, and called no cause: {_names(found.partial_model)}")
+    if found.prediction is not None:
+        repair = found.prediction
+        out(
+            f"  repair: {_names(repair.effects)}; moved {', '.join(repair.values) or 'no value'}; error on logs "
+            f"not used {repair.error_nominal:.2f} to {repair.error:.2f} (best set tried "
+            f"{repair.error_best:.2f}), {repair.unexplained:.3f} of it explained by nothing listed"
+        )
+        denied = [
+            effect.name
+            for effect in found.effects
+            if effect.name in repair.effects and effect.explains[0] > 0.3 and effect.presence < 0.2
+        ]
+        out(f"  denied above .8 though it explains more than .3: {', '.join(denied) or 'none'}")
     sets = sorted(found.sets.items(), key=lambda item: -item[1])[:4]
     out("  probable sets: " + "; ".join(f"{_names(names)} {p:.3f}" for names, p in sets))
     if found.ambiguous_with:

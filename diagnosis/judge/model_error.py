@@ -72,8 +72,8 @@ class BesideModelError(Judge[Explanation]):
     said: JudgedSets
 
     def __init__(self, search: Search, rng: np.random.Generator) -> None:
-        """Validation records have a veto: what certainly makes these worse is something else. Without such an
-        effect everything is judged anew."""
+        """Prediction has a veto: a named effect with which logs are surely predicted worse is something else.
+        Without such an effect everything is judged anew."""
         self.search = search
         listed = search.case.machine.weighing.listed
         repairs: Repairs[Explanation] | None = None
@@ -87,12 +87,16 @@ class BesideModelError(Judge[Explanation]):
             matter = judged.accepted or names
             repaired = self.repair.explanation
             self.shares = shares_of(search, matter, repaired, judged.nominal, rng)
+            whole = self._named_set(judged)
             surely_worse = {
                 name
-                for name, (*_, most) in self.shares.carried.items()
-                if most <= 0 and name in judged.accepted and name not in self.shares.silent
+                for name in judged.fitted(judged.accepted)
+                if name not in names
+                and name not in search.refuted
+                and whole is not None
+                and not judging.is_silent(search, whole, name)
+                and repairs.refutes(name, whole.names)
             }
-            surely_worse -= search.refuted
             if not surely_worse:
                 break
             search.refuted |= surely_worse
@@ -109,6 +113,12 @@ class BesideModelError(Judge[Explanation]):
         self.repaired = repaired
         self.complete = judging.below_threshold(search, repaired)
         self.sets = best_of_sets(search.found)
+
+    def _named_set(self, judged: JudgedSets) -> Explanation | None:
+        """The likeliest set that holds all that is named; None where nothing of the sets is."""
+        named = judged.fitted(judged.accepted)
+        holding = (one.explanation for one in judged.judged if named <= set(one.explanation.names))
+        return next(holding, None) if named else None
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
         """What a time limit left out is said."""

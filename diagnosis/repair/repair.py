@@ -29,6 +29,9 @@ from diagnosis.search.loop import SEVERAL, SearchLoop
 # descent comes on top. With half of it the pendulum and the joints of `real_machine_gaps` have the same
 # repair.
 _SHARE_OF_SEARCH = 0.15
+# Standard errors by which a set has to predict worse with an effect for that to be refuted: by chance once in
+# forty times. With twice as many, logs of two or three blocks that differ would refute nothing.
+_SURELY = 2.0
 # Every number of moved values up to this one is tried, beyond it every doubling: a repair that moves more is
 # asked less finely how many.
 _EACH_NUMBER = 4
@@ -109,6 +112,30 @@ class Repairs(Generic[E]):
             chosen = self._smallest_set(named)
         chosen = self._fewest_values(chosen)
         return self._descended(chosen)
+
+    def refutes(self, name: str, names: Collection[str]) -> bool:
+        """Whether logs are surely predicted worse by a set of effects with one of them than without it.
+
+        Parameters
+        ----------
+        name : str
+            The effect in question.
+        names : collection of str
+            The set, with it. What was not fitted refutes nothing.
+        """
+        trials = []
+        for key in (tuple(sorted(names)), tuple(sorted(set(names) - {name}))):
+            known = [trial for trial in self.trials if trial.explanation.key == key]
+            if known:
+                trials.append(known[0])
+                continue
+            explanation = best_of_sets(self.search.found).get(key)
+            if explanation is None:
+                return False
+            trials.append(self._tried(explanation.end, self._all_moved(), explanation))
+        with_it, without = trials
+        difference, standard_error = with_it.error.beyond(without.error)
+        return difference > _SURELY * standard_error
 
     def _try_with(self, chosen: Trial[E], further: Collection[str]) -> bool:
         """Try a set with further effects, from where these ended elsewhere; whether there was one to try.

@@ -230,7 +230,20 @@ def test_what_is_surely_worse_is_not_as_good_however_little():
 
 
 def trial(names, energy):
-    return SimpleNamespace(names=names, error=PredictionError(np.array(energy), np.ones(len(energy))))
+    error = PredictionError(np.array(energy), np.ones(len(energy)))
+    key = tuple(sorted(names))
+    return SimpleNamespace(names=names, explanation=SimpleNamespace(key=key), error=error)
+
+
+def test_an_effect_with_which_logs_are_surely_predicted_worse_is_refuted():
+    blocks = np.linspace(1.0, 2.0, 16)
+    trials = [trial((), 2 * blocks), trial(("lag",), 2.2 * blocks), trial(("drag", "lag"), blocks)]
+    trials.append(trial(("drag",), blocks + 0.2 * (-1.0) ** np.arange(16)))
+    repairs = SimpleNamespace(trials=trials, search=SimpleNamespace(found=[]))
+    assert Repairs.refutes(repairs, "lag", ("lag",))
+    # Better without by chance alone, and a set that nobody fitted.
+    assert not Repairs.refutes(repairs, "lag", ("drag", "lag"))
+    assert not Repairs.refutes(repairs, "ripple", ("ripple",))
 
 
 def test_an_effect_belongs_to_the_repair_as_surely_as_no_other_replaces_it():
