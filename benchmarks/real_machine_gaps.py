@@ -28,8 +28,8 @@ def tell(out: Print, found: Diagnosis) -> None:
     if found.prediction is not None:
         repair = found.prediction
         out(
-            f"  repair: {_names(repair.effects)}; moved {', '.join(repair.values) or 'no value'}; error on logs "
-            f"not used {repair.error_nominal:.2f} to {repair.error:.2f} (best set tried "
+            f"  repair: {_names(repair.effects)}; moved {', '.join(repair.values) or 'no value'}; error on "
+            f"logs not used {repair.error_nominal:.2f} to {repair.error:.2f} (best set tried "
             f"{repair.error_best:.2f}), {repair.unexplained:.3f} of it explained by nothing listed"
         )
         denied = [
