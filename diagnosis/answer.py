@@ -432,10 +432,18 @@ def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:
 
 
 def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[str, Real]) -> Completeness:
-    """Of what a model leaves, whitened (T, Y); see `Completeness`."""
+    """What a model leaves, as `Completeness` says it.
+
+    probability : that no more than the threshold remains. residuals : whitened (T, Y), of every record.
+
+    A share is 1 where as much as the motion is left or more: of an output that hardly moves a model may miss
+    any multiple.
+    """
     names = case.machine.output_names
-    share, rms = (dict(zip(names, map(float, v), strict=True)) for v in left_of(case, residuals))
-    return Completeness(float(probability), case.machine.weighing.model_error, share, rms)
+    shares, rms = left_of(case, residuals)
+    remains = {name: min(float(share), 1.0) for name, share in zip(names, shares, strict=True)}
+    in_units = {name: float(size) for name, size in zip(names, rms, strict=True)}
+    return Completeness(float(probability), case.machine.weighing.model_error, remains, in_units)
 
 
 def share_closed(

@@ -132,4 +132,4 @@ def _answered(
         exact = KnownNoise(WhiteSearch(as_sensors, again, deadline_s).run_in_time()).answer(rng)
         if exact.verdict != "unknown":
             return exact
-    return looked_at_again(found, BesideModelError(found, rng).answer(rng), again, deadline_s, rng)
+    return looked_at_again(BesideModelError(found, rng), again, deadline_s, rng)

@@ -31,17 +31,22 @@ _NEAR_NOISE = 2.0
 
 
 def looked_at_again(
-    first: Search, answer: Diagnosis, progress: Progress, deadline_s: float, rng: np.random.Generator
+    judge: BesideModelError, progress: Progress, deadline_s: float, rng: np.random.Generator
 ) -> Diagnosis:
     """The answer of a machine that does not forget its inputs, from windows where a free run says less.
 
     Windows are not looked at where the records leave no gap that interests, nor where the first answer leaves
-    none, in them either; they are not taken where they only add to what was named.
+    none, in them either; they are not taken where they only add to what was named, nor where evidence in
+    windows names nothing.
     """
+    first = judge.search
+    answer = judge.answer(rng)
     # Unlisted causes act within windows too: what a free run leaves unknown stays so, and what it names of a
     # rig stands.
     named = set(answer.combination)
-    windows = first.horizon if named and isinstance(answer.case, PlantCase) else None
+    windows = None
+    if judge.evidence_names and isinstance(answer.case, PlantCase):
+        windows = first.horizon
     if windows is None:
         return answer
     search = Search(answer.case, progress, deadline_s, windows)
@@ -52,8 +57,11 @@ def looked_at_again(
         left = np.sqrt(search.explained(named_alone.end.on(search.records)).mean_squares)
         if max(np.max(left), np.max(named_alone.shares)) < answer.case.machine.weighing.model_error:
             return answer
-    again = BesideModelError(search.run_in_time(), rng).answer(rng)
-    return again if again.combination and not named < set(again.combination) else answer
+    in_windows = BesideModelError(search.run_in_time(), rng)
+    again = in_windows.answer(rng)
+    if in_windows.evidence_names and again.combination and not named < set(again.combination):
+        return again
+    return answer
 
 
 def reaches_noise(search: Search) -> bool:
@@ -107,6 +115,8 @@ class BesideModelError(Judge[Explanation]):
             and not set(likeliest.explanation.names) <= set(listed)
         )
         self.trials = repairs.trials
+        # Whether evidence alone names a cause, whatever prediction adds.
+        self.evidence_names = judged.answer not in ("none", "unknown")
         self.said = by_repair(search, judged, self.trials, repaired, self.shares)
         self.stated = search.stated()
         self.refit = judged.nominal

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
+from diagnosis.answer import completeness_of
 from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.fit.descent import descend
 from diagnosis.fit.residual import ResidualModel
@@ -304,3 +305,12 @@ def test_prediction_takes_from_unknown_no_more_than_that_has():
 def test_prediction_alone_is_never_surer_than_that_a_cause_is_on_the_list():
     assert presence_by_prediction(1.0, 0.99, 0.7) == 0.7
     assert presence_by_prediction(0.5, 0.4, 0.7) == 0.2
+
+
+def test_no_more_than_all_of_a_motion_remains():
+    """Of an output that hardly moves in validation records a model may miss any multiple."""
+    case = joint({}, unlisted_and_dry, logs=2)
+    far = {record.name: np.full(record.output.shape, 1e9) for record in case.experiments}
+    remains = completeness_of(case, 0.1, far)
+    assert remains.most == 1.0
+    assert remains.in_units["torque_Nm"] == pytest.approx(1e7)
