@@ -110,8 +110,10 @@ class Repairs(Generic[E]):
         missing = [name for name in named if name not in chosen.names]
         if missing and self._try_with(chosen, missing):
             chosen = self._smallest_set(named)
-        chosen = self._fewest_values(chosen)
-        return self._descended(chosen)
+        chosen = self._descended(self._fewest_values(chosen))
+        # Within one standard error of the best a repair may still predict worse than no effect does.
+        nominal = self.trials[0]
+        return nominal if chosen.error.rms > nominal.error.rms else chosen
 
     def refutes(self, name: str, names: Collection[str]) -> bool:
         """Whether logs are surely predicted worse by a set of effects with one of them than without it.

@@ -153,7 +153,7 @@ def test_the_effect_is_found_among_all_that_are_listed(name):
     assert (found.verdict, found.combination) == ("effect", (name,))
     key, value = CASES[name][-1]
     # Stated values are off by up to a tolerance, 3 to 5 %; measured 0.1 to 1.3 %.
-    assert found.repair[0].values[key] == pytest.approx(value, rel=0.05)
+    assert found.effects[0].parameters[key] == pytest.approx(value, rel=0.05)
     assert found.gap_closed > 0.95
 
 

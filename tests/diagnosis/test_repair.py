@@ -142,6 +142,13 @@ def test_no_set_that_was_tried_predicts_much_better_than_the_repair():
     assert found.prediction.error < found.prediction.error_nominal
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_no_repair_predicts_worse_than_the_model_as_it_was(seed):
+    """A torque of the position alone, which no candidate follows, in logs of different motions."""
+    found = diagnose(joint({}, lambda position, speed: 2.0 * np.sin(17 * position), seed=seed, samples=400))
+    assert found.prediction.error <= found.prediction.error_nominal
+
+
 # One log left out
 
 
