@@ -189,6 +189,8 @@ def by_repair(
         )
         if weighing.counted:
             there *= 1 - judging.acts_like(name, weighing.listed, weighing.counted)
+        if name in repaired.names:
+            there *= 1 - judging.is_none_but_by_name(search, repaired, repaired.names.index(name))
         presence[name] = there
     probabilities = raised(judged.probabilities, presence, carried)
     answer = judged.answer

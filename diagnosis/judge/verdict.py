@@ -314,7 +314,7 @@ def _judged(
             break
         reduced = rest
     for k, name in enumerate(explanation.names):
-        parts[name] = replace(parts[name], by_name=_by_name(search, explanation, k))
+        parts[name] = replace(parts[name], by_name=is_none_but_by_name(search, explanation, k))
     by_name = max((part.by_name for part in parts.values() if part.matters > 0.5), default=0.0)
     left, carries = _beyond(explanation), share_beside(nominal, explanation)
     explains = 0.0 if by_name == 1 else _enough(left, weighing)
@@ -332,7 +332,7 @@ def _judged(
     return Judged(explanation, named, score, explains, complete, left, carries, beyond)
 
 
-def _by_name(search: Search, explanation: Explanation, k: int) -> float:
+def is_none_but_by_name(search: Search, explanation: Explanation, k: int) -> float:
     """Probability that the k-th effect is none but by its name.
 
     At an end of its range it is. A constant is what a static error of an unlisted cause adds, too, where it

@@ -111,9 +111,11 @@ class Repairs(Generic[E]):
         if missing and self._try_with(chosen, missing):
             chosen = self._smallest_set(named)
         chosen = self._descended(self._fewest_values(chosen))
-        # Within one standard error of the best a repair may still predict worse than no effect does.
+        # Within one standard error of the best a repair may still predict worse than no effect does: of logs
+        # left out, which one step predicts roughly, and of those for validation.
         nominal = self.trials[0]
-        return nominal if chosen.error.rms > nominal.error.rms else chosen
+        is_worse = chosen.error.rms > nominal.error.rms and chosen.validation.rms > nominal.validation.rms
+        return nominal if is_worse else chosen
 
     def refutes(self, name: str, names: Collection[str]) -> bool:
         """Whether logs are surely predicted worse by a set of effects with one of them than without it.

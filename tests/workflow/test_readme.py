@@ -145,7 +145,7 @@ def assert_hidden_cause_is_found(path: Path) -> None:
     assert abs(truth["torque_Nm"] - (low + high) / 2) < high - low
     assert answer["gap_after"] < 1.05 < answer["gap_refit"]
     torque_Nm = answer["effects"][0]["parameters"]["torque_Nm"]
-    assert f"torque {torque_Nm:.5f} N m (95 %: {low:.5f} to {high:.5f})" in README
+    assert f"torque {torque_Nm:.5f} N m (95 %: {low:.4g} to {high:.4g})" in README
 
 
 @pytest.mark.slow
