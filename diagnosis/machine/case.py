@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -35,6 +36,7 @@ class Experiment:
     first_row : of the run that the record is a part of; disturbances and drifts began with the run.
     readings : (R, Y). The outputs' values before any interpolation, for the steps of their sensors; default
         `output`.
+    beside : name -> (T,) signals of the log that the rig does not use, as a load.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Experiment:
     missing: tuple[int, ...] = ()
     readings: Real | None = None
     first_row: int = 0
+    beside: Mapping[str, Real] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lock(self, "voltage_V", "output")
@@ -75,6 +78,7 @@ class Experiment:
             reference_rad=reference,
             missing=tuple(row - first for row in self.missing if first <= row < end),
             first_row=self.first_row + first,
+            beside={name: signal[first:end] for name, signal in self.beside.items()},
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from diagnosis.machine.force_places import ForcePlace
 from diagnosis.machine.machine_protocol import KNOWN_START, Real, RecordOfMachine, UnknownStart, Weighing
 from plant.effects import EFFECTS, Effect, make_machine
 from plant.effects.search_space import Candidate, Scales
@@ -130,6 +131,23 @@ class FlexibleArm:
         pulse[0] = 1.0
         found = self._prepared(()).measured(self.outputs, np.zeros(samples), hub_torque_Nm=pulse)
         return found, self.rig.sampling.dt_s
+
+    def force_places(self, inputs: int) -> tuple[ForcePlace, ...]:
+        """The hub, on which a torque acts [N m]; `inputs` is always one, the voltage."""
+        return (ForcePlace("hub", "N m", motion=self.outputs.index("hub_angle_rad"), command=0),)
+
+    def other_coordinates(self, outputs: Real) -> dict[str, Real]:
+        """The deflection (T,) of the link [m], of outputs (T, Y) that hold the tip's position."""
+        if _TIP not in self.outputs:
+            return {}
+        reach = self.rig.hub.radius_m + self.rig.link.length_m
+        angle, tip = (outputs[:, self.outputs.index(name)] for name in ("hub_angle_rad", _TIP))
+        return {"deflection_m": tip - reach * angle}
+
+    def pushed(self, inputs: Real, forces: Real) -> Real:
+        """(T, Y) outputs of the nominal rig from rest under the voltage (T, 1) and a hub torque (T, 1) [N
+        m]."""
+        return self._prepared(()).measured(self.outputs, inputs[:, 0], hub_torque_Nm=forces[:, 0])
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         """Every effect of the registry that a fit can find; signed ones twice. Of a sensor of the link that

@@ -122,6 +122,16 @@ class SimulatedMachine(Protocol):
         """(T, Y) outputs after a torque of one on the hub over the first sample, and the sampling period [s];
         None for a machine without a hub."""
 
+    def force_places(self, inputs: int) -> Sequence[Any]:
+        """(F,) places (`diagnosis.machine.force_places.ForcePlace`) at which a missing force may act, of a
+        machine with so many input columns; empty where the output is the force itself."""
+
+    def other_coordinates(self, outputs: Real) -> Mapping[str, Real]:
+        """Name with its unit -> (T,) coordinates that stand for the other outputs (T, Y) beside a place."""
+
+    def pushed(self, inputs: Real, forces: Real) -> Real:
+        """(T, Y) outputs without noise under inputs (T, U) and forces (T, F) at the force places."""
+
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
         """Effects that may be missing, as search spaces with ranges that fit the records."""
 

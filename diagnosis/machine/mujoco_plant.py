@@ -24,6 +24,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from diagnosis.machine.force_places import ForcedSimulation, ForcePlace
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK
 from diagnosis.machine.mujoco_model import MujocoModel
@@ -69,6 +70,17 @@ class MujocoArm(MujocoModel):
     def quantities(self, experiments: Sequence[PlantExperiment]) -> dict[str, PlantEffect]:
         """Everything that may be off or missing, by name."""
         return Quantities(self, experiments).by_name()
+
+    @property
+    def force_places(self) -> tuple[ForcePlace, ...]:
+        """The joints whose position is measured, each with the first actuator that moves it."""
+        moved_by = [one.target for one in self.spec.actuators]
+        found = []
+        for column, joint, _ in self.tracked:
+            slides = self.spec.joint(joint).type == mujoco.mjtJoint.mjJNT_SLIDE
+            command = moved_by.index(joint) if joint in moved_by else None
+            found.append(ForcePlace(joint, "N" if slides else "N m", column, command))
+        return tuple(found)
 
     def tracking(self, experiments: Sequence[PlantExperiment]) -> float:
         """Half the largest speed over the travel [rad/s], and enough to hold every joint against gravity."""
@@ -229,6 +241,7 @@ class MujocoArm(MujocoModel):
                 replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
             ),
             units=self.units,
+            forced=ForcedSimulation(places, simulation.forced) if (places := self.force_places) else None,
             input_names=self.inputs,
             counted="models",
         )

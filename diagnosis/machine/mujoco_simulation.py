@@ -104,6 +104,25 @@ class MujocoSimulation:
             found, moved = found + weight * (again - found), moved + weight * (shift - moved)
         return found
 
+    def forced(self, parameters: Mapping[str, float], inputs: Real, forces: Real) -> Real:
+        """Outputs of the model under forces on the tracked joints, from the start that fits the record.
+
+        Parameters
+        ----------
+        parameters : name -> value
+            As of a call; those that are as stated change nothing.
+        inputs : (T, U + Y)
+            Commands, then outputs as measured.
+        forces : (T, J)
+            On the J tracked joints, held over each sample [N m of a hinge, N of a slide].
+
+        Returns
+        -------
+        (T, Y) outputs; the start is not fitted anew.
+        """
+        changed = {k: v for k, v in parameters.items() if v != self.quantities[k].stated}
+        return self._run(self._model(changed), inputs, self._start(inputs).state, forces=forces)
+
     def stick_figure(self, outputs: Real) -> Real | None:
         """(F, Y) -> (F, L, 2, 3) [m] ends of lines: from body to body, of a last one to its
         first site, else to its centre of mass. None where a joint is not measured."""
@@ -135,7 +154,7 @@ class MujocoSimulation:
 
     def _compiled(self, spec: Any) -> tuple[Any, Any]:
         omega = self.arm.tracking_rad_s
-        for _, joint, inertia in self.arm.tracked if omega else ():
+        for _, joint, inertia in self.arm.tracked:
             one = spec.add_actuator(PLAIN.default, name=f"tracking {joint}", target=joint)
             one.trntype, one.gear = mujoco.mjtTrn.mjTRN_JOINT, np.eye(6)[0]
             one.gaintype, one.biastype = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_AFFINE
@@ -160,8 +179,10 @@ class MujocoSimulation:
         inputs: Real,
         start: Real,
         before: Real | None = None,
+        forces: Real | None = None,
     ) -> Real:
-        """start: (S,), see `_Start`. before: (U,) commands before the first row; None: as in that."""
+        """start: (S,), see `_Start`. before: (U,) commands before the first row; None: as in that. forces:
+        (T, J) on the tracked joints beside what holds them near the record [N m or N]; None: none."""
         arm, (model, data) = self.arm, compiled
         before = inputs[0, : len(arm.inputs)] if before is None else before
         U, T = len(arm.inputs), len(inputs)
@@ -182,6 +203,8 @@ class MujocoSimulation:
             n = model.actuator_history[u, 0]
             if n:
                 mujoco.mj_initCtrlHistory(model, data, u, None, np.full((n, 1), before[u]))
+        if forces is not None:
+            control[:, U : U + forces.shape[1]] += np.repeat(forces, steps, axis=0)
         if model.nhistory:
             mujoco.mj_forward(model, data)
             for s in range(model.nsensor):

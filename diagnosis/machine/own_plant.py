@@ -23,6 +23,7 @@ from types import MappingProxyType
 import numpy as np
 
 from diagnosis.machine.around import Identity, MeasuredBody, Started, around
+from diagnosis.machine.force_places import ForcedSimulation, ForcePlace
 from diagnosis.machine.machine_protocol import (
     KNOWN_START,
     Real,
@@ -35,6 +36,7 @@ from diagnosis.machine.machine_protocol import (
 )
 from diagnosis.machine.plant_effect import Change, PlantEffect, wrong_values
 from ident.data.arrays import lock
+from ident.data.units import written_unit
 from plant.effects.search_space import Candidate
 
 # Parameters, effects, inputs (T, U) and, where a start is unknown, its states -> outputs (T, Y).
@@ -110,6 +112,8 @@ class Plant:
         does.
     units : output -> unit, of outputs whose names do not end with it.
     counted : as in `Weighing`.
+    forced : the simulation with forces at places of its own, for where the error lies; None: a force is what
+        is added to an input.
     input_names : of the inputs, for pages; inputs behind these only hold a simulation near its record.
     """
 
@@ -128,6 +132,7 @@ class Plant:
     units: Mapping[str, str] = field(default_factory=dict)
     input_names: tuple[str, ...] = ()
     counted: str = ""
+    forced: ForcedSimulation | None = None
 
     def __post_init__(self) -> None:
         lock(self, "noise")
@@ -221,6 +226,39 @@ class Plant:
     def torque_response(self, samples: int) -> None:
         return None
 
+    def force_places(self, inputs: int) -> tuple[ForcePlace, ...]:
+        """(F,) places of the simulation's own; else every one of its input columns; none where the motion is
+        an input and the force an output."""
+        if self.forced is not None:
+            return self.forced.places
+        if self.body is not None:
+            return ()
+        names = self.input_names or tuple(f"input {k + 1}" for k in range(inputs))
+        return tuple(ForcePlace(name, self.unit(name), command=k) for k, name in enumerate(names))
+
+    def pushed(self, inputs: Real, forces: Real) -> Real:
+        """(T, Y) outputs of the simulation as stated under inputs (T, U) and forces (T, F) at the places.
+
+        Not a number throughout where the simulation ends with a numerical error.
+        """
+        try:
+            with np.errstate(all="ignore"):  # forces may drive it away
+                if self.forced is not None:
+                    return self.forced.simulate(self.parameters, inputs, forces)
+                moved = np.array(inputs, dtype=np.float64)
+                moved[:, : forces.shape[1]] += forces
+                return self.simulated(())(moved)
+        except _NUMERICAL:
+            return np.full((len(inputs), self.noise.size), np.nan)
+
+    def other_coordinates(self, outputs: Real) -> dict[str, Real]:
+        """Nothing: the positions of a simulation of one's own are its outputs (T, Y)."""
+        return {}
+
+    def unit(self, name: str) -> str:
+        """Unit of an output or input as stated, else as its name ends with it; "" where neither says it."""
+        return self.units.get(name, "") or written_unit(name)
+
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
         far, at_rest = RUNAWAY * self.noise, self.simulated(effects)
@@ -304,16 +342,25 @@ class Plant:
 @dataclass(frozen=True, eq=False)
 class PlantExperiment:
     """One record of a plant: input (T, U), output (T, Y) as measured, a single one as (T,) too; held-out
-    records fit no parameter. missing : rows whose outputs say nothing."""
+    records fit no parameter. missing : rows whose outputs say nothing. first_row : of the log that the record
+    is a part of. beside : name -> (T,) signals of the log that the simulation does not use, as a load."""
 
     name: str
     role: Role
     input: Real
     output: Real
     missing: tuple[int, ...] = ()
+    first_row: int = 0
+    beside: Mapping[str, Real] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         lock(self, "input", "output")
+        for name, signal in self.beside.items():
+            if np.shape(signal) != (len(self.output),) or not np.all(np.isfinite(signal)):
+                raise ValueError(
+                    f"experiment {self.name}: {name} beside the outputs must be finite and "
+                    f"({len(self.output)},); got {np.shape(signal)}"
+                )
         for key, signal in (("input", self.input), ("output", self.output)):
             object.__setattr__(self, key, signal[:, None] if signal.ndim == 1 else signal)
         check_record(self)

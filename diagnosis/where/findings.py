@@ -28,8 +28,6 @@ SENSORS: dict[Output, tuple[str, str]] = {
 _Z95 = float(norm.ppf(0.975))
 # A statement about where "most" of the gap lies covers at least this share of it.
 _MOST = 0.8
-# A missing function is the answer in short if it explains at least this share of the gap.
-_MUCH = 0.5
 # From such a share of the gap on it is called linear in the voltage; below the other one it is not.
 _LINEAR, _NOT_LINEAR = 0.9, 0.5
 # A straight drift has 7 % of its energy around its fourth line.
@@ -183,42 +181,76 @@ class CommonFinding:
         return self.peak_share >= _LINE
 
 
-@dataclass(frozen=True)
-class EquivalentCurve:
-    """The residuals read as one missing function of a regime variable, at one place of the machine.
+Quantity = Literal["position", "speed", "acceleration", "value", "command", "time", "beside"]
 
-    route : str
-        hub_torque (a torque on the hub, sent through the model), hub_angle or tip (added to a sensor).
-    axis, unit : str. The variable it is a function of: speed, angle, command, deflection, time, position.
-    centres, values, standard_errors : tuple of float. The function at the mean of every bin, in Nm, rad or m.
+
+Shape = Literal["line", "jump", "curve"]
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """Another variable, with its unit, at a place, that explains this share of the error."""
+
+    place: str
+    quantity: Quantity
+    of: str
+    unit: str
+    share: float
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """A missing force, or an error of a reading, as a curve of one variable.
+
+    Parameters
+    ----------
+    place : str
+        Joint, hub or command at which the force acts; output whose reading is wrong.
+    acts : "force" or "reading"
+    quantity, of, unit : str
+        The variable: what it is, of which output, command or column ("" of the time), and its unit.
+    own : bool
+        The variable is the motion of the place itself.
+    value_unit : str
+        Of the force or the reading; of a force added to a command, that of the command.
+    centres, values, standard_errors : tuple of float
+        The curve at points of the variable.
     share : float
-        Of the whole gap energy that this one function explains, the energy noise alone would add taken off.
-    share_by_chance : float
-        95 % point of that share when the function's variable is shifted in time; 0 if it was not needed.
-    p_value : float
+        Of the error's energy above noise that the curve explains in data that it was not drawn on, 0 to 1; of
+        a second dependence, of what it takes beside the first.
+    constant_share : float
+        What a constant force at the same place explains of it.
+    judged_on : "logs" or "blocks"
+        What was left out in turn: whole logs, or blocks of the only one.
+    shape : "line", "jump" or "curve"
+        What explains at least nine tenths of it: a straight line, a change of sign with the variable, or no
+        less than the curve.
+    slope, slope_error : float or None
+        Of a line, per unit of the variable; of a jump, half its height; with standard errors.
+    beside : bool
+        It explains what another dependence leaves.
+    also : tuple of Alternative
+        What explains as much within two standard errors, at most two.
     """
 
-    route: str
-    axis: str
+    place: str
+    acts: Literal["force", "reading"]
+    quantity: Quantity
+    of: str
     unit: str
+    own: bool
     value_unit: str
     centres: tuple[float, ...]
     values: tuple[float, ...]
     standard_errors: tuple[float, ...]
     share: float
-    share_by_chance: float
-    p_value: float
-    found: bool
-
-    @property
-    def points(self) -> tuple[tuple[float, float], ...]:
-        """Where the curve is best known: next to zero on both sides, or (over time) at both ends."""
-        nodes = list(zip(self.centres, self.values, strict=True))
-        if self.axis == "time":
-            return (nodes[0], nodes[-1])
-        # Half the samples of a side lie below its first node beside zero.
-        below, above = [n for n in nodes if n[0] < 0], [n for n in nodes if n[0] > 0]
-        return (*below[-1:], *above[:1])
+    constant_share: float
+    judged_on: Literal["logs", "blocks"]
+    shape: Shape
+    slope: float | None
+    slope_error: float | None
+    beside: bool
+    also: tuple[Alternative, ...]
 
 
 @dataclass(frozen=True)
@@ -316,8 +348,9 @@ class Where:
     """Where the gap lies.
 
     gap : PartGap. All records together.
-    sensors, experiments, bands, regimes, drift, common, curves : See their records. From regimes on only of a
-        flexible link.
+    sensors, experiments, bands, regimes, dependences, drift, common : See their records. Drift and common
+    only
+        of a flexible link.
     periodic, amplitude, linear : None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
@@ -331,7 +364,7 @@ class Where:
     regimes: tuple[RegimeFinding, ...] = ()
     drift: tuple[DriftFinding, ...] = ()
     common: tuple[CommonFinding, ...] = ()
-    curves: tuple[EquivalentCurve, ...] = ()
+    dependences: tuple[Dependence, ...] = ()
     periodic: tuple[PeriodicFinding, ...] = ()
     amplitude: AmplitudeFinding | None = None
     linear: LinearCorrection | None = None
@@ -355,21 +388,6 @@ class Where:
             if s.gap.share_interval[0] > 0.95 or (len(shown) == 1 and s.gap.share > 0.9):
                 return s.sensor
         return None
-
-    @property
-    def best_curve(self) -> EquivalentCurve | None:
-        """The missing function that explains most, if it explains half of the gap and is beyond chance."""
-        usable = [c for c in self.curves if c.found and c.share >= _MUCH]
-        return max(usable, key=lambda c: c.share, default=None)
-
-    @property
-    def near_curves(self) -> tuple[EquivalentCurve, ...]:
-        """Others that explain nearly as much as the best one."""
-        best = self.best_curve
-        if best is None:
-            return ()
-        least = 0.8 * min(best.share, 1.0)
-        return tuple(c for c in self.curves if c.found and c is not best and c.share >= least)
 
     @property
     def telling_regimes(self) -> tuple[RegimeFinding, ...]:

@@ -16,9 +16,9 @@ import numpy as np
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import NOISE
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.where.dependence import dependences
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.findings import Where, sensors_of
-from diagnosis.where.missing_function import missing_functions
 from diagnosis.where.regimes import axes_of_output, motions, regime_axes, regime_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
 from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings, linear_correction
@@ -50,6 +50,7 @@ def where(
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
     rng = np.random.default_rng(0) if rng is None else rng
+    given_case, given = case, residuals
     if case.model_error > 0:
         case, residuals = over_levels(case, residuals, thresholds_of(case))
     moved, sensors = motions(case, residuals), sensors_of(case)
@@ -66,7 +67,7 @@ def where(
         regimes=regime_findings(e, sensors, regime_axes(moved), level, rng),
         drift=drift_findings(case, e, level),
         common=common_findings(case, e, level),
-        curves=missing_functions(case, e, moved, level, rng),
+        dependences=dependences(given_case, given, case.dt_s, level) if found.is_gap else (),
         periodic=periodic_findings(case, e, level),
         amplitude=amplitude_finding(case, e, level, rng),
         linear=linear_correction(case, e),
@@ -76,11 +77,13 @@ def where(
 
 def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
     """Of any machine: by sensor, experiment, frequency, and by what its outputs and inputs do (direction,
-    size, rate, time in the record); arguments as of `where`. Raises ValueError without a sampling period."""
+    size, rate, time in the record), and what it depends on; arguments as of `where`. Raises ValueError
+    without a sampling period."""
     if not dt_s > 0:
         raise ValueError(f"case {case.name}: state the plant's sampling period (Plant(dt_s=...)) for a page")
     names, rng = case.machine.output_names, np.random.default_rng(0)
     axes = [axes_of_output(case, residuals, dt_s, k) for k in range(len(names))]
+    given = residuals
     if case.machine.weighing.model_error > 0:
         _, residuals = over_levels(case, residuals, thresholds_of(case))
     regimes = [
@@ -90,7 +93,9 @@ def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: f
             {name: e[:, [k]] for name, e in residuals.items()}, (sensor,), own, LEVEL / len(names), rng
         )
     ]
-    return replace(_by_parts(residuals, names, dt_s, LEVEL), regimes=tuple(regimes))
+    found = _by_parts(residuals, names, dt_s, LEVEL)
+    depends = dependences(case, given, dt_s, LEVEL) if found.is_gap else ()
+    return replace(found, regimes=tuple(regimes), dependences=depends)
 
 
 def _by_parts(residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float) -> Where:

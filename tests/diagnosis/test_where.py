@@ -10,7 +10,16 @@ from scipy.fft import dct
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from diagnosis import Case, Experiment, ResidualModel
+from diagnosis import (
+    Case,
+    EffectParameter,
+    Experiment,
+    Plant,
+    PlantCase,
+    PlantEffect,
+    PlantExperiment,
+    ResidualModel,
+)
 from diagnosis.where.distortion import periodic_findings
 from diagnosis.where.regimes import motions
 from diagnosis.where.where import subsystem_mass, where, where_in_records
@@ -142,8 +151,10 @@ def test_a_drift_is_found_with_its_rate():
     half = (tip.interval[1] - tip.interval[0]) / 2
     assert abs(tip.rate - rate) < 12.9 / 3.18 * half
     assert tip.notable
-    curve = found.best_curve
-    assert (curve.route, curve.axis) == ("tip", "time")
+    first = found.dependences[0]
+    assert (first.acts, first.place, first.quantity, first.shape) == ("reading", "tip_m", "time", "line")
+    # The dependence's slope holds the same rate.
+    assert abs(first.slope - rate) < 4 * first.slope_error
 
 
 @cache
@@ -160,13 +171,18 @@ def _of_effect(*effects):
 def test_a_torque_that_depends_on_the_angle_is_read_off():
     k3 = 0.05
     found = _of_effect(HardeningSpring(cubic_Nm_rad3=k3))
-    curve = next(c for c in found.curves if (c.route, c.axis) == ("hub_torque", "angle"))
-    assert curve.found
-    assert curve.share > 0.9
-    assert curve.share == pytest.approx(max(c.share for c in found.curves), abs=0.02)
-    # The curve at its outermost node against -k3 theta^3, within a third: piecewise linear, first order.
-    theta, torque = curve.centres[-1], curve.values[-1]
-    assert torque == pytest.approx(-k3 * theta**3, rel=0.35)
+    first = found.dependences[0]
+    assert (first.acts, first.place, first.quantity, first.of) == (
+        "force",
+        "hub",
+        "position",
+        "hub_angle_rad",
+    )
+    assert (first.own, first.value_unit, first.judged_on, first.shape) == (True, "N m", "logs", "curve")
+    assert 0.75 < first.share <= 1
+    # The curve against -k3 theta^3, to a tenth of its largest value.
+    theta, torque = np.array(first.centres), np.array(first.values)
+    assert np.max(np.abs(torque + k3 * theta**3)) < 0.1 * k3 * np.max(np.abs(theta)) ** 3
 
 
 def test_a_coarse_tip_sensor_is_found_there_and_at_all_frequencies():
@@ -185,12 +201,12 @@ def test_a_coarse_tip_sensor_is_found_there_and_at_all_frequencies():
 def test_a_wrong_sensor_gain_is_an_error_over_the_tip_position():
     ratio = 1.05
     found = _of_effect(SensorGain(ratio=ratio))
-    curve = found.best_curve
-    assert (curve.route, curve.axis) == ("tip", "position")
-    assert curve.share > 0.98
-    # The straight line (ratio - 1) x, within four standard errors at every node.
-    line = (ratio - 1) * np.array(curve.centres)
-    assert np.all(np.abs(np.array(curve.values) - line) < 4 * np.array(curve.standard_errors) + 1e-9)
+    first = found.dependences[0]
+    assert (first.acts, first.place, first.quantity, first.of) == ("reading", "tip_m", "position", "tip_m")
+    assert (first.shape, len(found.dependences)) == ("line", 1)
+    assert first.share > 0.98
+    # The error over the reading ratio x, over the true position x, or over what lies between.
+    assert 0.99 * (ratio - 1) / ratio < first.slope < 1.01 * (ratio - 1)
     assert found.dominant_sensor == "tip"
     assert found.linear.share > 0.9
 
@@ -310,12 +326,10 @@ def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_case
 
 def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
     found = _recorded(gap_cases, "coulomb_friction")
-    curve = next(c for c in found.curves if (c.route, c.axis) == ("hub_torque", "speed"))
-    assert curve.found
-    # The node below which half the samples of a side lie: a torque against the motion on both sides.
-    backwards = [v for x, v in zip(curve.centres, curve.values, strict=True) if x < 0][-1]
-    forwards = next(v for x, v in zip(curve.centres, curve.values, strict=True) if x > 0)
-    assert backwards > 0 > forwards
+    first = found.dependences[0]
+    assert (first.acts, first.quantity, first.shape) == ("force", "speed", "jump")
+    # answer.toml: torque_Nm, against the motion.
+    assert first.slope == pytest.approx(-0.01047, rel=0.1)
     assert found.amplitude.growth == "offset"
 
 
@@ -345,7 +359,6 @@ def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():
     # Sensor noise is allowed beside it.
     allowed = np.hypot(error * np.std(held.output), NOISE[0]) / NOISE[0]
     assert found.gap.gap_rms == pytest.approx(np.sqrt((size / allowed) ** 2 - 1), rel=0.01)
-    assert {c.route for c in found.curves} == {"hub_torque", "hub_angle"}
     assert "deflection" not in {r.axis for r in found.regimes}
     assert found.dominant_sensor is None
     assert not where(case, {name: e[:, None] / 4 for name, e in tone.items()}).is_gap
@@ -394,15 +407,21 @@ def test_of_records_shorter_than_a_second_no_growth_with_the_input_is_said(sampl
 )
 def test_of_any_machine_it_is_said_when_it_errs(added, said):
     """One of two outputs, in a direction, for a size of an input, at a place, late, never."""
+
+    def simulate_lag(parameters, effects, inputs):
+        return lfilter([0.1], [1.0, -0.9], inputs, axis=0)
+
     rng, records, left, t = np.random.default_rng(1), [], {}, 0.01 * np.arange(800)
     for name in "nopqrstuvw":
         u = rng.uniform(-1, 1, (100, 2)).repeat(8, axis=0)
-        y, e = lfilter([0.1], [1.0, -0.9], u, axis=0), rng.standard_normal((800, 2))
+        y, e = simulate_lag({}, {}, u), rng.standard_normal((800, 2))
         e[:, 0] += added(y[:, 0], np.gradient(y[:, 0]), u[:, 0], t, rng.standard_normal(800))
-        records.append(SimpleNamespace(name=name, input=u, output=y + 1e-3 * e))
+        role = "held_out" if name == "w" else "estimation"
+        records.append(PlantExperiment(name, role, u, y + 1e-3 * e))
         left[name] = e
-    given = {"input_names": (), "output_names": ("a", "b"), "weighing": SimpleNamespace(model_error=0.0)}
-    case = SimpleNamespace(machine=SimpleNamespace(**given), experiments=records, noise=np.full(2, 1e-3))
+    listed = (PlantEffect("gain", (EffectParameter("ratio", 0.1, 1.0),)),)
+    plant = Plant(simulate_lag, {}, {}, ("a", "b"), np.full(2, 1e-3), listed, 0.0, 0.01)
+    case = PlantCase("lag", plant, tuple(records))
     found = where_in_records(case, left, 0.01).telling_regimes
     assert {one.sensor for one in found} <= {"a"}
     assert any(f"{one.axis}: {one.peak.label}".startswith(said) for one in found) == bool(said)
@@ -420,12 +439,12 @@ def _alarms(found):
         "regimes": any(r.found for r in found.regimes),
         "drift": any(d.found for d in found.drift),
         "common": any(c.found for c in found.common),
-        "curves": any(c.found for c in found.curves),
+        "dependences": bool(found.dependences),
         "periodic": any(v.found for p in found.periodic for v in (*p.bands, *p.groups)),
     }
 
 
-# Axes whose tests cover their level; curves and periodic ask for more than chance and stay below.
+# Axes whose tests cover their level; dependences and periodic ask for more than chance and stay below.
 REACHED = ("sensors", "experiments", "bands", "regimes", "drift")
 
 

@@ -586,19 +586,24 @@ def _experiments(
     found = []
     for k, (path, table) in enumerate(zip(paths, tables, strict=True)):
         with naming(str(path)):
-            whole = _signals(table, (*inputs, *outputs), len(inputs), settings)
-        y = whole[:, len(inputs) :]
-        u = whole if tracked else whole[:, : len(inputs)]
+            whole = _signals(table, (*inputs, *outputs, *settings.beside), len(inputs), settings)
+        used = len(inputs) + len(outputs)
+        y = whole[:, len(inputs) : used]
+        u = whole[:, :used] if tracked else whole[:, : len(inputs)]
+        beside = dict(zip(settings.beside, whole[:, used:].T, strict=True))
         name = path.stem if [p.stem for p in paths].count(path.stem) == 1 else f"{path.stem} {k + 1}"
         if len(paths) > 1:
             role: Literal["estimation", "held_out"] = "held_out" if k == len(paths) - 1 else "estimation"
             with naming(str(path)):
-                found.append(PlantExperiment(name, role, u, y))
+                found.append(PlantExperiment(name, role, u, y, beside=beside))
             continue
         cut = int(_FITTED * len(y))
         with naming(f"{path}: of a single log the last third validates; give more of it, or a second --log"):
-            found.append(PlantExperiment(f"{name} (first part)", "estimation", u[:cut], y[:cut]))
-            found.append(PlantExperiment(f"{name} (last part)", "held_out", u[cut:], y[cut:]))
+            begins = {key: signal[:cut] for key, signal in beside.items()}
+            ends = {key: signal[cut:] for key, signal in beside.items()}
+            first, last = f"{name} (first part)", f"{name} (last part)"
+            found.append(PlantExperiment(first, "estimation", u[:cut], y[:cut], beside=begins))
+            found.append(PlantExperiment(last, "held_out", u[cut:], y[cut:], first_row=cut, beside=ends))
     return tuple(found)
 
 

@@ -24,6 +24,9 @@ class SimulatorSettings(Section):
         description="log files; the last one is for validation, of a single one its last third"
     )
     columns: dict[str, ColumnChoice] = Field({}, description="name in the model -> column, where they differ")
+    beside: tuple[str, ...] = Field(
+        (), description="columns the model does not use, a load or temperature, that the error may depend on"
+    )
     dt_s: float | None = Field(None, gt=0, description="sampling period of logs without a time column")
     repair: bool = Field(False, description="put stamps that jitter, and missing rows, on a uniform grid")
     resample_s: float | None = Field(None, gt=0, description="put all rows on a grid of this step")

@@ -8,6 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from plant.effects import in_words
+from workflow.engine import codec
+from workflow.text.dependence import (
+    alternatives_words,
+    dependence_line,
+    dependence_short,
+    dependence_words,
+)
 from workflow.text.formats import MISSING, fixed, interval, listing, number, si
 from workflow.text.names import name_words, stated_name, stated_unit, unit_of
 
@@ -145,6 +152,11 @@ def trend_words(found: Any) -> str:
     )
 
 
+def of_finding(words: Callable[[Mapping[str, Any]], str]) -> Callable[[Any], str]:
+    """Words of a dependence that is a record of numbers, or the same in JSON."""
+    return lambda finding: words(codec.plain(finding))
+
+
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "effect": in_words,
     "parameter_unit": unit_of,
@@ -163,4 +175,8 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "repair": repair_words,
     "select_moved": lambda deviations: [key for key, off in deviations.items() if off],
     "trend": trend_words,
+    "dependence": of_finding(dependence_words),
+    "dependence_line": of_finding(dependence_line),
+    "dependence_short": of_finding(dependence_short),
+    "alternatives": of_finding(alternatives_words),
 }

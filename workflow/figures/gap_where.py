@@ -1,13 +1,15 @@
-"""Where the gap lies: by frequency, by experiment and sensor, by regime, and as a missing function."""
+"""Where the gap lies: by frequency, by experiment and sensor, by regime, and what it depends on."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from diagnosis.where.findings import SENSORS, BandGap, Where
+from workflow.engine import codec
 from workflow.figures import gap_style, style
 from workflow.figures.bands import Real
 from workflow.figures.description import Picture, X, new_picture, small_multiples
+from workflow.text.dependence import missing_words, variable_words
 from workflow.text.formats import portion
 
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
@@ -23,7 +25,6 @@ _REGIMES = {
     "command_size": "size of the command",
     "time": "time since start",
 }
-_ROUTES = {"hub_torque": "torque on the hub", "hub_angle": "hub angle reading", "tip": "tip reading"}
 
 
 def _size(model_error: float) -> tuple[float, str]:
@@ -132,22 +133,25 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Picture | None:
     return picture
 
 
-@style.drawing("gap_curves")
-def draw_curves(where: Where) -> Picture | None:
-    """The gap read as one missing function of a variable, two standard errors either side."""
-    curves = [curve for curve in where.curves if curve.found]
-    if not curves:
+@style.drawing("gap_dependences")
+def draw_dependences(where: Where) -> Picture | None:
+    """The missing force, or error of a reading, over what it depends on, two standard errors either side."""
+    found = where.dependences
+    if not found:
         return None
-    picture, panels = small_multiples(len(curves), min(3, max(2, len(curves))), 2.6, 0.9)
-    for panel, curve in zip(panels, curves, strict=True):
-        at, value = np.array(curve.centres), np.array(curve.values)
-        error = 2 * np.array(curve.standard_errors)
+    picture, panels = small_multiples(len(found), 2, 2.9, 0.9)
+    for panel, one in zip(panels, found, strict=True):
+        plain = codec.plain(one)
+        at, value = np.array(one.centres), np.array(one.values)
+        error = 2 * np.array(one.standard_errors)
         panel.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
-        panel.plot(at, value, marker="o", color=style.MODEL, ms=4, lw=1.0, label="what is missing")
+        panel.plot(at, value, color=style.MODEL, lw=1.6, label="what is missing")
         panel.axhline(0, color="#555555", lw=0.8)
-        panel.set(xlabel=_with_unit(curve.axis.replace("_", " "), curve.unit))
-        panel.set(ylabel=_with_unit(_ROUTES[curve.route], curve.value_unit))
-        panel.set_title(f"{portion(curve.share)} of the gap energy", size=9.5, bold=False)
+        panel.set(xlabel=_with_unit(variable_words(plain).removeprefix("the "), one.unit))
+        panel.set(ylabel=_with_unit(missing_words(plain), one.value_unit.replace("Nm", "N m")))
+        panel.set_title(
+            f"{portion(one.share)} of the error on {one.judged_on} not used", size=9.5, bold=False
+        )
     return picture
 
 

@@ -1,0 +1,406 @@
+"""The force that a simulation lacks, as a function of time, and the residuals that are linear in it.
+
+Residuals of a simulation are the missing force filtered by the machine: against an angle they show a blurred
+dependence. A pulse of force at a place gives the machine's response; the force whose response is the residual
+is found with it, and simulated, so that a machine whose response depends on its pose is followed as well.
+What this simulation shows beyond the linear response is taken off the residuals. Any curve of any variable is
+then a linear regression, without another simulation.
+
+Residuals and responses are then whitened: in proportion to what a force that no curve explains would leave.
+
+Neglected: effects that the machine has between a force and its response beyond the simulation (a lag, a
+play).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse.linalg import LinearOperator, lsqr
+
+from diagnosis.machine.force_places import ForcePlace
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
+
+# A residual is followed to this share of its RMS, or to the noise: a real log is never explained to its
+# noise, and a finer force is one of noise. Chosen; a curve needs a tenth at most.
+_FOLLOWED = 0.05
+# Iterations of least squares for one force: each holds about one more frequency. Chosen; twice as many change
+# shares of the series by less than 0.01.
+_ITERATIONS = 80
+# Times the noise at which a record is followed: an eighth of noise more than there is. Chosen.
+_ENOUGH = 1.1
+# Rounds of simulation and correction: an arm that is held near its record is followed in two, one that falls
+# freely in six. Chosen; each is two simulations at most of a record.
+_ROUNDS = 12
+# Parts of a correction that are tried where all of it leads away: a free run bends where it goes far.
+_PARTS = (1.0, 0.5, 0.25)
+# A round that leaves more than this part of the error was the last. Chosen: a free run that comes back to the
+# record gains little at first.
+_GAINS = 0.99
+# Part of the missing force, RMS, that no curve explains. Chosen: measured forces repeat to a tenth; with
+# three times as much shares of the series change by less than 0.05.
+_UNEXPLAINED = 0.05
+# Rows of one unknown force, and the most of them in a record: slower than what a machine shows within its own
+# period as a rule, and a decomposition of a second at most. Chosen.
+_ROWS_PER_FORCE, _MOST_FORCES = 10, 100
+# What an unknown start may do, in noise deviations: anything.
+_ANY_SIZE = 1e6
+# Parts of a direction below this are not taken off: rounding.
+_NOTHING = 1e-9
+# Where in a record pulses of force are tried, as shares of its length: at its begin, and in another pose.
+_PULSES_AT = (0.0, 0.25, 0.5)
+# Rows at the begin of a record whose forces stand for a start that nobody knows: position, speed and a state
+# between them, in each place.
+_START_ROWS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """A symmetric matrix (T Y, T Y) that takes some directions off by some part.
+
+    basis (T Y, R): orthonormal columns. taken (R,): parts, 0 to 1.
+    """
+
+    basis: Real
+    taken: Real
+
+    def of(self, signals: Real) -> Real:
+        """(T, K, Y) signals without these parts."""
+        rows, count, outputs = signals.shape
+        flat = np.moveaxis(signals, 1, 2).reshape(rows * outputs, count)
+        flat = flat - self.basis @ (self.taken[:, None] * (self.basis.T @ flat))
+        return np.moveaxis(flat.reshape(rows, outputs, count), 2, 1)
+
+    def passes(self, weights: Real, outputs: int) -> Real:
+        """(Y,) energy that white noise of one keeps in rows of weights (T,)."""
+        lost = np.sum(self.basis**2 * (1 - (1 - self.taken) ** 2), axis=1).reshape(len(weights), outputs)
+        return np.asarray(np.sum((1 - lost) * weights[:, None], axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class ForcedRecord:
+    """One record with the force that its simulation lacks.
+
+    Parameters
+    ----------
+    name : str
+    residuals : (T, Y) array
+        Over the levels of the outputs and whitened: linear in the missing force, and the rest that no force
+        at the places makes. Rows that are missing are zero before that.
+    forces : (T, F) array
+        Missing forces at the places, in their units; zero where the simulation could not be made to follow.
+    motion : (T, Y) array
+        Outputs in their units as the forced simulation gives them, with less noise than measured.
+    weights : (T,) array
+        One, and zero in rows that are missing.
+    whitening : Whitening
+        Of residuals and of what curves do to them.
+    noise_energies : (Y,) array
+        Energy of the sensor noise in the whitened residuals of each output.
+    """
+
+    name: str
+    residuals: Real
+    forces: Real
+    motion: Real
+    weights: Real
+    whitening: Whitening
+    noise_energies: Real
+
+
+@dataclass(frozen=True, eq=False)
+class MissingForces:
+    """Places of a machine, its responses to forces there, and records with the forces that they lack.
+
+    Parameters
+    ----------
+    places : tuple of ForcePlace
+        (F,) places that move some output.
+    responses : (F, T, Y) array
+        Outputs over their levels after a force of one over the first sample.
+    reading_responses : (Y, T, Y) array
+        Residuals over the levels where one output reads one unit more in the first row.
+    records : tuple of ForcedRecord
+    """
+
+    places: tuple[ForcePlace, ...]
+    responses: Real
+    reading_responses: Real
+    records: tuple[ForcedRecord, ...]
+
+    def response_to(self, place: int, forces: Real, record: ForcedRecord) -> Real:
+        """(T, K, Y) whitened residuals of a record under each of the forces (T, K) at a place."""
+        moved = _convolved(forces, self.responses[place])
+        return record.whitening.of(moved * record.weights[:, None, None])
+
+    def response_to_reading(self, output: int, errors: Real, record: ForcedRecord) -> Real:
+        """(T, K, Y) whitened residuals of a record where an output reads more by each of the errors (T, K),
+        in its unit."""
+        moved = _convolved(errors, self.reading_responses[output])
+        return record.whitening.of(moved * record.weights[:, None, None])
+
+
+def missing_forces(case: CaseOfMachine, residuals: Mapping[str, Real]) -> MissingForces:
+    """Forces at the machine's places that make its simulation follow the records.
+
+    Parameters
+    ----------
+    case : RecordedCase
+    residuals : record -> (T, Y) array
+        (measured - model) / noise of every record, whichever model of the machine made them.
+
+    Returns
+    -------
+    MissingForces
+        Without places where none moves an output; without forces in records that the simulation, pushed,
+        follows no better.
+    """
+    missed = {name: np.asarray(e, dtype=np.float64) * case.noise for name, e in residuals.items()}
+    moves = np.sqrt(np.mean(np.concatenate([*missed.values()]) ** 2, axis=0))
+    levels = np.hypot(case.noise, _FOLLOWED * moves)
+    places, responses = _responses(case, moves, levels)
+
+    forces, beyond = dict[str, Real](), dict[str, Real]()
+    weights = {record.name: np.ones(len(record.output)) for record in case.experiments}
+    for record in case.experiments:
+        weights[record.name][list(getattr(record, "missing", ()))] = 0.0
+        forces[record.name], beyond[record.name] = _force_of(
+            case, record, missed[record.name], weights[record.name], responses, levels
+        )
+
+    size = _slow_size([*forces.values()])
+    records = []
+    for record in case.experiments:
+        name, kept = record.name, weights[record.name]
+        moved = _response_to_all(responses, forces[name]) + beyond[name]
+        whitening = _whitening(responses, size, kept)
+        rest = (missed[name] / levels - beyond[name]) * kept[:, None]
+        records.append(
+            ForcedRecord(
+                name=name,
+                residuals=whitening.of(rest[:, None])[:, 0],
+                forces=forces[name],
+                motion=record.output - missed[name] + levels * moved,
+                weights=kept,
+                whitening=whitening,
+                noise_energies=(case.noise / levels) ** 2 * whitening.passes(kept, levels.size),
+            )
+        )
+    return MissingForces(places, responses, _reading_responses(case, moves, levels), tuple(records))
+
+
+def _responses(case: CaseOfMachine, size: Real, levels: Real) -> tuple[tuple[ForcePlace, ...], Real]:
+    """Places that move an output, and (F, T, Y) responses over the levels to one unit over the first sample.
+
+    size (Y,): of the residuals in the outputs' units; a pulse moves the outputs about as far, so that
+    contacts answer as they do to what is missing. The mean over some begins of the longest record stands for
+    a response that depends on the pose.
+    """
+    longest = max(case.experiments, key=lambda record: len(record.output))
+    every = case.machine.force_places(longest.input.shape[1])
+    rows = len(longest.output)
+    free = case.machine.pushed(longest.input, np.zeros((rows, len(every)))) if every else np.zeros((0, 0))
+    shown, responses = [], []
+    for k, place in enumerate(every):
+
+        def moved(begin: int, pulse: float, at: int = k) -> Real:
+            forces = np.zeros((rows, len(every)))
+            forces[begin, at] = pulse
+            return (case.machine.pushed(longest.input, forces) - free)[begin:] / levels
+
+        pulse = 1.0 if place.command is None else _largest(longest.input[:, place.command])
+        first = float(np.max(np.abs(moved(0, pulse)), initial=0.0))
+        if not 0 < first < np.inf:
+            continue
+        pulse *= float(np.max(size / levels)) / first
+        total, count = np.zeros((rows, levels.size)), np.zeros((rows, 1))
+        for share in _PULSES_AT:
+            begin = int(share * rows)
+            response = moved(begin, pulse) / pulse
+            if np.all(np.isfinite(response)):
+                total[: rows - begin] += response
+                count[: rows - begin] += 1
+        if np.any(total):
+            motion = _moved_most(total) if place.motion is None else place.motion
+            shown.append(ForcePlace(place.name, place.unit, motion, place.command))
+            responses.append(total / np.maximum(count, 1))
+    if not shown:
+        return (), np.zeros((0, rows, levels.size))
+    found = np.array(responses)
+    if any(place.motion is None for place in every):
+        shown = _paired(shown, found * levels)
+    return tuple(shown), found
+
+
+def _reading_responses(case: CaseOfMachine, size: Real, levels: Real) -> Real:
+    """(Y, T, Y) residuals over the levels where an output reads one unit more in the first row.
+
+    A simulation that is held near what was measured follows the wrong reading; others do not know of it.
+    """
+    machine, longest = case.machine, max(case.experiments, key=lambda record: len(record.output))
+    rows, outputs = longest.output.shape
+    found = np.zeros((outputs, rows, outputs))
+    found[:, 0] = np.eye(outputs)
+    commands = len(machine.input_names)
+    if longest.input.shape[1] == commands + outputs:
+        none = np.zeros((rows, len(machine.force_places(commands))))
+        free, middle = machine.pushed(longest.input, none), rows // 2
+        for k in range(outputs):
+            read = np.array(longest.input)
+            read[middle, commands + k] += size[k]
+            moved = (machine.pushed(read, none) - free)[middle:] / size[k]
+            if np.all(np.isfinite(moved)):
+                found[k, : rows - middle] -= moved
+    return np.asarray(found / levels)
+
+
+def _largest(signal: Real) -> float:
+    """Largest size of a command (T,), one where it is zero throughout."""
+    return float(np.max(np.abs(signal))) or 1.0
+
+
+def _moved_most(response: Real) -> int:
+    """Column of the output (T, Y), over its level, that a pulse moves most."""
+    return int(np.argmax(np.max(np.abs(response), axis=0)))
+
+
+def _paired(places: Sequence[ForcePlace], responses: Real) -> list[ForcePlace]:
+    """Places with the outputs that move where they act, from responses (F, T, Y) in the outputs' units.
+
+    Of joints in coordinates of their own, an inverse inertia has no permutation with a larger trace. Where
+    there are fewer outputs than places, or commands that are no forces, several may share an output.
+    """
+    early = max(responses.shape[1] // 10, 2)
+    begin = np.sum(responses[:, :early], axis=1)
+    whole = np.max(np.abs(responses), axis=(0, 1))
+    begin = begin / np.where(whole > 0, whole, 1.0)
+    rows, columns = linear_sum_assignment(-begin)
+    own = dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    return [
+        ForcePlace(place.name, place.unit, own.get(k, place.motion), place.command)
+        for k, place in enumerate(places)
+    ]
+
+
+def _force_of(
+    case: CaseOfMachine, record: RecordOfMachine, missed: Real, weights: Real, responses: Real, levels: Real
+) -> tuple[Real, Real]:
+    """(T, F) forces that make the simulation follow a record, and (T, Y), over the levels, what their
+    simulation gives beyond their linear response; zeros where it follows no better with them."""
+    rows, outputs = missed.shape
+    forces, beyond = np.zeros((rows, len(responses))), np.zeros((rows, outputs))
+    if not len(responses):
+        return forces, beyond
+    target = missed / levels * weights[:, None]
+    # The RMS of what is followed: noise where the residual is small, a share of it where it is large.
+    enough = _ENOUGH * np.sqrt(target.size)
+    free = case.machine.pushed(record.input, forces)
+    left, error = target, float(np.linalg.norm(target))
+    for _ in range(_ROUNDS):
+        if error <= enough:
+            break
+        step = _deconvolved(left, weights, responses, enough / error)
+        before = error
+        for part in _PARTS:
+            trial = forces + part * step
+            pushed = (case.machine.pushed(record.input, trial) - free) / levels
+            again = target - pushed * weights[:, None]
+            reached = float(np.linalg.norm(again))
+            if reached < error:
+                forces, left, error = trial, again, reached
+                beyond = pushed - _response_to_all(responses, forces)
+                break
+        if not error < _GAINS * before:
+            break
+    return forces, beyond
+
+
+def _deconvolved(target: Real, weights: Real, responses: Real, tolerance: float) -> Real:
+    """(T, F) forces whose linear response is the target (T, Y) to a relative tolerance, or as near as some
+    iterations come; the slowest parts first, as least squares by conjugate gradients takes them."""
+    rows, outputs = target.shape
+    places = len(responses)
+    n = next_fast_len(2 * rows - 1, real=True)
+    spectra = rfft(responses[:, :rows], n, axis=1)
+
+    def forward(x: Real) -> Real:
+        of_forces = rfft(x.reshape(rows, places).T, n, axis=1)
+        found = irfft(np.einsum("fw,fwy->wy", of_forces, spectra), n, axis=0)[:rows]
+        return np.asarray(found * weights[:, None]).ravel()
+
+    def backward(y: Real) -> Real:
+        of_outputs = rfft(y.reshape(rows, outputs) * weights[:, None], n, axis=0)
+        found = irfft(np.einsum("wy,fwy->wf", of_outputs, np.conj(spectra)), n, axis=0)[:rows]
+        return np.asarray(found).ravel()
+
+    # Places in units of their own: a force of one in each moves the outputs about as far.
+    scale = np.tile(1 / np.sqrt(np.sum(responses**2, axis=(1, 2))), rows)
+    operator = LinearOperator(
+        (rows * outputs, rows * places),
+        matvec=lambda x: forward(np.ravel(x) * scale),
+        rmatvec=lambda y: backward(np.ravel(y)) * scale,
+        dtype=np.float64,
+    )
+    found = lsqr(operator, target.ravel(), atol=0.0, btol=tolerance, conlim=0.0, iter_lim=_ITERATIONS)
+    return np.asarray(found[0] * scale).reshape(rows, places)
+
+
+def _slow_size(forces: Sequence[Real]) -> Real:
+    """(F,) RMS of the missing forces (T, F) of all records, each as means over some rows: without the noise
+    that a force of single rows holds."""
+    means = []
+    for one in forces:
+        parts = np.array_split(one, max(len(one) // _ROWS_PER_FORCE, 1))
+        means += [np.mean(part, axis=0) for part in parts]
+    return np.asarray(np.sqrt(np.mean(np.square(means), axis=0)))
+
+
+def _whitening(responses: Real, size: Real, weights: Real) -> Whitening:
+    """What makes noise, beside the traces of unknown forces and of an unknown start, white.
+
+    A machine that drifts integrates the smallest force: without this all of its error is drift, and no curve
+    explains it. Forces that no curve explains are triangles over some rows each, independent, of a share of
+    the RMS `size` (F,) of what is missing; forces in the first rows, of any size, stand for the start. The
+    covariance of a record is C = I + N N', N their responses; of the singular value decomposition of N,
+    C^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U'.
+    """
+    rows, outputs = len(weights), responses.shape[2]
+    if not len(responses):
+        return Whitening(np.zeros((rows * outputs, 0)), np.zeros(0))
+    count = int(np.clip(rows // _ROWS_PER_FORCE, 2, _MOST_FORCES))
+    nodes = np.linspace(0, rows - 1, count)
+    triangles = np.array([np.interp(np.arange(rows), nodes, row) for row in np.eye(count)]).T
+    first = np.eye(rows)[:, :_START_ROWS]
+    # What is not explained moves the outputs about as far from each place as from the one that misses most.
+    gains = np.sqrt(np.sum(responses**2, axis=(1, 2)))
+    columns = []
+    for response, gain in zip(responses, gains, strict=True):
+        of_start = _convolved(first, response)
+        largest = np.sqrt(np.sum(of_start**2, axis=(0, 2), keepdims=True))
+        columns.append(_ANY_SIZE * of_start / np.maximum(largest, np.finfo(float).tiny))
+        columns.append(_convolved(_UNEXPLAINED * float(np.max(size * gains)) / gain * triangles, response))
+    every = np.concatenate(columns, axis=1) * weights[:, None, None]
+    flat = np.moveaxis(every, 1, 2).reshape(rows * outputs, -1)
+    basis, sizes, _ = np.linalg.svd(flat, full_matrices=False)
+    taken = 1 - 1 / np.sqrt(1 + sizes**2)
+    return Whitening(basis[:, taken > _NOTHING], taken[taken > _NOTHING])
+
+
+def _response_to_all(responses: Real, forces: Real) -> Real:
+    """(T, Y) over the levels, of forces (T, F) at all places together."""
+    found = np.zeros((len(forces), responses.shape[2]))
+    for k, response in enumerate(responses):
+        found += _convolved(forces[:, [k]], response)[:, 0]
+    return found
+
+
+def _convolved(forces: Real, response: Real) -> Real:
+    """(T, K, Y) of each of the forces (T, K) through one response (T', Y), T' >= T."""
+    rows = len(forces)
+    n = next_fast_len(2 * rows - 1, real=True)
+    spectra = rfft(forces, n, axis=0)[:, :, None] * rfft(response[:rows], n, axis=0)[:, None]
+    return np.asarray(irfft(spectra, n, axis=0)[:rows])
