@@ -13,14 +13,15 @@ stated.
 
 Right: the first dependence is of that variable, of that output or column. Place: it is at the right joint.
 Size: RMS difference of the curve and the true force, each about its mean, over the RMS of the true force.
-Eight machines of each route have no such force and are as stated: what is found there is a false alarm.
+Eight machines of each route have no such force and are as stated, and five are shaken by a random torque that
+no log holds: what is found there is a false alarm.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import Any
 
 import mujoco
@@ -71,6 +72,7 @@ class Force:
             "speed": (lambda: -np.tanh(x / 0.02), lambda: -x, lambda: -x * np.abs(x)),
             "time": (lambda: -x, lambda: 1 - np.exp(-4 * x), lambda: np.sin(5 * x)),
             "load": (lambda: -x, lambda: -np.maximum(x, 0.0) * 2, lambda: -np.tanh(2 * x)),
+            "shaken": (lambda: x,) * 3,
             "other": (lambda: -z, lambda: -np.maximum(z, 0.0) * 2, lambda: -np.sin(3 * z)),
         }
         return self.size * laws[self.variable][self.law]()
@@ -84,6 +86,7 @@ class Machine:
     masses: Any
     damping: Any
     armature: Any
+    seed: int = 0
 
     @property
     def answer(self) -> tuple[str, str]:
@@ -113,8 +116,22 @@ class Machine:
             "time": time_s / (SAMPLES * DT_S),
             "load": load,
             "other": angles[1 - self.joint],
+            "shaken": shaken(self.seed, time_s),
         }[self.force.variable]
         return float(self.force.of(x))
+
+
+@cache
+def shaking(seed: int) -> Any:
+    """(3, 20) sizes, frequencies [Hz] and phases of a random torque in a log."""
+    rng = np.random.default_rng(seed)
+    return np.array([rng.normal(size=20), rng.uniform(0.3, 5.0, 20), rng.uniform(0, 2 * np.pi, 20)])
+
+
+def shaken(seed: int, time_s: float) -> float:
+    """A torque that is another in every log."""
+    size, frequency, phase = shaking(seed)
+    return float(np.sum(size * np.sin(2 * np.pi * frequency * time_s + phase)) / np.sqrt(10))
 
 
 def smooth(rng: np.random.Generator, count: int, bandwidth_Hz: float, hold: int, rows: int) -> Any:
@@ -254,7 +271,7 @@ def of_rig(machine: Machine, rig: Any, rng: np.random.Generator) -> tuple[Any, A
 
 def case_of(route: str, variable: str, number: int, seed: int) -> tuple[Machine, Any, Any]:
     """The machine, its case and its residuals (record -> (T, Y))."""
-    draw = [seed, ROUTES.index(route), ("none", *VARIABLES).index(variable), number]
+    draw = [seed, ROUTES.index(route), ("none", *VARIABLES, "shaken").index(variable), number]
     rng = np.random.default_rng(draw)
 
     def off(values: Any, share: float) -> Any:
@@ -266,7 +283,7 @@ def case_of(route: str, variable: str, number: int, seed: int) -> tuple[Machine,
     if variable != "none":
         middle = rest + rng.uniform(-0.2, 0.2)
         force = Force(variable, int(rng.integers(3)), 0.0, middle if variable in ("angle", "other") else 0.0)
-    known = 0.0 if variable == "none" else 1.0
+    known = 0.0 if variable in ("none", "shaken") else 1.0
     offs = ((MASSES_KG, MASS_OFF), (DAMPING, DAMPING_OFF), (ARMATURE, ARMATURE_OFF))
     bodies = [off(values, known * share) for values, share in offs]
     machine = Machine(route, force, joint, *bodies)
@@ -293,8 +310,8 @@ def case_of(route: str, variable: str, number: int, seed: int) -> tuple[Machine,
             *bodies,
         )
     records = []
-    for name, role in LOGS:
-        U, Y, beside = log(machine, rng)
+    for k, (name, role) in enumerate(LOGS):
+        U, Y, beside = log(replace(machine, seed=1000 * number + k), rng)
         if route == "rig":
             records.append(Experiment(name, role, U[:, 0], Y, beside=beside))  # type: ignore[arg-type]
             continue
@@ -410,7 +427,7 @@ def answered(
         f"{one.acts} {one.place}({one.quantity} {one.of}) {one.share:.2f} {one.shape}" for one in told
     )
     begin = f"{route:7s} {variable:6s} {number}"
-    if machine.force is None:
+    if machine.force is None or variable == "shaken":
         out(f"{begin} {'' if told else 'right':6s} {said or 'nothing'} ({cpu_s:.1f} s)")
         return not told, not told, float("nan"), cpu_s
 
@@ -438,6 +455,7 @@ def run(
             counts[route, variable] = sum(one[0] for one in here)
             every += here
         quiet += [answered(route, "none", k, seed, out) for k in range(none)]
+        quiet += [answered(route, "shaken", k, seed, out) for k in range(each)]
     out()
     for route in routes:
         by = ", ".join(f"{variable} {counts[route, variable]}" for variable in VARIABLES)

@@ -287,7 +287,7 @@ class _Regressions:
     def _by_block(self, rows: Real) -> Real:
         """(B,) sums of energies (N,) of rows over those of their records: logs that move more weigh no
         more."""
-        return np.bincount(self._blocks, rows * self._weights, minlength=_BLOCKS)
+        return np.bincount(self._blocks, rows * self._weights, minlength=_BLOCKS).astype(np.float64)
 
     def _judge(
         self, pairs: Sequence[_Pair], constant_at: tuple[str, int] | None, shape: Shape = "curve"
