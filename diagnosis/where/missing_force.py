@@ -44,13 +44,16 @@ _GAINS = 0.99
 # Part of the missing force, RMS, that no curve explains. Chosen: measured forces repeat to a tenth; with
 # three times as much shares of the series change by less than 0.05.
 _UNEXPLAINED = 0.05
-# Rows of one unknown force, and the most of them in a record: slower than what a machine shows within its own
-# period as a rule, and a decomposition of a second at most. Chosen.
-_ROWS_PER_FORCE, _MOST_FORCES = 10, 100
-# What an unknown start may do, in noise deviations: anything.
-_ANY_SIZE = 1e6
-# Parts of a direction below this are not taken off: rounding.
-_NOTHING = 1e-9
+# Rows of one unknown force, and the most of them in a record at all places: slower than what a machine shows
+# within its own period as a rule, and a decomposition of a second at most. Chosen.
+_ROWS_PER_FORCE, _MOST_FORCES = 10, 150
+# Directions of less than this part of the largest are rounding.
+_ALIKE = 1e-6
+# Energy over that of noise below which a direction is left as it is.
+_NOTHING = 1e-4
+# Values of a record that are looked at, of all outputs; a longer one is looked at every few rows. Chosen: a
+# curve has sixteen numbers; with twice as many seven joints take twice the time.
+_MOST_VALUES = 6000
 # Where in a record pulses of force are tried, as shares of its length: at its begin, and in another pose.
 _PULSES_AT = (0.0, 0.25, 0.5)
 # Rows at the begin of a record whose forces stand for a start that nobody knows: position, speed and a state
@@ -88,15 +91,17 @@ class ForcedRecord:
     Parameters
     ----------
     name : str
-    residuals : (T, Y) array
+    residuals : (T / step, Y) array
         Over the levels of the outputs and whitened: linear in the missing force, and the rest that no force
         at the places makes. Rows that are missing are zero before that.
     forces : (T, F) array
         Missing forces at the places, in their units; zero where the simulation could not be made to follow.
     motion : (T, Y) array
         Outputs in their units as the forced simulation gives them, with less noise than measured.
-    weights : (T,) array
-        One, and zero in rows that are missing.
+    weights : (T / step,) array
+        One, and zero in rows that are missing, of the rows that are looked at.
+    step : int
+        Every how many rows are looked at: residuals and responses are of these.
     whitening : Whitening
         Of residuals and of what curves do to them.
     noise_energies : (Y,) array
@@ -108,6 +113,7 @@ class ForcedRecord:
     forces: Real
     motion: Real
     weights: Real
+    step: int
     whitening: Whitening
     noise_energies: Real
 
@@ -132,15 +138,23 @@ class MissingForces:
     reading_responses: Real
     records: tuple[ForcedRecord, ...]
 
+    @property
+    def share_of_places(self) -> Real:
+        """(F,) how far the missing forces of each place move the outputs, over the largest; one where there
+        are none."""
+        moved = _slow_size([record.forces for record in self.records]) * _gains(self.responses)
+        largest = float(np.max(moved, initial=0.0))
+        return np.asarray(moved / largest) if largest > 0 else np.ones(moved.size)
+
     def response_to(self, place: int, forces: Real, record: ForcedRecord) -> Real:
-        """(T, K, Y) whitened residuals of a record under each of the forces (T, K) at a place."""
-        moved = _convolved(forces, self.responses[place])
+        """(T / step, K, Y) whitened residuals of a record under each of the forces (T, K) at a place."""
+        moved = _convolved(forces, self.responses[place])[:: record.step]
         return record.whitening.of(moved * record.weights[:, None, None])
 
     def response_to_reading(self, output: int, errors: Real, record: ForcedRecord) -> Real:
-        """(T, K, Y) whitened residuals of a record where an output reads more by each of the errors (T, K),
-        in its unit."""
-        moved = _convolved(errors, self.reading_responses[output])
+        """(T / step, K, Y) whitened residuals of a record where an output reads more by each of the errors
+        (T, K), in its unit."""
+        moved = _convolved(errors, self.reading_responses[output])[:: record.step]
         return record.whitening.of(moved * record.weights[:, None, None])
 
 
@@ -177,17 +191,20 @@ def missing_forces(case: CaseOfMachine, residuals: Mapping[str, Real]) -> Missin
     for record in case.experiments:
         name, kept = record.name, weights[record.name]
         moved = _response_to_all(responses, forces[name]) + beyond[name]
-        whitening = _whitening(responses, size, kept)
-        rest = (missed[name] / levels - beyond[name]) * kept[:, None]
+        step = -(-len(kept) * levels.size // _MOST_VALUES)
+        looked_at = kept[::step]
+        whitening = _whitening(responses, size, looked_at, step)
+        rest = (missed[name] / levels - beyond[name])[::step] * looked_at[:, None]
         records.append(
             ForcedRecord(
                 name=name,
                 residuals=whitening.of(rest[:, None])[:, 0],
                 forces=forces[name],
                 motion=record.output - missed[name] + levels * moved,
-                weights=kept,
+                weights=looked_at,
+                step=step,
                 whitening=whitening,
-                noise_energies=(case.noise / levels) ** 2 * whitening.passes(kept, levels.size),
+                noise_energies=(case.noise / levels) ** 2 * whitening.passes(looked_at, levels.size),
             )
         )
     return MissingForces(places, responses, _reading_responses(case, moves, levels), tuple(records))
@@ -359,35 +376,48 @@ def _slow_size(forces: Sequence[Real]) -> Real:
     return np.asarray(np.sqrt(np.mean(np.square(means), axis=0)))
 
 
-def _whitening(responses: Real, size: Real, weights: Real) -> Whitening:
+def _gains(responses: Real) -> Real:
+    """(F,) sizes of responses (F, T, Y)."""
+    return np.asarray(np.sqrt(np.sum(responses**2, axis=(1, 2))))
+
+
+def _whitening(responses: Real, size: Real, weights: Real, step: int) -> Whitening:
     """What makes noise, beside the traces of unknown forces and of an unknown start, white.
 
     A machine that drifts integrates the smallest force: without this all of its error is drift, and no curve
     explains it. Forces that no curve explains are triangles over some rows each, independent, of a share of
     the RMS `size` (F,) of what is missing; forces in the first rows, of any size, stand for the start. The
-    covariance of a record is C = I + N N', N their responses; of the singular value decomposition of N,
-    C^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U'.
+    covariance of a record, beside its start, is C = I + N N', N their responses. With the singular values s
+    of N and its left vectors U, C^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U'. weights: of every `step`-th row.
     """
-    rows, outputs = len(weights), responses.shape[2]
+    outputs = responses.shape[2]
     if not len(responses):
-        return Whitening(np.zeros((rows * outputs, 0)), np.zeros(0))
-    count = int(np.clip(rows // _ROWS_PER_FORCE, 2, _MOST_FORCES))
+        return Whitening(np.zeros((len(weights) * outputs, 0)), np.zeros(0))
+    rows = (len(weights) - 1) * step + 1
+    count = int(np.clip(rows // _ROWS_PER_FORCE, 2, max(_MOST_FORCES // len(responses), 2)))
     nodes = np.linspace(0, rows - 1, count)
     triangles = np.array([np.interp(np.arange(rows), nodes, row) for row in np.eye(count)]).T
-    first = np.eye(rows)[:, :_START_ROWS]
     # What is not explained moves the outputs about as far from each place as from the one that misses most.
-    gains = np.sqrt(np.sum(responses**2, axis=(1, 2)))
-    columns = []
-    for response, gain in zip(responses, gains, strict=True):
-        of_start = _convolved(first, response)
-        largest = np.sqrt(np.sum(of_start**2, axis=(0, 2), keepdims=True))
-        columns.append(_ANY_SIZE * of_start / np.maximum(largest, np.finfo(float).tiny))
-        columns.append(_convolved(_UNEXPLAINED * float(np.max(size * gains)) / gain * triangles, response))
-    every = np.concatenate(columns, axis=1) * weights[:, None, None]
-    flat = np.moveaxis(every, 1, 2).reshape(rows * outputs, -1)
-    basis, sizes, _ = np.linalg.svd(flat, full_matrices=False)
-    taken = 1 - 1 / np.sqrt(1 + sizes**2)
-    return Whitening(basis[:, taken > _NOTHING], taken[taken > _NOTHING])
+    gains = _gains(responses)
+    unexplained = _UNEXPLAINED * float(np.max(size * gains))
+
+    def of_all(forces: Real) -> Real:
+        """(T / step Y, K F) responses over their gains to forces (T, K) at every place."""
+        every = [_convolved(forces, one / gain)[::step] for one, gain in zip(responses, gains, strict=True)]
+        found = np.concatenate(every, axis=1) * weights[:, None, None]
+        return np.asarray(np.moveaxis(found, 1, 2).reshape(len(weights) * outputs, -1))
+
+    of_start = of_all(np.eye(rows, _START_ROWS))
+    lengths = np.maximum(np.linalg.norm(of_start, axis=0), np.finfo(float).tiny)
+    start, sizes, _ = np.linalg.svd(of_start / lengths, full_matrices=False)
+    start = start[:, sizes > _ALIKE * sizes[0]]
+    of_forces = unexplained * of_all(triangles)
+    of_forces -= start @ (start.T @ of_forces)
+    energies, turned = np.linalg.eigh(of_forces.T @ of_forces)
+    kept = energies > max(_NOTHING, _ALIKE**2 * float(energies[-1]))
+    basis = of_forces @ (turned[:, kept] / np.sqrt(energies[kept]))
+    taken = 1 - 1 / np.sqrt(1 + energies[kept])
+    return Whitening(np.concatenate([start, basis], axis=1), np.append(np.ones(start.shape[1]), taken))
 
 
 def _response_to_all(responses: Real, forces: Real) -> Real:
