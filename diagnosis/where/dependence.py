@@ -77,12 +77,13 @@ _POSITIONS, _SPEEDS = ("rad", "m", "deg", "mm", ""), ("rad/s", "m/s", "deg/s")
 
 @dataclass(frozen=True, eq=False)
 class _Variable:
-    """A variable with its values (T,) in every record, in the records' order."""
+    """A variable with its values (T,) in every record, in their order; inner intervals of its curve."""
 
     quantity: Quantity
     of: str
     unit: str
     values: tuple[Real, ...]
+    intervals: int = _INTERVALS
 
     @property
     def jumps(self) -> bool:
@@ -441,13 +442,18 @@ def _scatter(energies: Real, rows: Sequence[int]) -> float:
     return float(np.sqrt(2 * np.sum(energies**2 / np.array(rows)[:, None])))
 
 
+def _are_logs(case: CaseOfMachine) -> bool:
+    """Whether the records are several logs, each from its begin."""
+    records = case.experiments
+    return len(records) > 1 and all(getattr(one, "first_row", 0) == 0 for one in records)
+
+
 def _folds(case: CaseOfMachine, records: Sequence[ForcedRecord]) -> tuple[list[Integer], bool]:
     """(T,) fold of every row of every record, and whether the folds are logs.
 
     Parts of one log are blocks: of a variable like the time no part holds what another one does.
     """
-    logs = all(getattr(record, "first_row", 0) == 0 for record in case.experiments)
-    if logs and len(records) > 1:
+    if _are_logs(case):
         count = min(len(records), 2 * _FOLDS)
         return [np.full(len(one.residuals), k % count) for k, one in enumerate(records)], True
     rows = sum(len(one.residuals) for one in records)
@@ -470,10 +476,9 @@ def _basis(variable: _Variable, shape: Shape) -> _Basis:
     def jump(values: Real) -> Real:
         return np.clip(values / still, -1.0, 1.0)[:, None]
 
-    intervals = _INTERVALS_OF_TIME if variable.quantity == "time" else _INTERVALS
-    step = (high - low) / intervals
-    knots = low + step * np.arange(-_DEGREE, intervals + _DEGREE + 1)
-    count = intervals + _DEGREE
+    step = (high - low) / variable.intervals
+    knots = low + step * np.arange(-_DEGREE, variable.intervals + _DEGREE + 1)
+    count = variable.intervals + _DEGREE
 
     def curve(values: Real) -> Real:
         inside = np.clip(values, low, high)
@@ -593,7 +598,9 @@ def _common(case: CaseOfMachine, dt_s: float) -> tuple[_Variable, ...]:
         dt_s * (getattr(one, "first_row", 0) + np.arange(len(one.output), dtype=np.float64))
         for one in records
     )
-    found = [_Variable("time", "", "s", time)]
+    # Of one log everything is a function of the time: none that is finer than the blocks.
+    intervals = _INTERVALS_OF_TIME if _are_logs(case) else _INTERVALS
+    found = [_Variable("time", "", "s", time, intervals)]
     held = [getattr(one, "beside", {}) for one in records]
     for name in held[0]:
         if all(name in one for one in held) and _varies([one[name] for one in held]):

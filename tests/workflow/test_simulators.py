@@ -81,6 +81,18 @@ def write_log(path: Path, seed: int, friction: float, gain: float = 1.0) -> None
     save(path, rows)
 
 
+def test_columns_beside_the_model_are_read_along_with_the_parts_of_a_log(arm):
+    rows = np.loadtxt(arm / "one.csv", delimiter=",", skiprows=1)
+    load = np.sin(rows[:, 0])
+    save(arm / "one.csv", np.column_stack([rows, load]), names="time_s,motor,hinge,load_N")
+    first, last = loaded(arm, f'{ONE}beside = ["load_N"]').case.experiments
+    np.testing.assert_allclose(np.concatenate([first.beside["load_N"], last.beside["load_N"]]), load)
+    assert (first.first_row, last.first_row) == (0, len(first.output))
+    assert first.input.shape[1] == 2  # no input of the model
+    with pytest.raises(InputError, match="no column for weight"):
+        loaded(arm, f'{ONE}beside = ["weight"]')
+
+
 @pytest.mark.slow
 def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink, monkeypatch):
     mujoco = pytest.importorskip("mujoco")
