@@ -38,6 +38,7 @@ Integer = npt.NDArray[np.int64]
 # swells ten times in a log. Chosen; with twice as many the penalty takes over and shares of the series move
 # by less than 0.01.
 _INTERVALS, _INTERVALS_OF_TIME = 10, 40
+# Cubic: two derivatives of a force are continuous, as of what bends.
 _DEGREE = 3
 # Strengths of the penalty that are tried, over the mean energy of a basis function.
 _PENALTIES = (1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1.0)

@@ -19,7 +19,7 @@ PART = PartGap(5.0, (4.0, 6.0), 1.0, (0.9, 1.0), 0.0, True)
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({}, "the angle of elbow: missing torque at elbow, 55 % of the error on logs not used; a spring of 7.8 N"),
+        ({}, "the angle of elbow: missing torque at elbow, 55 % of the error on logs not used; a spring"),
         ({}, "a spring of 7.8 N m/rad"),
         ({"slope": 7.8}, "grows by 7.8 N m/rad"),
         ({"own": False, "of": "shoulder"}, "the angle of shoulder: missing torque at elbow"),
@@ -34,6 +34,9 @@ PART = PartGap(5.0, (4.0, 6.0), 1.0, (0.9, 1.0), 0.0, True)
         ({"place": "tip_m", "acts": "reading", "value_unit": "m"}, "error of the reading of tip"),
         ({"of": "hub_angle_rad", "place": "hub"}, "the hub angle: missing torque at hub"),
         ({"shape": "curve", "slope": None}, "-7.8 N m at 1 rad, 7.8 N m at -1 rad"),
+        ({"of": "angle_rad", "place": "torque_Nm"}, "the angle: missing torque, 55 %"),
+        ({"of": "angle_rad", "quantity": "speed", "unit": "rad/s", "slope": -0.2}, "the speed: missing torque"),
+        ({"of": "cart_speed_m_s", "unit": "m"}, "the position of cart: missing"),
         ({"judged_on": "blocks"}, "on blocks not used"),
     ],
 )  # fmt: skip

@@ -43,8 +43,8 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     page = (tmp_path / "motor.html").read_text()
     for section in ("gap", "where", "which", "closure", "remains", "unchecked"):
         assert f'<section id="{section}">' in page
-    # Measured, gap, three of where, probabilities, partial answers, spectra.
-    assert page.count("<figure>") == 8
+    # Measured, gap, four of where, probabilities, partial answers, spectra.
+    assert page.count("<figure>") == 9
     assert faults_seen(tmp_path / "motor.html") == []
     words = " ".join(re.sub(r"<[^>]+>", " ", page).split())
     found = test.globs["found"]

@@ -27,12 +27,17 @@ def variable_words(finding: Finding) -> str:
         return f"the command {of}"
     if quantity not in _MOTIONS:
         return of
-    moving = of.removesuffix(" angle").removesuffix(" position")
+    # "hub angle" is the angle of hub; "angle" alone is that of the only body.
+    words = of.split()
+    names_motion = words[-1:] in (["angle"], ["position"], ["speed"])
+    moving = " ".join(words[:-1] if names_motion else words)
     if quantity != "position":
-        return f"the {quantity} of {moving}"
-    if moving != of or of.endswith("deflection"):
+        return f"the {quantity} of {moving}" if moving else f"the {quantity}"
+    if (names_motion and words[-1] != "speed") or of.endswith("deflection"):
         return f"the {of}"
-    return f"the angle of {of}" if unit == "rad" else f"the position of {of}"
+    if not moving:
+        return "the way since the start"
+    return f"the angle of {moving}" if unit == "rad" else f"the position of {moving}"
 
 
 def missing_words(finding: Finding) -> str:
@@ -41,9 +46,9 @@ def missing_words(finding: Finding) -> str:
     if finding["acts"] == "reading":
         return f"error of the reading of {place}"
     if unit in _TORQUES:
-        return f"missing torque at {place}"
+        return "missing torque" if place == "torque" else f"missing torque at {place}"
     if unit in _FORCES:
-        return f"missing force at {place}"
+        return "missing force" if place == "force" else f"missing force at {place}"
     return f"missing part of the command {place}"
 
 
