@@ -239,7 +239,7 @@ class Plant:
     def pushed(self, inputs: Real, forces: Real) -> Real:
         """(T, Y) outputs of the simulation as stated under inputs (T, U) and forces (T, F) at the places.
 
-        Not a number throughout where the simulation ends with a numerical error.
+        Not a number throughout where the simulation ends with an error: forces lead where nobody has been.
         """
         try:
             with np.errstate(all="ignore"):  # forces may drive it away
@@ -248,7 +248,7 @@ class Plant:
                 moved = np.array(inputs, dtype=np.float64)
                 moved[:, : forces.shape[1]] += forces
                 return self.simulated(())(moved)
-        except _NUMERICAL:
+        except (*_NUMERICAL, SimulationError):
             return np.full((len(inputs), self.noise.size), np.nan)
 
     def other_coordinates(self, outputs: Real) -> dict[str, Real]:

@@ -198,12 +198,13 @@ def test_of_a_torque_from_motion_the_output_is_the_force():
     assert first.slope == pytest.approx(0.3, rel=0.05)
 
 
-def test_a_simulation_that_fails_when_pushed_leaves_its_readings():
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyError("far")])
+def test_a_simulation_that_fails_when_pushed_leaves_its_readings(error):
     case, left = case_of(lambda x, v, k, load: np.array([-8.0 * x[0], 0.0]))
 
     def fragile(parameters, effects, inputs):
         if not any(np.array_equal(inputs, e.input) for e in case.experiments):
-            raise ZeroDivisionError
+            raise error
         return stepped(inputs)
 
     plant = replace(PLANT, simulation=fragile)

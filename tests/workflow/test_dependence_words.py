@@ -35,7 +35,7 @@ PART = PartGap(5.0, (4.0, 6.0), 1.0, (0.9, 1.0), 0.0, True)
         ({"of": "hub_angle_rad", "place": "hub"}, "the hub angle: missing torque at hub"),
         ({"shape": "curve", "slope": None}, "-7.8 N m at 1 rad, 7.8 N m at -1 rad"),
         ({"of": "angle_rad", "place": "torque_Nm"}, "the angle: missing torque, 55 %"),
-        ({"of": "angle_rad", "quantity": "speed", "unit": "rad/s", "slope": -0.2}, "the speed: missing torque"),
+        ({"of": "angle_rad", "quantity": "speed", "unit": "rad/s", "slope": -0.2}, "the speed: missing"),
         ({"of": "cart_speed_m_s", "unit": "m"}, "the position of cart: missing"),
         ({"judged_on": "blocks"}, "on blocks not used"),
     ],
