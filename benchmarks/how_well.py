@@ -239,6 +239,14 @@ SECTIONS = {
             "`{1}`: true response inside its ellipses at {0} % of frequencies",
         ),
         Row(
+            "Drawn after release 0.2.0, each kind twice: certified, and 20 of 20 steps settle",
+            "closed_loop_machines_32",
+            r"^all +\| (\d+) of (\d+) \| - \| (\d+) of (\d+)",
+            "{0} of {1}; {2} of {3} certificates exceeded",
+            BY_MACHINE,
+            "`{1}`: true response inside its ellipses at {0} % of frequencies",
+        ),
+        Row(
             "Six machines, their logs rounded, thinned, shortened, in other units: certificate or first mode "
             "differs",
             "same_log_otherwise",
