@@ -120,13 +120,13 @@ def rate_members(response: ResponsePosterior, poles: Poles, longest_s: float) ->
     size = chi2_radius(LEVEL) * np.abs(x)
     if size[0] < 1:
         return ()
-    not_zero = low & (size < 1)
-    first_known = int(np.argmax(not_zero)) if not_zero.any() else int(np.argmin(np.where(low, size, np.inf)))
+    # The first of the least sizes, those below one taken alike.
+    known_at = int(np.argmin(np.where(low, np.maximum(size, 1), np.inf)))
     # Force over speed, without the delay of the input and of the hold.
     delay_s = (response.input_delay_samples + 0.5) * response.dt_s
     force = np.exp(-1j * omega * delay_s) / (1j * omega * gain)
     # An inertia is positive.
-    force = force * np.copysign(1.0, force[first_known].imag)
+    force = force * np.copysign(1.0, force[known_at].imag)
 
     # A unit normal whose growth takes force away, and its values that leave a damping.
     turn = np.copysign(1.0, force[0].real)

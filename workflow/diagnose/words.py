@@ -15,9 +15,12 @@ from workflow.text.dependence import (
     dependence_short,
     dependence_words,
 )
-from workflow.text.formats import MISSING, fixed, interval, listing, number, si
+from workflow.text.formats import MISSING, fixed, interval, listing, number, portion, si
 from workflow.text.names import name_words, stated_name, stated_unit, unit_of
 
+# Share of the error, explained by nothing on the list, from which on a page says so. Chosen: less is what a
+# good model leaves, too.
+_LEAST_UNEXPLAINED = 0.05
 _SURE = {0.99: "practically certain", 0.9: "very likely", 0.66: "likely", 0.33: "possible", 0.0: "unlikely"}
 
 
@@ -128,6 +131,17 @@ def repair_words(document: Mapping[str, Any]) -> str:
     return f"{sizes}{with_effects}; moved: {listing(moved) if moved else 'no value'}"
 
 
+def unexplained_words(found: Any) -> str:
+    """A sentence on what the repaired model of a diagnosis leaves that nothing on the list explains.
+
+    "" where that is little, no repair was made, or the answer is that nothing is missing.
+    """
+    prediction = found.prediction
+    if not prediction or found.verdict == "none" or prediction.unexplained < _LEAST_UNEXPLAINED:
+        return ""
+    return f"{portion(prediction.unexplained)} of the error is explained by nothing on the list."
+
+
 def closure_words(document: Mapping[str, Any]) -> str:
     """Share of the model error that is explained, with its interval; a dash where nothing was added."""
     closed = document["gap_closed"]
@@ -173,6 +187,7 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "nothing_tried": nothing_tried,
     "closure": closure_words,
     "repair": repair_words,
+    "unexplained": unexplained_words,
     "select_moved": lambda deviations: [key for key, off in deviations.items() if off],
     "trend": trend_words,
     "dependence": of_finding(dependence_words),

@@ -15,6 +15,9 @@ Finding = Mapping[str, Any]
 
 # Units of a torque and of a force, as logs and models spell them.
 _TORQUES, _FORCES = ("N m", "Nm"), ("N",)
+# Share that a constant force explains from which on it is said beside that of the curve. Chosen, as the least
+# share of a dependence.
+_LEAST_CONSTANT = 0.1
 _MOTIONS = ("position", "speed", "acceleration")
 
 
@@ -108,7 +111,7 @@ def dependence_words(finding: Finding) -> str:
     unused = "logs" if finding["judged_on"] == "logs" else "blocks of the log"
     begins = "beside that, the error depends" if finding["beside"] else "the error depends"
     of_constant = ""
-    if finding["constant_share"] >= 0.1:
+    if finding["constant_share"] >= _LEAST_CONSTANT:
         of_constant = f" (what is constant in it alone: {portion(finding['constant_share'])})"
     what = missing_words(finding)
     article = "an" if what.startswith("error") else "a"
