@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 from math import factorial
 from typing import Any
@@ -19,96 +19,170 @@ from diagnosis.machine.rounding import rounding_effect
 from diagnosis.search.loop import SEVERAL
 from diagnosis.search.search import Search
 
-# A further effect of a partial answer closes so much more, a third one twice that.
+# Share of the validation error that a further effect has to close for a set with it to be listed among the
+# sets that close much; for a third effect twice that, as any third number closes something. Chosen; with
+# twice as much the list of partial answers loses its weakest line, and nothing else reads it.
 _CLOSES = 0.05
+# Quantiles between which 95 % of the bootstrap lie.
+_INTERVAL = (0.025, 0.975)
+
+Names = tuple[str, ...]
 
 
 def shares_of(
     search: Search,
     matter: Sequence[str],
-    accepted: Explanation,
+    repaired: Explanation,
     nominal: Explanation,
     rng: np.random.Generator,
 ) -> Shares:
-    """Shares of the energy of the held-out residuals beyond white noise of the stated size.
+    """Shares of the validation error, in energy beyond white noise of the stated size, that effects carry.
 
-    matter : those of the effects of the repaired model that are not small. nominal : what they are added to.
+    Parameters
+    ----------
+    search : Search
+        After its run. Parts of the repaired model that it has not fitted are fitted, if there is time.
+    matter : sequence of str
+        Effects that are not small. Others of the repaired model are recorded as small.
+    repaired : Explanation
+        The repaired model.
+    nominal : Explanation
+        What the effects are added to.
+    rng : numpy.random.Generator
+        Of the bootstrap.
 
-    Carried is the Shapley value of every effect of the repaired model, small ones included: what it closes,
-    averaged over the orders in which they could be added, so that it depends on none and all together are
-    what the model closes; intervals by bootstrap over blocks of samples. Empty where a time limit left no
-    time for the parts of the model.
+    Returns
+    -------
+    Shares
+        `carried` is empty where a time limit left no time for the parts of the repaired model.
+
+    Notes
+    -----
+    What an effect carries is its Shapley value (Shapley 1953): what it closes, averaged over the orders in
+    which the effects could be added. It depends on no order, and all together are what the model closes.
+    Intervals: bootstrap over blocks of `BLOCK` samples. Neglected: correlation between neighbouring blocks.
     """
-    held, fitted = search.held_out, [name for name in matter if name in accepted.names]
-    names = (*fitted, *(name for name in accepted.names if name not in fitted))
-    parts = [chosen for count in range(len(names) + 1) for chosen in combinations(names, count)]
-    known = {accepted.key, *(e.key for e in search.found)}
-    in_time = not search.out_of_time or all(tuple(sorted(chosen)) in known for chosen in parts)
-    subsets = {chosen: search.by_these(chosen, accepted) for chosen in (parts if in_time else ((),))}
-    # Alone a part may run away, far beyond what the nominal leaves: it carries nothing.
-    nothing = _blocks(search, nominal)
-    blocks = {
-        chosen: min(_blocks(search, explanation), nothing, key=np.sum)
-        for chosen, explanation in subsets.items()
-    }
-    drawn, carried = rng.integers(0, blocks[()].size, (DRAWS, blocks[()].size)), {}
-    for name in names if in_time else ():
-        value = _shapley(name, names, {c: b.sum(keepdims=True) for c, b in blocks.items()})[0]
-        spread = _shapley(name, names, {c: b[drawn].sum(axis=1) for c, b in blocks.items()})
-        low, high = np.quantile(spread, [0.025, 0.975])
-        carried[name] = (float(value), min(float(low), 1.0), min(float(high), 1.0))
-    ranked = sorted(search.found, key=lambda e: e.evidence)
-    closed = {e.key: closed_by(search, e, nominal) for e in ranked if e.names}
-    # What closes more than any part of it does.
-    best = {
-        key: max([0.0, *(closed.get(rest, 0.0) for rest in combinations(key, len(key) - 1))])
-        for key in closed
-    }
-    told = sorted(
-        ((c, key) for key, c in closed.items() if c > best[key] + _CLOSES * (1 if len(key) < 3 else 2)),
-        reverse=True,
-    )[:SEVERAL]
+    interesting = [name for name in matter if name in repaired.names]
+    names = (*interesting, *(name for name in repaired.names if name not in interesting))
+    held_out = search.held_out
     return Shares(
         names=tuple(search.case.machine.output_names),
-        before=tuple(map(float, held.shares(nominal.left_held_out))),
-        after=tuple(map(float, held.shares(accepted.left_held_out))),
+        before=tuple(map(float, held_out.shares(nominal.left_held_out))),
+        after=tuple(map(float, held_out.shares(repaired.left_held_out))),
         interests=search.case.machine.weighing.model_error,
-        carried=carried,
+        carried=_carried_by_each(search, names, repaired, nominal, rng),
         small=tuple(name for name in names if name not in matter),
-        closes=tuple((key, c) for c, key in told),
+        closes=_sets_that_close(search, nominal),
         not_tried=tuple(search.left_out),
-        silent=tuple(name for name in fitted if is_silent(search, accepted, name)),
+        silent=tuple(name for name in interesting if is_silent(search, repaired, name)),
         in_windows=search.windows is not None,
-        **_over_horizon(search, accepted, nominal),
+        **_over_horizon(search, repaired, nominal),
     )
 
 
 def closed_by(search: Search, explanation: Explanation, nominal: Explanation) -> float:
-    """Share of the energy of the held-out residuals beyond noise that a set closes."""
-    return min(1 - float(np.sum(_blocks(search, explanation)) / np.sum(_blocks(search, nominal))), 1.0)
+    """Share of the energy of the validation error beyond noise that a set closes: 1 or less, negative where
+    it leaves more than the nominal."""
+    left = float(np.sum(_blocks(search, explanation)))
+    before = float(np.sum(_blocks(search, nominal)))
+    return min(1 - left / before, 1.0)
 
 
-def _over_horizon(search: Search, accepted: Explanation, nominal: Explanation) -> dict[str, Any]:
+def _carried_by_each(
+    search: Search,
+    names: Names,
+    repaired: Explanation,
+    nominal: Explanation,
+    rng: np.random.Generator,
+) -> dict[str, tuple[float, float, float]]:
+    """Effect -> share of the validation error, and ends of its 95 % interval, none above 1."""
+    parts = [part for count in range(len(names) + 1) for part in combinations(names, count)]
+    fitted_keys = {repaired.key, *(explanation.key for explanation in search.found)}
+    all_fitted = all(tuple(sorted(part)) in fitted_keys for part in parts)
+    if search.out_of_time and not all_fitted:
+        return {}
+
+    # A part of the model that runs away alone, far beyond what the nominal leaves, carries nothing.
+    nominal_blocks = _blocks(search, nominal)
+    blocks = {}
+    for part in parts:
+        part_blocks = _blocks(search, search.by_these(part, repaired))
+        blocks[part] = min(part_blocks, nominal_blocks, key=np.sum)
+
+    count = blocks[()].size
+    drawn = rng.integers(0, count, (DRAWS, count))
+    totals = {part: energy.sum(keepdims=True) for part, energy in blocks.items()}
+    drawn_totals = {part: energy[drawn].sum(axis=1) for part, energy in blocks.items()}
+    carried = {}
+    for name in names:
+        share = float(_shapley(name, names, totals)[0])
+        low, high = np.quantile(_shapley(name, names, drawn_totals), _INTERVAL)
+        carried[name] = (share, min(float(low), 1.0), min(float(high), 1.0))
+    return carried
+
+
+def _sets_that_close(search: Search, nominal: Explanation) -> tuple[tuple[Names, float], ...]:
+    """The `SEVERAL` sets that close most of the validation error, each more than any part of it, with the
+    share that it closes."""
+    by_evidence = sorted(search.found, key=lambda explanation: explanation.evidence)
+    # The likeliest fit of a set comes last and stays.
+    closed = {e.key: closed_by(search, e, nominal) for e in by_evidence if e.names}
+    listed = []
+    for key, share in closed.items():
+        parts = combinations(key, len(key) - 1)
+        best_part = max([0.0, *(closed.get(part, 0.0) for part in parts)])
+        least_gain = _CLOSES if len(key) < 3 else 2 * _CLOSES
+        if share > best_part + least_gain:
+            listed.append((share, key))
+    listed.sort(reverse=True)
+    return tuple((key, share) for share, key in listed[:SEVERAL])
+
+
+def _over_horizon(search: Search, repaired: Explanation, nominal: Explanation) -> dict[str, Any]:
+    """Fields of `Shares` about windows of a machine that does not forget its inputs; empty for others."""
     if search.horizon is None:
         return {}
-    within = Records(search.case, search.case.held_out, search.horizon)
-    before, after = (tuple(map(float, within.shares(e.left_held_out))) for e in (nominal, accepted))
-    return {"horizon_samples": search.horizon.samples, "horizon_before": before, "horizon_after": after}
+    windows = Records(search.case, search.case.held_out, search.horizon)
+    return {
+        "horizon_samples": search.horizon.samples,
+        "horizon_before": tuple(map(float, windows.shares(nominal.left_held_out))),
+        "horizon_after": tuple(map(float, windows.shares(repaired.left_held_out))),
+    }
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:
-    """Energy over noise of blocks of the held-out residuals, less what noise and rounding have."""
-    noise, rounding = search.case.noise, rounding_effect(search.case)
-    white = 1.0 if rounding is None else 1.0 + rounding.variances / noise**2
-    whitened = [np.sum((part / noise) ** 2 - white, axis=1) for part in explanation.left_held_out]
-    return np.concatenate([np.add.reduceat(e, np.arange(0, e.size, BLOCK)) for e in whitened])
+    """(B,) energy of the validation error, in squares of the noise, of blocks of `BLOCK` samples of every
+    record, less what noise and rounding of the sensors have."""
+    noise = search.case.noise
+    rounding = rounding_effect(search.case)
+    expected = np.ones(noise.size)
+    if rounding is not None:
+        expected = expected + rounding.variances / noise**2
+    blocks = []
+    for residual in explanation.left_held_out:
+        beyond_noise = np.sum((residual / noise) ** 2 - expected, axis=1)
+        blocks.append(np.add.reduceat(beyond_noise, np.arange(0, beyond_noise.size, BLOCK)))
+    return np.concatenate(blocks)
 
 
-def _shapley(name: str, names: Sequence[str], energy: dict[tuple[str, ...], Real]) -> Real:
-    others, total = [n for n in names if n != name], np.zeros_like(energy[()])
+def _shapley(name: str, names: Names, energy: Mapping[Names, Real]) -> Real:
+    """(D,) share of the energy left by no effect that an effect closes, averaged over the orders of adding.
+
+    Parameters
+    ----------
+    name : str
+        The effect.
+    names : tuple of str
+        All effects.
+    energy : mapping
+        Every subset of the names, in their order -> (D,) energy that it leaves, of D draws.
+    """
+    others = [other for other in names if other != name]
+    gain = np.zeros_like(energy[()])
     for count in range(len(names)):
+        # Share of the orders in which exactly these others come first.
         weight = factorial(count) * factorial(len(names) - count - 1) / factorial(len(names))
         for before in combinations(others, count):
-            after = tuple(n for n in names if n in (*before, name))
-            total = total + weight * (energy[tuple(n for n in names if n in before)] - energy[after])
-    return np.asarray(total / energy[()])
+            after = tuple(n for n in names if n == name or n in before)
+            gain = gain + weight * (energy[before] - energy[after])
+    return np.asarray(gain / energy[()])

@@ -36,10 +36,28 @@ from diagnosis.search.loop import SearchLoop
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What a judge says. answer: the most probable cause; accepted: effects accepted with it, rounding too
-    where it interests, which is read off the values and in none of the sets; alike: others that fit as well.
-    untried: effect -> what it needs to be tried. acts_alike: effect -> what its presence is less by, as a
-    cause on no list may act like it."""
+    """What a judge says of a case.
+
+    Attributes
+    ----------
+    probabilities : Probabilities
+        Of causes, of sets of effects, and of every effect's presence.
+    answer : str
+        The most probable cause: an effect, "none" or "unknown".
+    accepted : tuple of str
+        Effects that are accepted with the answer. Rounding of a sensor may be among them: it is read off the
+        measured values and stands in no fitted set.
+    untried : mapping
+        Effect that was not tried -> what it needs to be tried.
+    rounding : Rounding or None
+        Rounding of a sensor that interests.
+    alike : tuple of str
+        Effects that fit as well as the accepted ones.
+    acts_alike : mapping
+        Effect -> by how much its presence is lower because a cause on no list may act like it.
+    converged : bool
+        False where the fit of the repaired model did not end.
+    """
 
     probabilities: Probabilities
     answer: str
@@ -52,43 +70,71 @@ class Judgement:
 
     @property
     def verdict(self) -> Verdict:
-        named: dict[str, Verdict] = {"none": "none", "unknown": "unknown"}
-        return named.get(self.answer, "effect")
+        """ "none", "unknown", or "effect" where the answer is one."""
+        if self.answer == "none":
+            return "none"
+        if self.answer == "unknown":
+            return "unknown"
+        return "effect"
 
     @property
     def shares(self) -> dict[str, float]:
         """Presence of every effect, probabilities of none and unknown."""
-        both = {name: self.probabilities.cause[name] for name in ("none", "unknown")}
-        return {**self.probabilities.presence, **both}
+        cause = self.probabilities.cause
+        return {**self.probabilities.presence, "none": cause["none"], "unknown": cause["unknown"]}
 
     @property
     def ambiguous_with(self) -> tuple[str, ...]:
-        """Other answers that keep more than a few per cent, most probable first, then effects that fit as
-        well: one that contains an accepted one (Stribeck friction) is improbable for its needless parameters,
-        yet the records do not rule it out."""
-        others = {n: p for n, p in self.shares.items() if n != self.answer and n not in self.accepted}
-        likely = [n for n, p in sorted(others.items(), key=lambda item: -item[1]) if p >= POSSIBLE]
-        return tuple(dict.fromkeys([*likely, *(n for n in self.alike if n not in self.accepted)]))
+        """Other answers that keep at least `POSSIBLE`, most probable first, then effects that fit as well.
+
+        An effect that contains an accepted one (Stribeck friction contains Coulomb friction) is improbable
+        for the parameters that it does not need, yet the records do not rule it out.
+        """
+        others = {}
+        for name, probability in self.shares.items():
+            if name != self.answer and name not in self.accepted and probability >= POSSIBLE:
+                others[name] = probability
+        likely = sorted(others, key=lambda name: -others[name])
+        fitting = [name for name in self.alike if name not in self.accepted]
+        # A dictionary keeps the first of each name, in order.
+        return tuple(dict.fromkeys([*likely, *fitting]))
 
     def detail(self, deviations: Real) -> DetailVerdict:
-        """deviations (P,): of the repaired model, in tolerances."""
+        """The verdict in more detail: whether the fit ended, values are far off, or rivals are possible.
+
+        Parameters
+        ----------
+        deviations : (P,) array
+            Of the repaired model's values from those stated, in tolerances.
+        """
         if not self.converged:
             return "not_converged"
         if self.verdict == "unknown":
             return "unknown"
         if self.verdict == "none":
             return "parametric" if np.max(np.abs(deviations), initial=0.0) > FAR_OFF else "none"
-        unsure = self.probabilities.cause[self.answer] < SURE
-        likely = any(self.shares[name] >= POSSIBLE for name in self.ambiguous_with)
-        return "ambiguous" if unsure or likely else "effect"
+        is_unsure = self.probabilities.cause[self.answer] < SURE
+        has_rival = any(self.shares[name] >= POSSIBLE for name in self.ambiguous_with)
+        return "ambiguous" if is_unsure or has_rival else "effect"
 
 
 class Judge(ABC, Generic[E]):
     """Weighs what a search has fitted, in `said`, and records it.
 
-    stated, refit, repaired : the models to compare: as stated, nominal values re-estimated, effects added.
-    repair : the repaired model with how well it predicts; trials : sets of effects that it was chosen from.
-    complete : probability that these effects are all.
+    Attributes
+    ----------
+    search : SearchLoop
+        After its run.
+    said : Judgement
+        The answer.
+    stated, refit, repaired : Explanation or Hypothesis
+        The models to compare: as stated, with nominal values re-estimated, with effects added.
+    repair : Trial
+        The repaired model with how well it predicts.
+    trials : sequence of Trial
+        Sets of effects that the repair was chosen from, the nominal first.
+    complete : float
+        Probability that the effects of the repaired model are all that is missing.
     """
 
     search: SearchLoop[E]
@@ -109,61 +155,78 @@ class Judge(ABC, Generic[E]):
         """Where an effect is fitted best; None where no size of it was worth a fit."""
 
     @abstractmethod
-    def covariance(self, found: E, k: int) -> tuple[Real, Real]:
-        """Of all its unknowns (M, M) as far as the records tell, and (A, A) of the k-th effect's coordinates
-        from all sources."""
+    def covariance(self, fit: E, k: int) -> tuple[Real, Real]:
+        """Covariances of a fit: (M, M) of all its unknowns as far as the records tell, and (A, A) of the
+        coordinates of its k-th effect from all sources."""
 
     @abstractmethod
-    def explains(self, found: E, name: str, gap_after: float) -> tuple[float, float, float]:
-        """See `NamedEffect.explains`; gap_after: that of `found`."""
+    def explains(self, fit: E, name: str, gap_after: float) -> tuple[float, float, float]:
+        """Share of the validation error that an effect explains, with the ends of a 95 % interval; NaN where
+        nothing is known (`NamedEffect.explains`). gap_after: RMS that the fit leaves, in noise deviations."""
 
-    def recorded(self, rng: np.random.Generator, **more: Any) -> Diagnosis:
-        """more: fields of `Diagnosis` that only one judge knows."""
-        case, said, search = self.search.case, self.said, self.search
-        keys, weighed = search.records.nominal.keys, said.probabilities
-        before, refit, after = (search.whitened(one) for one in (self.stated, self.refit, self.repaired))
-        simulations = search.simulations
-        of_sensor = rounding_effect(case)
-        floor = NOISE_FLOOR if of_sensor is None else of_sensor.floor
-        closed, interval = share_closed(case, refit, after, rng, floor)
-        named = {name: self._entry(name, keys, after, rng) for name in weighed.presence}
+    def recorded(self, rng: np.random.Generator, **fields: Any) -> Diagnosis:
+        """The record of this judgement.
+
+        Parameters
+        ----------
+        rng : numpy.random.Generator
+            Of the intervals.
+        **fields
+            Of `Diagnosis`, which only one kind of judge knows.
+        """
+        case = self.search.case
+        probabilities = self.said.probabilities
+        value_names = self.search.records.nominal.keys
+        residuals_before = self.search.whitened(self.stated)
+        residuals_refit = self.search.whitened(self.refit)
+        residuals_after = self.search.whitened(self.repaired)
+        # Simulations for the intervals below are not the search's.
+        simulations = self.search.simulations
+
+        rounding_of_sensor = rounding_effect(case)
+        noise_floor = NOISE_FLOOR if rounding_of_sensor is None else rounding_of_sensor.floor
+        closed, closed_interval = share_closed(case, residuals_refit, residuals_after, rng, noise_floor)
+
+        entries = [self._entry(name, residuals_after, rng) for name in probabilities.presence]
         # "Unknown" is about what the repair leaves.
-        unexplained = (1 - closed, 1 - interval[1], 1 - interval[0])
-        for name, explains in (("none", (float("nan"),) * 3), ("unknown", unexplained)):
-            probability = weighed.cause[name]
-            named[name] = NamedEffect(name, probability, probability, {}, {}, float("nan"), explains)
+        unexplained = (1 - closed, 1 - closed_interval[1], 1 - closed_interval[0])
+        not_a_number = float("nan")
+        for name, explains in (("none", (not_a_number,) * 3), ("unknown", unexplained)):
+            probability = probabilities.cause[name]
+            entries.append(NamedEffect(name, probability, probability, {}, {}, not_a_number, explains))
 
-        def off(found: E) -> dict[str, float]:
-            return dict(zip(keys, map(float, found.end.deviations), strict=True))
-
-        repair, rounding = self.repaired.end.effects, said.rounding
+        repair = self.repaired.end.effects
+        if self.said.rounding is not None:
+            repair = (*repair, self.said.rounding.effect)
+        is_effect = self.said.verdict == "effect"
+        deviations = self.repaired.end.deviations
         return Diagnosis(
             case=case,
-            verdict=said.verdict,
-            detail_verdict=said.detail(self.repaired.end.deviations),
-            probabilities=weighed.cause,
-            sets=weighed.sets,
-            effects=best_first([*named.values()], said.answer, said.accepted),
-            combination=said.accepted if said.verdict == "effect" else (),
-            ambiguous_with=said.ambiguous_with,
-            gap_before=held_out_gap(case, before),
-            gap_refit=held_out_gap(case, refit),
-            gap_after=held_out_gap(case, after),
-            noise_floor=floor,
+            verdict=self.said.verdict,
+            detail_verdict=self.said.detail(deviations),
+            probabilities=probabilities.cause,
+            sets=probabilities.sets,
+            effects=best_first(entries, self.said.answer, self.said.accepted),
+            combination=self.said.accepted if is_effect else (),
+            ambiguous_with=self.said.ambiguous_with,
+            gap_before=held_out_gap(case, residuals_before),
+            gap_refit=held_out_gap(case, residuals_refit),
+            gap_after=held_out_gap(case, residuals_after),
+            noise_floor=noise_floor,
             gap_closed=closed,
-            gap_closed_interval=interval,
-            deviations=off(self.repaired),
-            deviations_refit=off(self.refit),
-            rig=search.records.nominal.at(self.repaired.end.deviations).description,
-            repair=repair if rounding is None else (*repair, rounding.effect),
-            residuals_before=before,
-            residuals_refit=refit,
-            residuals_after=after,
+            gap_closed_interval=closed_interval,
+            deviations=dict(zip(value_names, map(float, deviations), strict=True)),
+            deviations_refit=dict(zip(value_names, map(float, self.refit.end.deviations), strict=True)),
+            rig=self.search.records.nominal.at(deviations).description,
+            repair=repair,
+            residuals_before=residuals_before,
+            residuals_refit=residuals_refit,
+            residuals_after=residuals_after,
             simulations=simulations,
-            completeness=completeness_of(case, self.complete, after),
-            partial_model=() if said.verdict == "effect" else tuple(sorted(self.repair.names)),
+            completeness=completeness_of(case, self.complete, residuals_after),
+            partial_model=() if is_effect else tuple(sorted(self.repair.names)),
             prediction=self._prediction(closed),
-            **more,
+            **fields,
         )
 
     def _prediction(self, closed: float) -> Prediction:
@@ -183,38 +246,49 @@ class Judge(ABC, Generic[E]):
             tried=tuple((trial.names, trial.error.rms) for trial in self.trials),
         )
 
-    def _entry(
-        self, name: str, keys: tuple[str, ...], after: dict[str, Real], rng: np.random.Generator
-    ) -> NamedEffect:
-        said, rounding, search = self.said, self.said.rounding, self.search
+    def _entry(self, name: str, residuals_after: Mapping[str, Real], rng: np.random.Generator) -> NamedEffect:
+        """What is known of one effect: its probabilities, and its sizes with intervals where it was fitted.
+
+        residuals_after : record -> (T, Y) residuals of the repaired model in noise deviations.
+        """
+        case = self.search.case
         entry = NamedEffect(
             name,
-            said.probabilities.cause[name],
-            said.probabilities.presence[name],
+            self.said.probabilities.cause[name],
+            self.said.probabilities.presence[name],
             {},
             {},
             float("nan"),
-            untried=said.untried.get(name, ""),
-            acts_alike=said.acts_alike.get(name, 0.0),
+            untried=self.said.untried.get(name, ""),
+            acts_alike=self.said.acts_alike.get(name, 0.0),
         )
-        best = self.holding(name)
-        if best is not None:
-            end, k = best.end, best.names.index(name)
-            candidate, at, rows = end.candidates[k], end.coordinates_of(k), end.rows_of(k)
-            told, whole = self.covariance(best, k)
-            intervals = parameter_intervals(candidate, at, whole, rng)
-            gap = held_out_gap(search.case, search.whitened(best, search.case.held_out))
-            widest = widened_by(told, end.deviations.size, rows.start, float(whole[0, 0]))
-            entry = replace(
+        rounding = self.said.rounding
+        fit = self.holding(name)
+        if fit is None:
+            if rounding is None or name != rounding.name:
+                return entry
+            return replace(
                 entry,
-                parameters=candidate.parameters(at),
-                intervals=intervals,
-                gap_after=gap,
-                explains=self.explains(best, name, gap),
-                remarks=remarks(candidate, at, intervals),
-                widened_by="" if widest is None else keys[widest],
+                parameters=rounding.effect.parameters(),
+                intervals=rounding.intervals,
+                gap_after=held_out_gap(case, residuals_after),
             )
-        elif rounding is not None and name == rounding.name:
-            gap, sizes = held_out_gap(search.case, after), rounding.effect.parameters()
-            entry = replace(entry, parameters=sizes, intervals=rounding.intervals, gap_after=gap)
-        return entry
+
+        place = fit.names.index(name)
+        candidate = fit.end.candidates[place]
+        coordinates = fit.end.coordinates_of(place)
+        by_records, covariance = self.covariance(fit, place)
+        intervals = parameter_intervals(candidate, coordinates, covariance, rng)
+        gap_after = held_out_gap(case, self.search.whitened(fit, case.held_out))
+        # The nominal value whose uncertainty widens the interval of the effect's size most.
+        first_row = fit.end.rows_of(place).start
+        value = widened_by(by_records, fit.end.deviations.size, first_row, float(covariance[0, 0]))
+        return replace(
+            entry,
+            parameters=candidate.parameters(coordinates),
+            intervals=intervals,
+            gap_after=gap_after,
+            explains=self.explains(fit, name, gap_after),
+            remarks=remarks(candidate, coordinates, intervals),
+            widened_by="" if value is None else self.search.records.nominal.keys[value],
+        )

@@ -28,52 +28,88 @@ from diagnosis.repair.stability import share_of_repairs
 from diagnosis.search.white import WhiteSearch
 from plant.effects import LOOK_ALIKES
 
+# Median of a half-normal variable, in scales: what solvers usually disagree about, of a prior of that shape.
+_HALF_NORMAL_MEDIAN = 0.674
+
 
 class KnownNoise(Judge[Hypothesis]):
-    """By the evidence of white noise. A time limit that is over lowers "unknown", and leaves validation
-    records aside."""
+    """Weighs hypotheses by their evidence under white noise of known size.
+
+    Attributes
+    ----------
+    found : sequence of Hypothesis
+        Everything that was fitted, with the weight of validation records where these decided.
+    held_out_decided : bool
+        Whether validation records moved the weights.
+    floor : float
+        RMS in noise deviations that a perfect model leaves.
+    gap_refit : float
+        RMS that the nominal with values re-estimated leaves of validation records, in noise deviations.
+    """
 
     search: WhiteSearch
 
     def __init__(self, search: WhiteSearch) -> None:
-        self.search, case, model = search, search.case, search.records
-        untried, base = search.untried, search.base
+        """Weigh what a search has fitted.
+
+        A time limit that is over leaves validation records aside; what was not tried for it counts as
+        unknown.
+        """
+        self.search = search
+        case = search.case
+        base = search.base
         self.found: Sequence[Hypothesis] = search.found
         weighed = probabilities(self.found)
-        accepted, unknown = _accepted(self.found, weighed.answer), weighed.answer == "unknown"
-        leading = max(self.found, key=lambda h: h.unknown_weight) if unknown else accepted
-        late = search.late("confrontation with validation records")
-        seen = None if late or (unknown and leading.is_answer) else confronted(model, self.found, leading)
-        self.held_out_decided = seen is not None
-        if seen is not None:
-            self.found = seen
+        accepted = _accepted(self.found, weighed.answer)
+
+        # Validation records decide where they contradict what estimation records say.
+        is_unknown = weighed.answer == "unknown"
+        leading = max(self.found, key=lambda h: h.unknown_weight) if is_unknown else accepted
+        confronted_hypotheses = None
+        is_late = search.late("confrontation with validation records")
+        if not is_late and not (is_unknown and leading.is_answer):
+            confronted_hypotheses = confronted(search.records, self.found, leading)
+        self.held_out_decided = confronted_hypotheses is not None
+        if confronted_hypotheses is not None:
+            self.found = confronted_hypotheses
             weighed = probabilities(self.found)
             accepted = _accepted(self.found, weighed.answer)
-        nothing = np.zeros(model.nominal.count)
-        self.stated = replace(base, end=replace(base.end, deviations=nothing))
+
+        # The models to compare: as stated, with values re-estimated, with effects added.
+        as_stated = replace(base.end, deviations=np.zeros(search.records.nominal.count))
+        self.stated = replace(base, end=as_stated)
         self.refit = base
         repairs = Repairs(search, base)
         self.repair = repairs.best(accepted.names)
         self.trials = repairs.trials
         self.repaired = self.repair.explanation
-        converged = self.repaired.end.converged
-        rounding, together = rounding_effect(case), accepted.names
-        self.floor = NOISE_FLOOR if rounding is None else rounding.floor
+
+        # Rounding of a sensor is read off the measured values and stands in no hypothesis.
+        rounding = rounding_effect(case)
+        accepted_names = accepted.names
+        self.floor = NOISE_FLOOR
         if rounding is not None:
-            before, after = (search.whitened(one) for one in (base, self.repaired))
-            leads = leads_over(case, rounding, before, after)
+            self.floor = rounding.floor
+            leads = leads_over(case, rounding, search.whitened(base), search.whitened(self.repaired))
             weighed = weighed.beside(rounding.name, leads=leads)
-            together = (rounding.name, *together) if leads or not together else (*together, rounding.name)
+            if leads or not accepted_names:
+                accepted_names = (rounding.name, *accepted_names)
+            else:
+                accepted_names = (*accepted_names, rounding.name)
+
+        untried = search.untried
         if search.left_out:
             weighed = weighed.with_untried(untried, larger=True)
         # What was not tried counts as unknown.
         answer = weighed.counting_as_unknown(untried).answer
-        # Of sets of the same number that fit as well as the accepted one.
-        sets = [h for h in self.found if h.is_answer and 0 < len(accepted.names) == len(h.names)]
-        near = [h for h in sets if h.end.loss <= accepted.end.loss + SUBSTANTIAL and answer != "unknown"]
-        alike = tuple(name for h in sorted(near, key=lambda h: h.end.loss) for name in h.names)
         self.said = Judgement(
-            weighed, answer, together, untried, rounding, alike, converged=converged or late
+            weighed,
+            answer,
+            accepted_names,
+            untried,
+            rounding,
+            () if answer == "unknown" else self._fitting_as_well(accepted),
+            converged=self.repaired.end.converged or is_late,
         )
         self.complete = 1 - sum(weighed.cause[name] for name in ("unknown", *untried))
         self.gap_refit = held_out_gap(case, search.whitened(base, case.held_out))
@@ -81,17 +117,30 @@ class KnownNoise(Judge[Hypothesis]):
             presence = {**weighed.presence, **self._presence_by_prediction()}
             self.said = replace(self.said, probabilities=replace(weighed, presence=presence))
 
+    def _fitting_as_well(self, accepted: Hypothesis) -> tuple[str, ...]:
+        """Effects of sets of the same number that fit the estimation records as well as the accepted one,
+        those that fit best first; none where no effect is accepted."""
+        if not accepted.names:
+            return ()
+        fitting = []
+        for hypothesis in self.found:
+            is_same_size = hypothesis.is_answer and len(hypothesis.names) == len(accepted.names)
+            if is_same_size and hypothesis.end.loss <= accepted.end.loss + SUBSTANTIAL:
+                fitting.append(hypothesis)
+        fitting.sort(key=lambda hypothesis: hypothesis.end.loss)
+        return tuple(name for hypothesis in fitting for name in hypothesis.names)
+
     def _presence_by_prediction(self) -> dict[str, float]:
         """Effect of the repair -> probability that it is there, where prediction has more than evidence.
 
         The main cause stays unknown: where simulation and sensors are exact, an effect that leaves anything
         is not the whole cause.
         """
-        gap_after = self._gap(self.repaired)
+        gap_after = self._validation_gap(self.repaired)
         beyond_noise = self.gap_refit**2 - self.floor**2
         if not beyond_noise > 0:
             return {}
-        left = max(gap_after**2 - self.floor**2, 0.0) / beyond_noise
+        share_left = max(gap_after**2 - self.floor**2, 0.0) / beyond_noise
         in_repairs = share_of_repairs(self.trials)
         presence = {}
         for name in self.repaired.names:
@@ -99,72 +148,91 @@ class KnownNoise(Judge[Hypothesis]):
                 continue
             share, _, _ = self.explains(self.repaired, name, gap_after)
             if np.isfinite(share):
-                there = presence_by_prediction(in_repairs.get(name, 0.0), genuine_beside(share, left), LISTED)
-                presence[name] = max(there, self.said.probabilities.presence[name])
+                by_prediction = presence_by_prediction(
+                    in_repairs.get(name, 0.0), genuine_beside(share, share_left), LISTED
+                )
+                presence[name] = max(by_prediction, self.said.probabilities.presence[name])
         return presence
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
-        likeliest = max(self.found, key=lambda h: h.unknown_weight)
+        """The record of the judgement; what a time limit left out is a doubt."""
+        likeliest = max(self.found, key=lambda hypothesis: hypothesis.unknown_weight)
         left_out = [what for what in self.search.left_out if what not in self.said.untried]
+        doubts = (f"the time limit left out {', '.join(left_out)}",) if left_out else ()
+        looks_like = self.said.verdict == "unknown" and not likeliest.is_answer
         return self.recorded(
             rng,
             held_out_decided=self.held_out_decided,
-            doubts=(f"the time limit left out {', '.join(left_out)}",) if left_out else (),
-            unlisted=likeliest.end.effects
-            if self.said.verdict == "unknown" and not likeliest.is_answer
-            else (),
+            doubts=doubts,
+            unlisted=likeliest.end.effects if looks_like else (),
             competing=self._competing(),
         )
 
     def holding(self, name: str) -> Hypothesis | None:
+        """See `Judge.holding`: the repaired model, or the likeliest hypothesis that holds the effect."""
         if name in self.repaired.names:
             return self.repaired
         holding = [h for h in self.found if h.is_answer and name in h.names]
-        return max(holding, key=lambda h: h.log_weight) if holding else None
+        return max(holding, key=lambda h: h.log_weight, default=None)
 
-    def covariance(self, found: Hypothesis, k: int) -> tuple[Real, Real]:
-        """What is left beyond the noise widens intervals in proportion, as does what solvers disagree about:
-        where contacts switch, that is correlated over a record."""
-        end, samples = found.end, np.mean([len(record.output) for record in self.search.case.estimation])
-        # .674: median of a half-normal prior.
-        usual = 0.674 * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
-        wider = max(1.0, end.rms**2) * (1 + usual**2 * float(samples))
-        told = wider * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
-        return told, told[end.rows_of(k), end.rows_of(k)]
+    def covariance(self, fit: Hypothesis, k: int) -> tuple[Real, Real]:
+        """See `Judge.covariance`.
 
-    def explains(self, found: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
-        """Of the energy of the validation error beyond noise, without an interval."""
-        rest = {n for n in found.names if n != name}
-        without = [self._gap(h) for h in self.found if h.is_answer and rest == {*h.names}]
-        before = min(without, default=np.nan) if rest else self.gap_refit
-        energy = self.gap_refit**2 - self.floor**2
-        explained = (before**2 - gap_after**2) / energy if energy > 0 else float("nan")
+        Notes
+        -----
+        What is left beyond the noise widens intervals in proportion. So does what solvers disagree about
+        where contacts switch: that is correlated over a record, so that its whole length counts as one value.
+        """
+        end = fit.end
+        mean_samples = float(np.mean([len(record.output) for record in self.search.case.estimation]))
+        disagreement = _HALF_NORMAL_MEDIAN * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
+        widening = max(1.0, end.rms**2) * (1 + disagreement**2 * mean_samples)
+        covariance = widening * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
+        return covariance, covariance[end.rows_of(k), end.rows_of(k)]
+
+    def explains(self, fit: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
+        """See `Judge.explains`: without an interval, and NaN where the set without the effect was not
+        fitted."""
+        others = {other for other in fit.names if other != name}
+        gap_without = self.gap_refit
+        if others:
+            fitted = [h for h in self.found if h.is_answer and set(h.names) == others]
+            gap_without = min((self._validation_gap(h) for h in fitted), default=float("nan"))
+        beyond_noise = self.gap_refit**2 - self.floor**2
+        explained = (gap_without**2 - gap_after**2) / beyond_noise if beyond_noise > 0 else float("nan")
         return float(np.clip(explained, 0.0, 1.0)), float("nan"), float("nan")
 
-    def _gap(self, found: Hypothesis) -> float:
+    def _validation_gap(self, hypothesis: Hypothesis) -> float:
+        """RMS that a hypothesis leaves of validation records, in noise deviations."""
         case = self.search.case
-        return held_out_gap(case, self.search.whitened(found, case.held_out))
+        return held_out_gap(case, self.search.whitened(hypothesis, case.held_out))
 
     def _competing(self) -> tuple[CompetingHypothesis, ...]:
-        """What the next experiment is to separate; what is unknown is one where it has a name (a
-        look-alike)."""
-        case, weighed = self.search.case, self.said.probabilities
+        """What the next experiment is to separate, most probable first.
+
+        What is unknown is one of them where it has a name (a look-alike) and it, and every effect that it
+        looks like, are possible. Empty for machines that are no rigs.
+        """
+        case = self.search.case
         if not isinstance(case, Case):
             return ()
-        answers, alike = ([h for h in self.found if h.is_answer == listed] for listed in (True, False))
+        weighed = self.said.probabilities
+        answers = [h for h in self.found if h.is_answer]
+        look_alikes = [h for h in self.found if not h.is_answer]
         competing = competing_hypotheses(case, answers, weighed.sets)
-        if not alike:
+        if not look_alikes:
             return competing
-        likeliest = max(alike, key=lambda h: h.unknown_weight)
-        acted = [LOOK_ALIKES[n].look_alike_of for n in likeliest.names if n in LOOK_ALIKES]
-        if min([weighed.cause["unknown"], *(weighed.presence[str(name)] for name in acted)]) < POSSIBLE:
+        likeliest = max(look_alikes, key=lambda h: h.unknown_weight)
+        looked_like = [str(LOOK_ALIKES[n].look_alike_of) for n in likeliest.names if n in LOOK_ALIKES]
+        if min([weighed.cause["unknown"], *(weighed.presence[name] for name in looked_like)]) < POSSIBLE:
             return competing
-        double = competing_hypothesis(case, likeliest.end, weighed.cause["unknown"])
-        ranked = sorted((*competing, double), key=lambda hypothesis: -hypothesis.probability)
+        look_alike = competing_hypothesis(case, likeliest.end, weighed.cause["unknown"])
+        ranked = sorted((*competing, look_alike), key=lambda hypothesis: -hypothesis.probability)
         return tuple(ranked[:MOST_COMPETING])
 
 
 def _accepted(hypotheses: Sequence[Hypothesis], answer: str) -> Hypothesis:
-    """The best hypothesis of the answer: nothing added for none and unknown, else the set it leads."""
-    names = () if answer in ("none", "unknown") else (answer,)
-    return max((h for h in hypotheses if h.names[:1] == names), key=lambda h: h.log_weight)
+    """The best hypothesis of the answer: without effects for none and unknown, else of the sets that it
+    leads."""
+    leading_names = () if answer in ("none", "unknown") else (answer,)
+    return max((h for h in hypotheses if h.names[:1] == leading_names), key=lambda h: h.log_weight)

@@ -143,23 +143,26 @@ class BesideModelError(Judge[Explanation]):
         judged = [one.explanation for one in self.said.judged]
         return next((e for e in (self.repaired, *judged, *self.sets.values()) if name in e.names), None)
 
-    def covariance(self, found: Explanation, k: int) -> tuple[Real, Real]:
-        """Imperfections of the model that may act as the effect does widen it."""
-        end = found.end
-        likely = np.linalg.pinv(end.normal(self.search.records).hessian, hermitian=True)
-        told = judging.TEMPER * np.asarray(likely, dtype=np.float64)
-        rest = judging.best_without(self.sets, found, found.names[k])
-        alike = judging.LITTLE * self.search.case.machine.weighing.model_error
-        share = max(judging.share_beside(rest, found), alike)
+    def covariance(self, fit: Explanation, k: int) -> tuple[Real, Real]:
+        """See `Judge.covariance`: imperfections of the model that may act as the effect does widen it."""
+        end = fit.end
+        inverse = np.linalg.pinv(end.normal(self.search.records).hessian, hermitian=True)
+        by_records = judging.TEMPER * np.asarray(inverse, dtype=np.float64)
+        without = judging.best_without(self.sets, fit, fit.names[k])
+        imperfections = judging.LITTLE * self.search.case.machine.weighing.model_error
+        share = max(judging.share_beside(without, fit), imperfections)
         changes = [_size(end.candidates[k], i, x) for i, x in enumerate(end.coordinates_of(k))]
-        sizes = alike / share * np.array(changes)
-        return told, told[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
+        sizes = imperfections / share * np.array(changes)
+        return by_records, by_records[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
 
-    def explains(self, found: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
-        rest = judging.best_without(self.sets, found, name)
-        closes = [closed_by(self.search, e, self.refit) for e in (found, rest)]
-        alone = (float(np.clip(closes[0] - closes[1], 0.0, 1.0)), float("nan"), float("nan"))
-        return self.shares.carried.get(name) or alone
+    def explains(self, fit: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
+        """See `Judge.explains`: as the repaired model shares it out, or by this fit alone."""
+        carried = self.shares.carried.get(name)
+        if carried is not None:
+            return carried
+        without = judging.best_without(self.sets, fit, name)
+        closed = closed_by(self.search, fit, self.refit) - closed_by(self.search, without, self.refit)
+        return float(np.clip(closed, 0.0, 1.0)), float("nan"), float("nan")
 
 
 def by_repair(
