@@ -1,4 +1,4 @@
-"""Do the held-out records confirm the answer that the estimation records gave?
+"""Whether validation records confirm the answer that the estimation records gave.
 
 They decide only where they leave more over than noise, solver disagreement and uncertain values explain, or
 where a competing hypothesis predicts them far better.
@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from diagnosis.evidence.hypotheses import Hypothesis, disagreement_gain
 from diagnosis.fit.coordinates import box, effects_at, quotients
@@ -20,60 +21,99 @@ from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import solver_spread, without_drift
 from diagnosis.machine.machine_protocol import Real
 
+# Smallest diagonal of a Hessian, in squares per square of a coordinate, for its scaling: nothing that a
+# record tells is as weak, and a zero would divide.
+_LEAST_CURVATURE = 1e-12
+# Share of its own diagonal that is added to a Hessian before it is solved with: half the digits of a double,
+# so that a coordinate on which nothing depends stays where it is and no other one moves by what is seen.
+_DAMPING = 1e-8
+
 
 def confronted(
     model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis
 ) -> list[Hypothesis] | None:
-    """The hypotheses with the log density of the held-out records added to their weights, and to an unknown
-    rest what that gains; None if the records confirm the leading one and it is an answer, no look-alike."""
+    """The hypotheses weighed by validation records too; None where these confirm the leading one.
+
+    Parameters
+    ----------
+    model : ResidualModel
+        Of the case.
+    hypotheses : sequence of Hypothesis
+        Weighed by the estimation records.
+    leading : Hypothesis
+        The likeliest of them. A look-alike is never confirmed: it is no answer.
+
+    Returns
+    -------
+    list of Hypothesis or None
+        In the same order. To every weight the log density of the validation records is added, and to that of
+        an unknown cause what such a cause gains from them. None, too, where there are no validation records.
+    """
     if not model.case.held_out:
         return None
-    first = _prediction(model, leading.end)
-    confirmed = leading.is_answer and first.unknown_gain < SUBSTANTIAL
-    if confirmed and not _contradicted(model, hypotheses, leading, first):
+    leading_prediction = _prediction(model, leading.end)
+    leaves_nothing = leading.is_answer and leading_prediction.unknown_gain < SUBSTANTIAL
+    if leaves_nothing and not _contradicted(model, hypotheses, leading, leading_prediction):
         return None
-    best = max(h.evidence for h in hypotheses)
-    seen = {
-        k: first if h is leading else _prediction(model, h.end)
-        for k, h in enumerate(hypotheses)
-        if h.evidence > best - DECISIVE
-    }
-    # All others stay behind the best prediction by what they were behind before.
-    least = _Prediction(max(p.gain for p in seen.values()), 0.0, 0.0)
-    return [_with(h, seen.get(k, least)) for k, h in enumerate(hypotheses)]
+
+    best_evidence = max(hypothesis.evidence for hypothesis in hypotheses)
+    predictions = {}
+    for k, hypothesis in enumerate(hypotheses):
+        if hypothesis is leading:
+            predictions[k] = leading_prediction
+        elif hypothesis.evidence > best_evidence - DECISIVE:
+            predictions[k] = _prediction(model, hypothesis.end)
+    # Others are not worth a simulation: with the best prediction they stay behind by what they were behind.
+    best_gain = max(prediction.gain for prediction in predictions.values())
+    not_predicted = _Prediction(best_gain, 0.0, 0.0)
+    return [_with(h, predictions.get(k, not_predicted)) for k, h in enumerate(hypotheses)]
 
 
 def _contradicted(
-    model: ResidualModel, hypotheses: Sequence[Hypothesis], leading: Hypothesis, first: _Prediction
+    model: ResidualModel,
+    hypotheses: Sequence[Hypothesis],
+    leading: Hypothesis,
+    leading_prediction: _Prediction,
 ) -> bool:
-    """Whether another one with no more effects is well ahead of the leading one once both have predicted."""
-    ahead = leading.log_weight + first.gain + SUBSTANTIAL
-    close: dict[tuple[frozenset[str], bool], Hypothesis] = {}
-    for h in sorted(hypotheses, key=lambda h: -h.weight):
-        if len(h.names) <= len(leading.names) or not leading.names:
-            close.setdefault((frozenset(h.names), h.is_answer), h)
-    return any(
-        h.weight + _prediction(model, h.end).gain > ahead
-        for h in close.values()
-        if h is not leading and h.weight > leading.log_weight - DECISIVE
-    )
+    """Whether a hypothesis with no more effects is well ahead of the leading one by both kinds of records.
+
+    Of each set of effects the best fit is asked; any number of effects where the leading one has none.
+    """
+    needed = leading.log_weight + leading_prediction.gain + SUBSTANTIAL
+    rivals: dict[tuple[frozenset[str], bool], Hypothesis] = {}
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.weight):
+        if len(hypothesis.names) <= len(leading.names) or not leading.names:
+            rivals.setdefault((frozenset(hypothesis.names), hypothesis.is_answer), hypothesis)
+    for rival in rivals.values():
+        if rival is leading or rival.weight <= leading.log_weight - DECISIVE:
+            continue
+        if rival.weight + _prediction(model, rival.end).gain > needed:
+            return True
+    return False
 
 
-def _with(hypothesis: Hypothesis, seen: _Prediction) -> Hypothesis:
-    known = hypothesis.log_weight + seen.gain
-    unknown = hypothesis.unknown_weight + seen.gain
+def _with(hypothesis: Hypothesis, prediction: _Prediction) -> Hypothesis:
+    """A hypothesis with what validation records add to its log weights."""
+    unknown_weight = hypothesis.unknown_weight + prediction.gain
     if hypothesis.is_answer:
-        unknown += seen.unknown_gain
-    return replace(hypothesis, log_weight=known, unknown_weight=unknown)
+        unknown_weight += prediction.unknown_gain
+    return replace(
+        hypothesis, log_weight=hypothesis.log_weight + prediction.gain, unknown_weight=unknown_weight
+    )
 
 
 @dataclass(frozen=True)
 class _Prediction:
-    """What held-out records say of a fit.
+    """What validation records say of a fit.
 
-    log_density : of the records given the fitted values and their uncertainty, up to a common constant.
-    allowed_gain : log evidence more if correct solvers may disagree.
-    unknown_gain : log odds that they add to an unknown rest, beyond that.
+    Attributes
+    ----------
+    log_density : float
+        Of the records given the fitted values and their uncertainty, up to a constant of the case.
+    allowed_gain : float
+        Log evidence that is gained if correct solvers may disagree.
+    unknown_gain : float
+        Log odds that the records add to an unknown cause, beyond that.
     """
 
     log_density: float
@@ -82,78 +122,97 @@ class _Prediction:
 
     @property
     def gain(self) -> float:
-        """What they add to the log weight of exactly these effects."""
+        """What the records add to the log weight of exactly these effects."""
         return self.log_density + self.allowed_gain
 
 
 def _prediction(model: ResidualModel, end: Descent) -> _Prediction:
+    """What validation records say of the end of a fit."""
     case = model.case
     outputs = case.noise.size
+    estimation_samples = [len(record.output) for record in case.estimation]
+    validation_samples = [len(record.output) for record in case.held_out]
     fitted, _ = without_drift(end.left, solver_spread(model, end))
-    e, log_density = _unpredicted(model, end)
-    segments = [len(record.output) for record in case.estimation]
-    both = [*segments, *(len(record.output) for record in case.held_out)]
-    before = discrepancy(fitted, segments, outputs)
-    after = discrepancy(np.concatenate([fitted, e]), both, outputs)
-    allowed = disagreement_gain(end, after) - disagreement_gain(end, before)
-    return _Prediction(log_density, allowed, _odds(end, after) - _odds(end, before))
+    unpredicted, log_density = _unpredicted(model, end)
+    before = discrepancy(fitted, estimation_samples, outputs)
+    after = discrepancy(
+        np.concatenate([fitted, unpredicted]), [*estimation_samples, *validation_samples], outputs
+    )
+    allowed_gain = disagreement_gain(end, after) - disagreement_gain(end, before)
+    return _Prediction(log_density, allowed_gain, _unknown_odds(end, after) - _unknown_odds(end, before))
 
 
-def _odds(end: Descent, left: Discrepancy) -> float:
+def _unknown_odds(end: Descent, left: Discrepancy) -> float:
+    """Log odds of an unknown cause for what is left, beyond the disagreement of correct solvers."""
     return left.log_gain_some - disagreement_gain(end, left)
 
 
 def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
-    """Held-out residuals (N,) without what the fitted values' uncertainty may do to them; log density.
+    """Validation residuals without what the fitted values' uncertainty may do to them, and their log density.
 
-    The most probable shift of the values given both kinds of records, linearised at the fit. Where contacts
-    switch the noise includes what correct solvers disagree about.
+    Returns
+    -------
+    residuals : (N,) array
+        In noise deviations, all records and outputs in a row.
+    log_density : float
+        Up to a constant of the case.
+
+    Notes
+    -----
+    With H the Hessian of the fit and J the Jacobian of the validation residuals e, the most probable shift of
+    the values given both kinds of records is -(H + J'J)^-1 J'e, linearised at the fit; the density is that of
+    a Gaussian with the covariance I + J H^-1 J'. Where contacts switch, the noise includes what correct
+    solvers disagree about.
     """
-    case = model.case
-    e = model.of(end.deviations, end.effects, case.held_out)
+    held_out = model.case.held_out
+    residuals = model.of(end.deviations, end.effects, held_out)
     if not end.jacobian.shape[1]:
-        return e, -0.5 * float(e @ e)
-    at, held, by = end.coordinates, case.held_out, steps_of(end.candidates)
-    J = np.hstack(
-        [
-            quotients(
-                lambda d: model.of(d, end.effects, held),
-                end.deviations,
-                e,
-                np.full(end.deviations.size, by[0]),
-            ),
-            quotients(
-                lambda x: model.of(end.deviations, effects_at(end.candidates, x), held),
-                at,
-                e,
-                by[1],
-                box(end.candidates)[1],
-            ),
-        ]
+        return residuals, -0.5 * float(residuals @ residuals)
+    step_sizes = steps_of(end.candidates)
+    by_deviations = quotients(
+        lambda deviations: model.of(deviations, end.effects, held_out),
+        end.deviations,
+        residuals,
+        np.full(end.deviations.size, step_sizes[0]),
     )
-    spread = solver_spread(model, end, case.held_out)
-    narrow, drift = without_drift(e, spread)
-    density = drift.log_gain + 0.5 * float(narrow @ narrow - e @ e)
+    by_coordinates = quotients(
+        lambda coordinates: model.of(end.deviations, effects_at(end.candidates, coordinates), held_out),
+        end.coordinates,
+        residuals,
+        step_sizes[1],
+        box(end.candidates)[1],
+    )
+    J = np.hstack([by_deviations, by_coordinates])
+
+    spread = solver_spread(model, end, held_out)
+    narrowed, drift = without_drift(residuals, spread)
+    log_density = drift.log_gain + 0.5 * float(narrowed @ narrowed - residuals @ residuals)
     if drift.size > 0:
-        e, J = narrow, J / np.sqrt(1.0 + spread)[:, None]
+        residuals = narrowed
+        J = J / np.sqrt(1.0 + spread)[:, None]
+
     H = end.hessian
-    scale = np.sqrt(np.maximum(np.diag(H), 1e-12))
-    H = H + 1e-8 * np.diag(scale**2)
-    A, gradient = H + J.T @ J, J.T @ e
-    step = np.asarray(-np.linalg.solve(A, gradient))
+    scale = np.sqrt(np.maximum(np.diag(H), _LEAST_CURVATURE))
+    H = H + _DAMPING * np.diag(scale**2)
+    both = H + J.T @ J
+    gradient = J.T @ residuals
+    step = np.asarray(-np.linalg.solve(both, gradient))
     # A value that would leave its range stays where it is.
-    free, step = np.flatnonzero(_inside(end, step)), np.zeros(step.size)
-    step[free] = -np.linalg.solve(A[np.ix_(free, free)], gradient[free])
-    cost = float(e @ e + gradient @ step)
-    determinants = (
-        np.linalg.slogdet(A / np.outer(scale, scale))[1] - (np.linalg.slogdet(H / np.outer(scale, scale))[1])
-    )
-    return np.asarray(e + J @ step), density - 0.5 * (cost + float(determinants))
+    free = np.flatnonzero(_inside(end, step))
+    step = np.zeros(step.size)
+    step[free] = -np.linalg.solve(both[np.ix_(free, free)], gradient[free])
+
+    quadratic = float(residuals @ residuals + gradient @ step)
+    # Scaled, so that values of different size lose no digits.
+    scales = np.outer(scale, scale)
+    log_determinant = float(np.linalg.slogdet(both / scales)[1] - np.linalg.slogdet(H / scales)[1])
+    return np.asarray(residuals + J @ step), log_density - 0.5 * (quadratic + log_determinant)
 
 
-def _inside(end: Descent, step: Real) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of (d, x) stay in their ranges after a step (P + A,)."""
+def _inside(end: Descent, step: Real) -> npt.NDArray[np.bool_]:
+    """(P + A,) which unknowns stay in their ranges after a step (P + A,): P deviations always do, of A
+    coordinates those within the bounds of their effects."""
     P = end.deviations.size
-    x = end.coordinates + step[P:]
+    coordinates = end.coordinates + step[P:]
     low, high = box(end.candidates)
-    return np.concatenate([np.ones(P, dtype=bool), (low <= x) & (x <= high)])
+    return np.concatenate([np.ones(P, dtype=bool), (low <= coordinates) & (coordinates <= high)])
