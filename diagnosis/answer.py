@@ -49,7 +49,6 @@ class NamedEffect:
         it explains in that set; of one that is not in the repaired model without an interval (nan).
     remarks : parameter -> what its interval does not say: at an end of its range, or as wide as that.
     untried : what it would need to be tried; "" where it was.
-    acts_alike : probability that a cause on no list acts like it, in which case it is not there.
     widened_by : key of the nominal value that the first interval is widest by, where tolerances make up most
         of it; else "". Were all of them exact, it would be half as wide or less.
     """
@@ -64,7 +63,6 @@ class NamedEffect:
     remarks: Mapping[str, str] = field(default_factory=dict)
     untried: str = ""
     widened_by: str = ""
-    acts_alike: float = 0.0
 
 
 @dataclass(frozen=True)

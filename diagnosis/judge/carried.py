@@ -13,7 +13,7 @@ from diagnosis.answer import BLOCK, Shares
 from diagnosis.evidence.explanation import Explanation
 from diagnosis.fit.coordinates import DRAWS
 from diagnosis.fit.records import Records
-from diagnosis.judge.verdict import is_silent
+from diagnosis.judge.set_features import is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.search.loop import SEVERAL

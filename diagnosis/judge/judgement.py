@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any, Generic
 
 import numpy as np
@@ -53,8 +53,6 @@ class Judgement:
         Rounding of a sensor that interests.
     alike : tuple of str
         Effects that fit as well as the accepted ones.
-    acts_alike : mapping
-        Effect -> by how much its presence is lower because a cause on no list may act like it.
     converged : bool
         False where the fit of the repaired model did not end.
     """
@@ -65,7 +63,6 @@ class Judgement:
     untried: Mapping[str, str]
     rounding: Rounding | None = None
     alike: tuple[str, ...] = ()
-    acts_alike: Mapping[str, float] = field(default_factory=dict)
     converged: bool = True
 
     @property
@@ -246,7 +243,7 @@ class Judge(ABC, Generic[E]):
             tried=tuple((trial.names, trial.error.rms) for trial in self.trials),
         )
 
-    def _entry(self, name: str, residuals_after: Mapping[str, Real], rng: np.random.Generator) -> NamedEffect:
+    def _entry(self, name: str, residuals_after: dict[str, Real], rng: np.random.Generator) -> NamedEffect:
         """What is known of one effect: its probabilities, and its sizes with intervals where it was fitted.
 
         residuals_after : record -> (T, Y) residuals of the repaired model in noise deviations.
@@ -260,7 +257,6 @@ class Judge(ABC, Generic[E]):
             {},
             float("nan"),
             untried=self.said.untried.get(name, ""),
-            acts_alike=self.said.acts_alike.get(name, 0.0),
         )
         rounding = self.said.rounding
         fit = self.holding(name)

@@ -13,7 +13,6 @@ from diagnosis.fit.likelihood import SUBSTANTIAL
 from diagnosis.judge.by_prediction import presence_by_prediction
 from diagnosis.judge.confirmation import confronted
 from diagnosis.judge.judgement import Judge, Judgement
-from diagnosis.judge.verdict import LISTED, genuine_beside
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import leads_over, rounding_effect
@@ -148,9 +147,7 @@ class KnownNoise(Judge[Hypothesis]):
                 continue
             share, _, _ = self.explains(self.repaired, name, gap_after)
             if np.isfinite(share):
-                by_prediction = presence_by_prediction(
-                    in_repairs.get(name, 0.0), genuine_beside(share, share_left), LISTED
-                )
+                by_prediction = presence_by_prediction(in_repairs.get(name, 0.0), share, share_left)
                 presence[name] = max(by_prediction, self.said.probabilities.presence[name])
         return presence
 

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import numpy as np
 
-from diagnosis.answer import Diagnosis, Shares
+from diagnosis.answer import Diagnosis
 from diagnosis.evidence.explanation import Explanation, best_of_sets
 from diagnosis.fit.descent import Descent
 from diagnosis.judge import verdict as judging
-from diagnosis.judge.by_prediction import presence_by_prediction, raised
 from diagnosis.judge.carried import closed_by, shares_of
 from diagnosis.judge.judgement import Judge
+from diagnosis.judge.set_features import LITTLE, best_without, is_silent, share_beside
 from diagnosis.judge.verdict import JudgedSets
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
-from diagnosis.repair.repair import Repairs, Trial
-from diagnosis.repair.stability import share_of_repairs
+from diagnosis.repair.repair import Repairs
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
 
+# Log likelihoods count this much less than independent coefficients would: what a model error leaves is
+# correlated. Calibrated on made cases (`flexlink blind --workshop`); it widens intervals of sizes.
+TEMPER = 4.0
 # RMS in noise deviations: what a simulation without error leaves, and a little that the search has not found.
 _NEAR_NOISE = 2.0
 
@@ -45,7 +44,7 @@ def looked_at_again(
     # rig stands.
     named = set(answer.combination)
     windows = None
-    if judge.evidence_names and isinstance(answer.case, PlantCase):
+    if judge.names_something and isinstance(answer.case, PlantCase):
         windows = first.horizon
     if windows is None:
         return answer
@@ -59,7 +58,7 @@ def looked_at_again(
             return answer
     in_windows = BesideModelError(search.run_in_time(), rng)
     again = in_windows.answer(rng)
-    if in_windows.evidence_names and again.combination and not named < set(again.combination):
+    if in_windows.names_something and again.combination and not named < set(again.combination):
         return again
     return answer
 
@@ -73,65 +72,77 @@ def reaches_noise(search: Search) -> bool:
 
 
 class BesideModelError(Judge[Explanation]):
-    """By likelihoods whose levels nobody knows: what a model error leaves is coloured, and no two records'
-    alike."""
+    """Weighs sets of effects beside a model error, whose levels nobody knows: what it leaves is coloured, and
+    in no two records alike.
+
+    Attributes
+    ----------
+    shares : Shares
+        Of the validation error, what each effect of the repaired model carries.
+    looks_like : bool
+        Whether the answer is unknown and the likeliest set holds a look-alike that is on no list.
+    names_something : bool
+        Whether an effect is more probable than none, or an unknown cause alone.
+    sets : dict
+        Sorted names -> the likeliest fit of these effects.
+    """
 
     search: Search
     said: JudgedSets
 
     def __init__(self, search: Search, rng: np.random.Generator) -> None:
-        """Prediction has a veto: a named effect with which logs are surely predicted worse is something else.
-        Without such an effect everything is judged anew."""
+        """Judge what a search has fitted.
+
+        Prediction has a veto: a named effect with which logs are surely predicted worse is something else.
+        Without such an effect everything is judged anew.
+        """
         self.search = search
-        listed = search.case.machine.weighing.listed
         repairs: Repairs[Explanation] | None = None
         while True:
-            judged = judging.judged(search)
+            self.said = judging.judged(search)
             search.progress(1.0, "done")
             if repairs is None:
-                repairs = Repairs(search, judged.nominal)
-            self.repair = repairs.best(judged.fitted(judged.accepted))
-            names = self.repair.names
-            matter = judged.accepted or names
-            repaired = self.repair.explanation
-            self.shares = shares_of(search, matter, repaired, judged.nominal, rng)
-            whole = self._named_set(judged)
-            surely_worse = {
-                name
-                for name in judged.fitted(judged.accepted)
-                if name not in names
-                and name not in search.refuted
-                and whole is not None
-                and not judging.is_silent(search, whole, name)
-                and repairs.refutes(name, whole.names)
-            }
+                repairs = Repairs(search, self.said.nominal)
+            named = self.said.fitted(self.said.accepted)
+            self.repair = repairs.best(named)
+            surely_worse = self._surely_worse(repairs, named)
             if not surely_worse:
                 break
             search.refuted |= surely_worse
-        likeliest = judged.judged[0]
-        self.looks_like = (
-            judged.answer == "unknown"
-            and likeliest.explains > 0.5
-            and not set(likeliest.explanation.names) <= set(listed)
-        )
         self.trials = repairs.trials
-        # Whether evidence alone names a cause, whatever prediction adds.
-        self.evidence_names = judged.answer not in ("none", "unknown")
-        self.said = by_repair(search, judged, self.trials, repaired, self.shares)
+        self.repaired = self.repair.explanation
+        self.shares = shares_of(
+            search, self.said.accepted or self.repair.names, self.repaired, self.said.nominal, rng
+        )
+        cause = self.said.probabilities.cause
+        self.names_something = cause["none"] + cause["unknown"] < 0.5
+        likeliest = self.said.judged[0].explanation
+        self.looks_like = self.said.answer == "unknown" and not set(likeliest.names) <= set(
+            search.case.machine.weighing.listed
+        )
         self.stated = search.stated()
-        self.refit = judged.nominal
-        self.repaired = repaired
-        self.complete = judging.below_threshold(search, repaired)
+        self.refit = self.said.nominal
+        self.complete = judging.below_threshold(search, self.repaired)
         self.sets = best_of_sets(search.found)
 
-    def _named_set(self, judged: JudgedSets) -> Explanation | None:
-        """The likeliest set that holds all that is named; None where nothing of the sets is."""
-        named = judged.fitted(judged.accepted)
-        holding = (one.explanation for one in judged.judged if named <= set(one.explanation.names))
-        return next(holding, None) if named else None
+    def _surely_worse(self, repairs: Repairs[Explanation], named: set[str]) -> set[str]:
+        """Named effects with which logs are surely predicted worse than without them.
+
+        Not asked are those of the repair, those that were refuted already, and those about which validation
+        records say nothing.
+        """
+        holding = [one.explanation for one in self.said.judged if named <= set(one.explanation.names)]
+        if not named or not holding:
+            return set()
+        likeliest = holding[0]
+        surely_worse = set()
+        for name in named - set(self.repair.names) - self.search.refuted:
+            if not is_silent(self.search, likeliest, name) and repairs.refutes(name, likeliest.names):
+                surely_worse.add(name)
+        return surely_worse
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
-        """What a time limit left out is said."""
+        """The record of the judgement, with shares and what the next experiment is to part."""
         return self.recorded(
             rng,
             unlisted=self.said.judged[0].explanation.end.effects if self.looks_like else (),
@@ -140,17 +151,21 @@ class BesideModelError(Judge[Explanation]):
         )
 
     def holding(self, name: str) -> Explanation | None:
+        """See `Judge.holding`: the repaired model, then the most probable set, then the likeliest one."""
         judged = [one.explanation for one in self.said.judged]
-        return next((e for e in (self.repaired, *judged, *self.sets.values()) if name in e.names), None)
+        for fit in (self.repaired, *judged, *self.sets.values()):
+            if name in fit.names:
+                return fit
+        return None
 
     def covariance(self, fit: Explanation, k: int) -> tuple[Real, Real]:
         """See `Judge.covariance`: imperfections of the model that may act as the effect does widen it."""
         end = fit.end
         inverse = np.linalg.pinv(end.normal(self.search.records).hessian, hermitian=True)
-        by_records = judging.TEMPER * np.asarray(inverse, dtype=np.float64)
-        without = judging.best_without(self.sets, fit, fit.names[k])
-        imperfections = judging.LITTLE * self.search.case.machine.weighing.model_error
-        share = max(judging.share_beside(without, fit), imperfections)
+        by_records = TEMPER * np.asarray(inverse, dtype=np.float64)
+        without = best_without(self.sets, fit, fit.names[k])
+        imperfections = LITTLE * self.search.case.machine.weighing.model_error
+        share = max(share_beside(without, fit), imperfections)
         changes = [_size(end.candidates[k], i, x) for i, x in enumerate(end.coordinates_of(k))]
         sizes = imperfections / share * np.array(changes)
         return by_records, by_records[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
@@ -160,84 +175,46 @@ class BesideModelError(Judge[Explanation]):
         carried = self.shares.carried.get(name)
         if carried is not None:
             return carried
-        without = judging.best_without(self.sets, fit, name)
+        without = best_without(self.sets, fit, name)
         closed = closed_by(self.search, fit, self.refit) - closed_by(self.search, without, self.refit)
         return float(np.clip(closed, 0.0, 1.0)), float("nan"), float("nan")
 
 
-def by_repair(
-    search: Search,
-    judged: JudgedSets,
-    trials: Sequence[Trial[Explanation]],
-    repaired: Explanation,
-    shares: Shares,
-) -> JudgedSets:
-    """What evidence says, with no effect of the repair less probable than prediction has it.
+def _competing(search: Search, said: JudgedSets) -> tuple[CompetingHypothesis, ...]:
+    """Sets whose effects contradict each other, for the experiment that parts them, most probable first.
 
-    Where evidence answers "unknown" and an effect becomes likelier than that, it is the answer. An answer
-    "none" stays: what is left does not interest, whatever explains it.
+    One standard deviation of an output is what the likelihood counts as one: the energies that do not
+    interest, over as many independent values as its bands have. Neglected: that they grow with the motion.
     """
-    weighing = search.case.machine.weighing
-    if judged.answer == "none" or not shares.carried:
-        return judged
-    carried = {name: share for name, (share, _, _) in shares.carried.items()}
-    closed = closed_by(search, repaired, judged.nominal)
-    in_repairs = share_of_repairs(trials)
-    presence = {}
-    for name, share in carried.items():
-        if name not in weighing.listed or name in search.refuted or share <= 0:
-            continue
-        there = presence_by_prediction(
-            in_repairs.get(name, 0.0), judging.genuine_beside(share, 1 - closed), judging.LISTED
-        )
-        if weighing.counted:
-            there *= 1 - judging.acts_like(name, weighing.listed, weighing.counted)
-        if name in repaired.names:
-            there *= 1 - judging.is_none_but_by_name(search, repaired, repaired.names.index(name))
-        presence[name] = there
-    probabilities = raised(judged.probabilities, presence, carried)
-    answer = judged.answer
-    accepted = judged.accepted
-    if answer == "unknown":
-        answer = probabilities.counting_as_unknown(judged.untried).answer
-    if answer != judged.answer:
-        sets_with_it = [names for names in probabilities.sets if answer in names]
-        likeliest = max(sets_with_it, key=lambda names: probabilities.sets[names])
-        accepted = tuple(sorted(likeliest, key=lambda name: -carried.get(name, 0.0)))
-    return replace(judged, probabilities=probabilities, answer=answer, accepted=accepted)
+    case = search.case
+    records = search.records
+    contradicting: dict[tuple[str, ...], Descent] = {}
+    for one in said.judged:
+        key = tuple(sorted(one.holding(0.5)))
+        related = [other for other in contradicting if set(key) <= set(other) or set(other) <= set(key)]
+        if key and not related:
+            contradicting[key] = one.explanation.end
 
-
-def _competing(search: Search, found: JudgedSets) -> tuple[CompetingHypothesis, ...]:
-    """Sets whose effects that matter contradict each other, for the experiment that parts them.
-
-    One standard deviation is what the likelihood counts as one: the energies that do not interest, over as
-    many independent values as its bands have. Neglected: that they grow with the motion.
-    """
-    case, records, kept = search.case, search.records, dict[tuple[str, ...], Descent]()
-    for one in found.judged:
-        key = tuple(sorted(part.name for part in one.parts if part.matters >= 0.5))
-        if key and not any(set(key) <= set(other) or set(other) <= set(key) for other in kept):
-            kept[key] = one.explanation.end
-    floor, counted = (
-        part.reshape(-1, case.noise.size).sum(axis=0)  # bands are ordered record, octave, output
-        for part in (records.levels.floor, records.levels.counted)
-    )
-    noise = np.sqrt(judging.TEMPER * floor / counted)
+    # Bands are ordered by record, octave and output.
+    outputs = case.noise.size
+    uninteresting = records.levels.floor.reshape(-1, outputs).sum(axis=0)
+    independent_values = records.levels.counted.reshape(-1, outputs).sum(axis=0)
+    noise = np.sqrt(TEMPER * uninteresting / independent_values)
     if isinstance(case, Case):
-        level = dict(zip(case.outputs, noise, strict=True))
-        noise = np.array([level.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
+        of_output = dict(zip(case.outputs, noise, strict=True))
+        noise = np.array([of_output.get(name, np.inf) for name in FlexibleArm(case.rig).output_names])
     return tuple(
         fitted_hypothesis(
             records.nominal,
             end.candidates,
             end.deviations,
             end.coordinates,
-            end.precision(records) / judging.TEMPER,
-            found.probability(key),
+            end.precision(records) / TEMPER,
+            said.probability(key),
             noise,
             key,
         )
-        for key, end in list(kept.items())[:MOST_COMPETING]
+        for key, end in list(contradicting.items())[:MOST_COMPETING]
     )
 
 

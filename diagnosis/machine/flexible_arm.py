@@ -67,7 +67,7 @@ class FlexibleArm:
 
     @property
     def weighing(self) -> Weighing:
-        return Weighing(model_error=self.model_error, counted="rigs")
+        return Weighing(model_error=self.model_error)
 
     @property
     def description(self) -> Rig:

@@ -37,14 +37,12 @@ class Weighing:
     most_effects : int. Beside a model error, effects that are looked for together.
     stated : bool. Somebody has said that the model error does not interest; else it is what is usual, and
         what no effect explains is an unknown cause however small.
-    counted : str. Table of `judge/look_alikes.toml` in which machines of this kind are counted; "": none is.
     """
 
     listed: tuple[str, ...] = field(default_factory=lambda: tuple(EFFECTS))
     model_error: float = 0.0
     most_effects: int = 3
     stated: bool = True
-    counted: str = ""
 
 
 @dataclass(frozen=True, eq=False)

@@ -243,5 +243,4 @@ class MujocoArm(MujocoModel):
             units=self.units,
             forced=ForcedSimulation(places, simulation.forced) if (places := self.force_places) else None,
             input_names=self.inputs,
-            counted="models",
         )

@@ -111,7 +111,6 @@ class Plant:
     untracked : the simulation without what holds it near a record, which is in these inputs; None: nothing
         does.
     units : output -> unit, of outputs whose names do not end with it.
-    counted : as in `Weighing`.
     forced : the simulation with forces at places of its own, for where the error lies; None: a force is what
         is added to an input.
     input_names : of the inputs, for pages; inputs behind these only hold a simulation near its record.
@@ -131,7 +130,6 @@ class Plant:
     untracked: Simulate | None = None
     units: Mapping[str, str] = field(default_factory=dict)
     input_names: tuple[str, ...] = ()
-    counted: str = ""
     forced: ForcedSimulation | None = None
 
     def __post_init__(self) -> None:
@@ -189,7 +187,7 @@ class Plant:
         stated = self.model_error is not None
         model_error = _USUAL_MODEL_ERROR if self.model_error is None else float(self.model_error)
         listed = tuple(kind.id for kind in self.missing)
-        return Weighing(listed, model_error, _MOST_EFFECTS, stated, self.counted)
+        return Weighing(listed, model_error, _MOST_EFFECTS, stated)
 
     @property
     def description(self) -> Plant:

@@ -337,7 +337,7 @@ def _rubbing(name, dry_N):
 def test_one_threshold_whatever_an_effect_is_called(dry_N, there, names):
     found = [diagnose(_rubbing(name, dry_N)) for name in names]
     presence = [one.presence(name) for one, name in zip(found, names, strict=True)]
-    assert (min(presence) > 0.9) == (max(presence) > 0.9) == there
+    assert (min(presence) > 0.8) == (max(presence) > 0.8) == there
     assert presence == pytest.approx([presence[0]] * len(names), abs=1e-6)
     for one in found:
         # Re-estimated only where validation records improve; what remains is told in both units.

@@ -134,7 +134,7 @@ def test_the_flexible_arm_answers_by_the_same_protocol():
         case.machine.simulator(())(case.experiments[0].input), simulate(case.rig, voltage, ()).output
     )
     assert case.machine.description is case.rig
-    assert case.machine.weighing == Weighing(counted="rigs")
+    assert case.machine.weighing == Weighing()
     assert case.machine.tolerances == RIG.tolerances
 
 

@@ -8,10 +8,9 @@ import pytest
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose
 from diagnosis.answer import completeness_of
-from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.fit.descent import descend
 from diagnosis.fit.residual import ResidualModel
-from diagnosis.judge.by_prediction import presence_by_prediction, raised
+from diagnosis.judge.by_prediction import presence_by_prediction
 from diagnosis.repair.left_out import fitted_without_each_log
 from diagnosis.repair.prediction_error import FEWEST_BLOCKS, PredictionError
 from diagnosis.repair.repair import Repairs, _order_of_return
@@ -284,34 +283,17 @@ def test_the_values_that_did_nothing_go_back_first():
 # Names
 
 
-def evidence_says(unknown, dry=0.05):
-    rest = 1 - unknown - dry
-    cause = {"none": rest, "dry": dry, "offset": 0.0, "unknown": unknown}
-    sets = {(): rest, ("dry",): dry, ("unknown",): unknown}
-    return Probabilities(cause, sets, {"dry": dry, "offset": 0.0})
-
-
-def test_what_prediction_says_of_an_effect_is_taken_from_unknown():
-    found = raised(evidence_says(0.9), {"dry": 0.6, "offset": 0.2}, {"dry": 0.4, "offset": 0.1})
-    assert found.presence["dry"] == pytest.approx(0.6)
-    assert found.presence["offset"] == pytest.approx(0.2)
-    assert found.cause["unknown"] == pytest.approx(0.9 - 0.55)
-    assert found.cause["dry"] == pytest.approx(0.6)
-    assert sum(found.cause.values()) == pytest.approx(1.0)
-    assert sum(found.sets.values()) == pytest.approx(1.0)
-    assert found.sets["dry", "offset"] == pytest.approx(0.2)
-
-
-def test_prediction_takes_from_unknown_no_more_than_that_has():
-    sure = evidence_says(0.0, dry=1.0)
-    assert raised(sure, {"offset": 0.7}, {"offset": 0.3}).presence == sure.presence
-    # And it denies nothing.
-    assert raised(sure, {"dry": 0.1}, {"dry": 0.1}).presence["dry"] == 1.0
-
-
 def test_prediction_alone_is_never_surer_than_that_a_cause_is_on_the_list():
-    assert presence_by_prediction(1.0, 0.99, 0.7) == 0.7
-    assert presence_by_prediction(0.5, 0.4, 0.7) == 0.2
+    all_of_it = presence_by_prediction(1.0, share=1.0, left=0.0)
+    assert 0.5 < all_of_it < 1.0
+    # In half of the repairs, half as sure.
+    assert presence_by_prediction(0.5, share=1.0, left=0.0) == pytest.approx(all_of_it / 2)
+
+
+def test_beside_much_that_is_left_prediction_says_little():
+    probabilities = [presence_by_prediction(1.0, share=1 - left, left=left) for left in (0.1, 0.5, 0.9, 0.99)]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert probabilities[-1] < 0.01
 
 
 def test_no_more_than_all_of_a_motion_remains():

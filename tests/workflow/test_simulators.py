@@ -14,7 +14,6 @@ import pytest
 from scipy.signal import lfilter
 
 from diagnosis import Change
-from diagnosis.judge.verdict import acts_like
 from diagnosis.machine.telling import Alike, Telling, telling
 from tests.workflow.command import ROOT
 from workflow.diagnose import check
@@ -693,16 +692,6 @@ def test_a_symbol_with_an_index_states_no_unit(tmp_path):
         summary = check.of_case(loaded, telling(loaded.case))
         (sizes,) = [section for section in summary.sections if section.title == "smallest size that shows"]
         assert {row.label: row.value for row in sizes.rows}[name].endswith(said)
-
-
-@pytest.mark.parametrize("name", ["spring", "gain", "mass"])
-def test_the_prior_of_a_value_does_not_depend_on_its_name(name):
-    listed = ("spring", "input_delay", "wrong_J")
-    as_named = acts_like(f"wrong_{name}", (*listed, f"wrong_{name}"), "models")
-    assert as_named == acts_like("wrong_k_s", (*listed, "wrong_k_s"), "models")
-    assert acts_like("spring", (*listed, f"wrong_{name}"), "rigs") == acts_like(
-        "spring", (*listed, "wrong_k_s"), "rigs"
-    )
 
 
 def test_advice_stays_a_sentence_and_names_are_those_of_the_model():

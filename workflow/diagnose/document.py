@@ -58,7 +58,6 @@ def document_of(
                 "intervals": effect.intervals,
                 "remarks": effect.remarks,
                 "explains": effect.explains,
-                "acts_alike": effect.acts_alike,
                 "needs": effect.untried,
             }
             for effect in found.effects
