@@ -121,7 +121,7 @@ def _answered(
     if isinstance(case, Case):
         case = case.at_fast_lengths()
     found = Search(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s).run_in_time()
-    if found.left_out:
+    if found.skipped_for_time:
         return BesideModelError(found, rng).answer(rng)
 
     def again(done: float, what: str) -> None:

@@ -9,32 +9,32 @@ from typing import TypeVar
 
 import numpy as np
 
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.descent import Fit
 from diagnosis.machine.machine_protocol import Real
 
 
 @dataclass(frozen=True, eq=False)
-class Weighed(ABC):
+class WeighedFit(ABC):
     """The end of a fit with its evidence."""
 
-    end: Descent
+    fit: Fit
 
     @property
     def names(self) -> tuple[str, ...]:
-        return self.end.names
+        return self.fit.names
 
     @property
-    def key(self) -> tuple[str, ...]:
+    def sorted_names(self) -> tuple[str, ...]:
         return tuple(sorted(self.names))
 
     @property
     @abstractmethod
-    def evidence(self) -> float:
+    def log_evidence(self) -> float:
         """Log of the probability of these effects, up to a constant of the case."""
 
 
 @dataclass(frozen=True, eq=False)
-class Explanation(Weighed):
+class Explanation(WeighedFit):
     """A fitted set of effects and what it leaves.
 
     log_likelihoods : (R,) of every record, estimation and held-out.
@@ -47,32 +47,32 @@ class Explanation(Weighed):
     log_likelihoods: Real
     log_prior: float
     log_volume: float
-    left: tuple[Real, ...]
-    left_held_out: tuple[Real, ...]
-    shares: Real
-    mean_squares: Real
+    residuals: tuple[Real, ...]
+    held_out_residuals: tuple[Real, ...]
+    residual_shares: Real
+    energy_ratios: Real
 
-    def pooled_held_out(self, noise: Real) -> float:
+    def held_out_energy(self, noise: Real) -> float:
         """Energy left of the held-out records, in noise deviations (Y,)."""
-        return float(sum(np.sum((part / noise) ** 2) for part in self.left_held_out))
+        return float(sum(np.sum((part / noise) ** 2) for part in self.held_out_residuals))
 
     @property
     def log_likelihood(self) -> float:
         return float(np.sum(self.log_likelihoods))
 
     @property
-    def evidence(self) -> float:
+    def log_evidence(self) -> float:
         return self.log_likelihood + self.log_prior + self.log_volume
 
 
-E = TypeVar("E", bound=Weighed)
+E = TypeVar("E", bound=WeighedFit)
 
 
 def best_of_sets(
-    found: Iterable[E], weight: Callable[[E], float] = lambda e: e.evidence
+    found: Iterable[E], weight: Callable[[E], float] = lambda e: e.log_evidence
 ) -> dict[tuple[str, ...], E]:
     """Sorted effect names -> the explanation by these of largest weight, the likeliest first."""
     best: dict[tuple[str, ...], E] = {}
     for explanation in sorted(found, key=lambda e: -weight(e)):
-        best.setdefault(explanation.key, explanation)
+        best.setdefault(explanation.sorted_names, explanation)
     return best

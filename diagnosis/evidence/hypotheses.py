@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import log_ndtr
 
-from diagnosis.evidence.explanation import Weighed, best_of_sets
-from diagnosis.fit.descent import Descent
+from diagnosis.evidence.explanation import WeighedFit, best_of_sets
+from diagnosis.fit.descent import Fit
 from diagnosis.fit.discrepancy import Discrepancy
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.solver_spread import NO_DRIFT, Drift
@@ -32,7 +32,7 @@ _UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_COUNT[0]))
 
 
 @dataclass(frozen=True, eq=False)
-class Hypothesis(Weighed):
+class Hypothesis(WeighedFit):
     """A fit, what it leaves over, and logs of (prior probability times evidence), comparable within a case.
 
     log_weight : exactly these effects, with the disagreement their solvers are allowed; -inf for a cause
@@ -42,7 +42,7 @@ class Hypothesis(Weighed):
     """
 
     log_weight: float
-    unknown_weight: float
+    log_weight_with_unknown: float
     listed: tuple[str, ...] = tuple(EFFECTS)
 
     @property
@@ -50,19 +50,19 @@ class Hypothesis(Weighed):
         return self.log_weight > -np.inf
 
     @property
-    def evidence(self) -> float:
+    def log_evidence(self) -> float:
         """Log weight of these effects, alone or with something unknown besides."""
-        return max(self.log_weight, self.unknown_weight)
+        return max(self.log_weight, self.log_weight_with_unknown)
 
     @property
-    def weight(self) -> float:
+    def log_cause_weight(self) -> float:
         """Log weight of these causes alone, which for one beyond the list counts as unknown."""
-        return self.log_weight if self.is_answer else self.unknown_weight
+        return self.log_weight if self.is_answer else self.log_weight_with_unknown
 
     @classmethod
     def of(
         cls,
-        fit: Descent,
+        fit: Fit,
         left: Discrepancy,
         drift: Drift = NO_DRIFT,
         listed: tuple[str, ...] = tuple(EFFECTS),
@@ -92,7 +92,7 @@ def log_prior(names: Sequence[str], n: int | None = None) -> float:
     return float(np.log(_PRIOR_COUNT.get(count, 1e-3)) - np.log(sets))
 
 
-def disagreement_gain(fit: Descent, left: Discrepancy) -> float:
+def disagreement_gain(fit: Fit, left: Discrepancy) -> float:
     """log evidence gained by the disagreement that two correct solvers of these effects may have.
 
     Its size has a half-normal prior, cut off beyond three deviations: more than that is no disagreement.
@@ -118,7 +118,7 @@ class Probabilities:
     sets: dict[tuple[str, ...], float]
     presence: dict[str, float]
 
-    def beside(self, name: str, *, leads: bool) -> Probabilities:
+    def with_certain_effect(self, name: str, *, leads: bool) -> Probabilities:
         """The same answers with one more effect that is certain, in every set but unknown.
 
         leads: it explains more than whatever else there is.
@@ -175,7 +175,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     if not hypotheses:
         raise ValueError("probabilities need at least one hypothesis")
     best = best_of_sets((h for h in hypotheses if h.is_answer), lambda h: h.log_weight)
-    unknown, keys = max(h.unknown_weight for h in hypotheses), [*best, _UNKNOWN]
+    unknown, keys = max(h.log_weight_with_unknown for h in hypotheses), [*best, _UNKNOWN]
     logs = np.array([*(h.log_weight for h in best.values()), unknown])
     weight = np.exp(logs - np.max(logs))
     weight /= weight.sum()
@@ -191,7 +191,7 @@ def probabilities(hypotheses: Sequence[Hypothesis]) -> Probabilities:
     return Probabilities(cause, sets, presence)
 
 
-def log_evidence(fit: Descent) -> float:
+def log_evidence(fit: Fit) -> float:
     """log of the integral of exp(-(|e|^2 + |d|^2)/2) over d (standard normal) and x (`Axis.log_density`).
 
     Laplace's approximation, cut off at the boxes: along every coordinate that ends at or near a bound, the
@@ -209,7 +209,7 @@ def log_evidence(fit: Descent) -> float:
         return float(value)
     # Of the same matrix as the determinant: a coordinate that nothing depends on integrates to its range.
     spread = (np.sqrt(np.diag(np.linalg.inv(scaled))) / scale)[P:]
-    gradient, at = (fit.jacobian.T @ fit.left)[P:], 0
+    gradient, at = (fit.jacobian.T @ fit.residual_coefficients)[P:], 0
     for k, candidate in enumerate(fit.candidates):
         x = fit.coordinates_of(k)
         value += candidate.log_density(x)

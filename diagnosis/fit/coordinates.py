@@ -11,14 +11,14 @@ from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
 # Of every Monte Carlo: quantiles of 2.5 % are then known to half a per cent.
-DRAWS = 1000
+MONTE_CARLO_DRAWS = 1000
 
 
-def box(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
+def bounds_of(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
     """Bounds (A,), (A,) of all coordinates in a row."""
     boxes = [candidate.box for candidate in candidates]
-    low = np.concatenate([np.zeros(0), *(box[0] for box in boxes)])
-    return low, np.concatenate([np.zeros(0), *(box[1] for box in boxes)])
+    low = np.concatenate([np.zeros(0), *(bounds[0] for bounds in boxes)])
+    return low, np.concatenate([np.zeros(0), *(bounds[1] for bounds in boxes)])
 
 
 def effects_at(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
@@ -32,7 +32,7 @@ def non_smooth(candidates: Sequence[Candidate]) -> bool:
     return any(c.dependence == "non-smooth" for c in candidates)
 
 
-def quotients(
+def difference_quotients(
     function: Callable[[Real], Real], at: Real, start: Real, steps: Real, high: Real | float = np.inf
 ) -> Real:
     """Derivatives (N, A) at a point (A,) of a function (A,) -> (N,) that is `start` there.
@@ -47,7 +47,7 @@ def quotients(
     return J
 
 
-def solved(matrix: Real, right: Real) -> Real:
+def solve_or_least_squares(matrix: Real, right: Real) -> Real:
     """x of matrix x = right, the smallest where trials that ran away leave the matrix singular."""
     try:
         return np.asarray(np.linalg.solve(matrix, right))
@@ -59,12 +59,12 @@ def solved(matrix: Real, right: Real) -> Real:
 _MOST = 0.75
 
 
-def widened_by(inverse: Real, nominal: int, size: int, variance: float) -> int | None:
+def widening_tolerance(inverse: Real, nominal: int, size: int, variance: float) -> int | None:
     """Where the tolerances of the first `nominal` unknowns make up most of the variance of unknown `size`:
     the one that makes up most of it; else None. inverse (M, M): covariance of the unknowns as far as the
     likelihood tells; variance: of that unknown, from all sources."""
     with_them = inverse[size, :nominal]
-    together = with_them @ solved(inverse[:nominal, :nominal], with_them)
+    together = with_them @ solve_or_least_squares(inverse[:nominal, :nominal], with_them)
     if not nominal or not together > _MOST * variance:
         return None
     return int(np.argmax(with_them**2 / np.diag(inverse)[:nominal]))
@@ -76,7 +76,7 @@ def parameter_intervals(
     """95 % intervals by Gaussian draws of the coordinates (A,), kept inside their box; covariance (A, A)."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    moved = coordinates + rng.standard_normal((DRAWS, coordinates.size)) @ root.T
+    moved = coordinates + rng.standard_normal((MONTE_CARLO_DRAWS, coordinates.size)) @ root.T
     sampled = [candidate.parameters(draw) for draw in np.clip(moved, *candidate.box)]
     found = {}
     for key, value in candidate.parameters(coordinates).items():

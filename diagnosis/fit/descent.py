@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from diagnosis.fit.coordinates import box, effects_at, non_smooth, quotients, solved
+from diagnosis.fit.coordinates import (
+    bounds_of,
+    difference_quotients,
+    effects_at,
+    non_smooth,
+    solve_or_least_squares,
+)
 from diagnosis.fit.likelihood import WORTH_IT
 from diagnosis.fit.nominal import prior_cost, prior_curvature, prior_slope
 from diagnosis.fit.records import FittedStart, RecordsToFit, StartColumns
@@ -41,7 +47,7 @@ _AGAIN, _AS_BEFORE = 3, 0.03
 
 
 @dataclass(frozen=True, eq=False)
-class Descent:
+class Fit:
     """End of a fit: deviations (P,), coordinates (A,) of the candidates, start, coefficients (N,) left.
 
     jacobian (N, P + A), weights (N,) of the coefficients. loss: -log posterior density; prior: the part of it
@@ -52,12 +58,12 @@ class Descent:
     deviations: Real
     coordinates: Real
     start: FittedStart
-    left: Real
+    residual_coefficients: Real
     weights: Real
     jacobian: Real
-    columns: StartColumns
+    start_columns: StartColumns
     loss: float
-    prior: float
+    prior_loss: float
     converged: bool
 
     @property
@@ -68,7 +74,7 @@ class Descent:
     def effects(self) -> tuple[Any, ...]:
         return effects_at(self.candidates, self.coordinates)
 
-    def rows_of(self, k: int) -> slice:
+    def unknowns_of(self, k: int) -> slice:
         """Where the coordinates of the k-th candidate stand among the unknowns."""
         first = self.deviations.size + sum(len(c.axes) for c in self.candidates[:k])
         return slice(first, first + len(self.candidates[k].axes))
@@ -86,7 +92,7 @@ class Descent:
     @property
     def rms(self) -> float:
         """Of what is left, in noise deviations where the noise is known."""
-        return float(np.sqrt(np.mean(self.left**2)))
+        return float(np.sqrt(np.mean(self.residual_coefficients**2)))
 
     @property
     def hessian(self) -> Real:
@@ -100,18 +106,18 @@ class Descent:
         first = sum(len(c.axes) for c in self.candidates[:k])
         return self.coordinates[first : first + len(self.candidates[k].axes)]
 
-    def normal(self, records: RecordsToFit) -> NormalEquations:
+    def normal_equations(self, records: RecordsToFit) -> NormalEquations:
         """Of its linearisation."""
         return _normal_at(self, records)
 
-    def on(self, records: RecordsToFit, start: FittedStart | None = None, **settings: Any) -> Descent:
+    def continued(self, records: RecordsToFit, start: FittedStart | None = None, **settings: Any) -> Fit:
         """Descended on, from another start where one is given."""
         start = self.start if start is None else start
         return descend(records, self.candidates, self.deviations, self.coordinates, start, **settings)
 
     def precision(self, records: RecordsToFit) -> Real:
         """(P + A, P + A) of deviations and coordinates, whatever the starts and zeros are."""
-        H, n = self.normal(records).hessian, self.jacobian.shape[1]
+        H, n = self.normal_equations(records).hessian, self.jacobian.shape[1]
         return np.asarray(H[:n, :n] - H[:n, n:] @ np.linalg.pinv(H[n:, n:], hermitian=True) @ H[n:, :n])
 
 
@@ -133,11 +139,11 @@ class NormalEquations:
     ) -> NormalEquations:
         shared = np.column_stack([jacobian, columns.zeros])
         P, k, S = deviations.size, shared.shape[1], records.state_spread.size
-        M = k + len(records.parts) * S
+        M = k + len(records.record_slices) * S
         weighted, of_states = shared * weights[:, None], []
         H = np.zeros((M, M))
         H[:k, :k] = shared.T @ weighted
-        for r, (part, own) in enumerate(zip(records.parts, columns.states, strict=True)):
+        for r, (part, own) in enumerate(zip(records.record_slices, columns.states, strict=True)):
             at = slice(k + r * S, k + (r + 1) * S)
             of_states.append(own * weights[part, None])
             H[at, at] = own.T @ of_states[r] + np.diag(1 / records.state_spread**2)
@@ -156,15 +162,15 @@ class NormalEquations:
         shared[shared.size - Z :] += start.zeros / self.records.zero_spread**2
         own = [
             columns.T @ e[part] + states / self.records.state_spread**2
-            for part, columns, states in zip(self.records.parts, of_states, start.states, strict=True)
+            for part, columns, states in zip(self.records.record_slices, of_states, start.states, strict=True)
         ]
         return np.concatenate([shared, *own])
 
 
 @lru_cache(maxsize=2)
-def _normal_at(end: Descent, records: RecordsToFit) -> NormalEquations:
+def _normal_at(end: Fit, records: RecordsToFit) -> NormalEquations:
     """Once for all that is tried beside a fit."""
-    return NormalEquations.of(records, end.weights, end.jacobian, end.columns, end.deviations)
+    return NormalEquations.of(records, end.weights, end.jacobian, end.start_columns, end.deviations)
 
 
 def loss_at(records: RecordsToFit, e: Real, deviations: Real, start: FittedStart) -> tuple[float, float]:
@@ -186,13 +192,13 @@ def descend(
     tolerance: float = 0.5,
     touching: bool = False,
     moved: npt.NDArray[np.bool_] | None = None,
-) -> Descent:
+) -> Fit:
     """Descend from a point; the Jacobian by the deviations and the start columns may be those of a point
     nearby, and are renewed on the way. touching: the latter feel contacts (`settled`). moved (P,): deviations
     that may change; None: all."""
     P, A = deviations.size, coordinates.size
     fixed = np.zeros(0, dtype=np.int64) if moved is None else np.flatnonzero(~moved)
-    low, high = box(candidates)
+    low, high = bounds_of(candidates)
     d, x = deviations.copy(), np.clip(coordinates, low, high)
     deviation_step, steps = steps_of(candidates)
 
@@ -209,12 +215,12 @@ def descend(
             and _moved_on(nominal_jacobian, lambda d: left(d, x, start), d, e, deviation_step)  # noqa: B023
         ):
             step = np.full(P, deviation_step)
-            nominal_jacobian = quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
+            nominal_jacobian = difference_quotients(lambda d: left(d, x, start), d, e, step)  # noqa: B023
         if columns is None or iteration == _AGAIN - 1:
             columns = records.start_columns(d, effects_at(candidates, x), start, touching=touching)
         if columns.zeros.shape[1] and any(c.kind.absolute_angle for c in candidates):
             columns = records.with_true_angles(columns, d, effects_at(candidates, x), start, e)
-        by_effects = quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
+        by_effects = difference_quotients(lambda x: left(d, x, start), x, e, steps, high)  # noqa: B023
         jacobian = np.column_stack([nominal_jacobian, by_effects])
         normal = NormalEquations.of(records, records.likelihood.weights(e), jacobian, columns, d)
         H, g = normal.hessian, normal.gradient(start, e)
@@ -225,8 +231,8 @@ def descend(
             damped = H + damping * np.diag(np.diag(H) + 1e-9)
             damped[range(P, P + A), range(P, P + A)] += 1e2 * damping
             step = np.zeros(g.size)
-            step[free] = -solved(damped[np.ix_(free, free)], g[free])
-            d2 = records.nominal.within(d + np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP))
+            step[free] = -solve_or_least_squares(damped[np.ix_(free, free)], g[free])
+            d2 = records.nominal.clipped(d + np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP))
             x2 = np.clip(x + np.clip(step[P : P + A], -LARGEST_STEP, LARGEST_STEP), low, high)
             start2 = columns.moved(start, step[P + A :])
             e2 = left(d2, x2, start2)
@@ -248,7 +254,7 @@ def descend(
     assert columns is not None
     jacobian = np.column_stack([nominal_jacobian, by_effects])
     weights = records.likelihood.weights(e)
-    return Descent(tuple(candidates), d, x, start, e, weights, jacobian, columns, loss, prior, converged)
+    return Fit(tuple(candidates), d, x, start, e, weights, jacobian, columns, loss, prior, converged)
 
 
 def _moved_on(jacobian: Real, function: Callable[[Real], Real], at: Real, start: Real, step: float) -> bool:
@@ -270,7 +276,7 @@ def steps_of(candidates: Sequence[Candidate]) -> tuple[float, Real]:
     return coarse.get("log", _STEP), np.array(steps)
 
 
-def refined(records: RecordsToFit, end: Descent) -> Descent:
+def refine_sizes(records: RecordsToFit, end: Fit) -> Fit:
     """The end with the sizes on which the loss does not depend smoothly sought on grids around it, all else
     following, and descended from the best of each."""
     first = 0
@@ -281,7 +287,7 @@ def refined(records: RecordsToFit, end: Descent) -> Descent:
     return end
 
 
-def scanned(records: RecordsToFit, end: Descent) -> Descent:
+def scan_far_values(records: RecordsToFit, end: Fit) -> Fit:
     """The same over far values of all parameters on logarithmic scales: where contacts switch, the loss
     along any of them is jagged, and slopes lead no further than the next tooth."""
     for k, axis in enumerate(axis for c in end.candidates for axis in c.axes):
@@ -290,15 +296,15 @@ def scanned(records: RecordsToFit, end: Descent) -> Descent:
     return end
 
 
-def _sought(records: RecordsToFit, end: Descent, k: int, shifts: Real) -> Descent:
+def _sought(records: RecordsToFit, end: Fit, k: int, shifts: Real) -> Fit:
     """The best of the end and what is descended to from the best of some shifts of its k-th coordinate."""
-    low, high = box(end.candidates)
+    low, high = bounds_of(end.candidates)
     trials = []
     for shift in shifts:
         x = end.coordinates.copy()
         x[k] = np.clip(x[k] + shift, low[k], high[k])
         trials.append(x)
-    loss, d, x = best_following(records, end, end.candidates, trials)
+    loss, d, x = best_after_following(records, end, end.candidates, trials)
     if loss > end.loss + WORTH_IT:
         return end
     again = descend(
@@ -308,41 +314,47 @@ def _sought(records: RecordsToFit, end: Descent, k: int, shifts: Real) -> Descen
         x,
         end.start,
         nominal_jacobian=end.jacobian[:, : d.size],
-        columns=end.columns,
+        columns=end.start_columns,
         iterations=5,
     )
     return min(end, again, key=lambda one: one.loss)
 
 
-def best_following(
-    records: RecordsToFit, around: Descent, candidates: Sequence[Candidate], trials: Sequence[Real]
+def best_after_following(
+    records: RecordsToFit, around: Fit, candidates: Sequence[Candidate], trials: Sequence[Real]
 ) -> tuple[float, Real, Real]:
     """The best of some coordinates of the candidates once all else has followed (`follow`): loss,
     deviations, coordinates."""
     followed = []
     for x in trials:
         e = records.coefficients(around.deviations, effects_at(candidates, x), around.start)
-        followed.append((*follow(records, around, e, around.start), x))
+        followed.append((*follow_linearly(records, around, e, around.start), x))
     return min(followed, key=lambda trial: trial[0])
 
 
-def follow(records: RecordsToFit, around: Descent, e: Real, start: FittedStart) -> tuple[float, Real]:
+def follow_linearly(records: RecordsToFit, around: Fit, e: Real, start: FittedStart) -> tuple[float, Real]:
     """What the loss of coefficients e (N,) becomes, and where the deviations go, once everything that
     `around` holds has followed linearly."""
-    P, normal = around.deviations.size, around.normal(records)
+    P, normal = around.deviations.size, around.normal_equations(records)
     H = normal.hessian + np.diag(1e-9 * np.diag(normal.hessian) + 1e-12)
-    step = -solved(H, normal.gradient(start, e))
+    step = -solve_or_least_squares(H, normal.gradient(start, e))
     step[:P] = np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP)
-    moved = e + np.column_stack([around.jacobian, around.columns.zeros]) @ step[: -start.states.size or None]
-    d, start2 = around.deviations + step[:P], around.columns.moved(start, step[around.jacobian.shape[1] :])
+    moved = (
+        e
+        + np.column_stack([around.jacobian, around.start_columns.zeros]) @ step[: -start.states.size or None]
+    )
+    d, start2 = (
+        around.deviations + step[:P],
+        around.start_columns.moved(start, step[around.jacobian.shape[1] :]),
+    )
     S, first = start.states.shape[1], step.size - start.states.size
-    for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
+    for r, (part, own) in enumerate(zip(records.record_slices, around.start_columns.states, strict=True)):
         moved[part] += own @ step[first + r * S : first + (r + 1) * S]
     loss, _ = loss_at(records, moved, d, start2)
-    return loss, records.nominal.within(d)
+    return loss, records.nominal.clipped(d)
 
 
-def occam(records: RecordsToFit, end: Descent) -> float:
+def log_occam_factor(records: RecordsToFit, end: Fit) -> float:
     """log of the prior density of the effects' coordinates times the volume that the records leave them and
     the deviations, whatever the starts and zeros are.
 
@@ -350,7 +362,7 @@ def occam(records: RecordsToFit, end: Descent) -> float:
     less likely because its motion feels more of how it began.
     """
     # What the records say nothing about keeps the width of its range.
-    low, high = box(end.candidates)
+    low, high = bounds_of(end.candidates)
     width = np.where(np.isfinite(high - low), high - low, 2 * np.pi)
     precision, P = end.precision(records), end.deviations.size
     rows = range(P, P + width.size)

@@ -64,12 +64,12 @@ class Levels:
     """
 
     band: npt.NDArray[np.int64]
-    counted: Real
+    independent_counts: Real
     floor: Real
     noise: Real
-    belongs: npt.NDArray[np.int64]
-    motion: Real
-    whole: Real
+    output_of_band: npt.NDArray[np.int64]
+    motion_energy: Real
+    whole_motion_energy: Real
     windows: Windows | None = field(default=None, kw_only=True)
 
     @classmethod
@@ -87,7 +87,7 @@ class Levels:
         rows, first, Y = [], 0, noise.size
         for r, record in enumerate(records):
             T = len(record.output)
-            parts = windows.parts(T) if windows else [(slice(0, T), 1, T)]
+            parts = windows.window_groups(T) if windows else [(slice(0, T), 1, T)]
             octave = np.concatenate([np.tile(octaves_of(length), count) for _, count, length in parts])
             octaves = int(np.max(octave)) + 1
             samples = np.bincount(octave).astype(np.float64)
@@ -108,40 +108,44 @@ class Levels:
             first += octaves * Y
         return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)), windows=windows)
 
-    def seen(self, residuals: Real) -> Real:
+    def to_coefficients(self, residuals: Real) -> Real:
         """See `diagnosis.fit.likelihood.Likelihood`."""
-        return self.changed(residuals).ravel()
+        return self.linearised(residuals).ravel()
 
-    def unseen(self, e: Real, outputs: int) -> Real:
+    def to_residuals(self, e: Real, outputs: int) -> Real:
         e = e.reshape(-1, outputs)
-        return self.windows.unseen(e) if self.windows else np.asarray(idct(e, axis=0, norm="ortho"))
+        return self.windows.to_residuals(e) if self.windows else np.asarray(idct(e, axis=0, norm="ortho"))
 
-    def changed(self, outputs: Real) -> Real:
-        return self.windows.seen(outputs) if self.windows else np.asarray(dct(outputs, axis=-2, norm="ortho"))
+    def linearised(self, outputs: Real) -> Real:
+        return (
+            self.windows.to_coefficients(outputs)
+            if self.windows
+            else np.asarray(dct(outputs, axis=-2, norm="ortho"))
+        )
 
     def energy(self, e: Real) -> Real:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
-    def within(self, part: slice) -> Levels:
+    def of_record(self, part: slice) -> Levels:
         """Of the record that has this part of the coefficients."""
         band = self.band[part]
         own = slice(int(band.min()), int(band.max()) + 1)
-        belongs = self.belongs[own]
+        belongs = self.output_of_band[own]
         outputs = slice(int(belongs.min()), int(belongs.max()) + 1)
         return Levels(
             band - own.start,
-            self.counted[own],
+            self.independent_counts[own],
             self.floor[own],
             self.noise[own],
             belongs - outputs.start,
-            self.motion[outputs],
-            self.whole[outputs],
+            self.motion_energy[outputs],
+            self.whole_motion_energy[outputs],
             windows=self.windows,
         )
 
     def loss_of(self, energy: Real) -> float:
         """-log likelihood of energies (B,)."""
-        return 0.5 * float(self.counted @ np.log1p(energy / self.floor))
+        return 0.5 * float(self.independent_counts @ np.log1p(energy / self.floor))
 
     def loss(self, e: Real) -> float:
         """-log likelihood of coefficients (N,), up to a constant of the records."""
@@ -149,4 +153,4 @@ class Levels:
 
     def weights(self, e: Real) -> Real:
         """(N,) w with grad(loss) = w e: the reciprocal variances that e itself shows."""
-        return np.asarray((self.counted / (self.energy(e) + self.floor))[self.band])
+        return np.asarray((self.independent_counts / (self.energy(e) + self.floor))[self.band])

@@ -21,13 +21,13 @@ SUBSTANTIAL, WORTH_IT, DECISIVE = 2.0, 5.0, 15.0
 class Likelihood(Protocol):
     """Of coefficients e (N,) of all records together."""
 
-    def seen(self, residuals: Real) -> Real:
+    def to_coefficients(self, residuals: Real) -> Real:
         """measured - model (T, Y) of one record, in the outputs' units -> its coefficients (T Y,)."""
 
-    def unseen(self, e: Real, outputs: int) -> Real:
+    def to_residuals(self, e: Real, outputs: int) -> Real:
         """The inverse, (T Y,) -> (T, Y); rounded outputs by the chance of their cells."""
 
-    def changed(self, outputs: Real) -> Real:
+    def linearised(self, outputs: Real) -> Real:
         """Changes of outputs (..., T, Y) -> those of coefficients, the same shape, to first order."""
 
     def loss(self, e: Real) -> float:
@@ -47,17 +47,17 @@ class White:
     noise: Real
     steps: Real
 
-    def seen(self, residuals: Real) -> Real:
+    def to_coefficients(self, residuals: Real) -> Real:
         e = residuals / self.noise
         for k in np.flatnonzero(self.steps):
             noise = float(self.noise[k])
             e[:, k] = cell_residual(residuals[:, k], np.zeros(len(e)), float(self.steps[k]), noise)
         return np.asarray(e.ravel())
 
-    def unseen(self, e: Real, outputs: int) -> Real:
+    def to_residuals(self, e: Real, outputs: int) -> Real:
         return np.asarray(e.reshape(-1, outputs) * self.noise)
 
-    def changed(self, outputs: Real) -> Real:
+    def linearised(self, outputs: Real) -> Real:
         return np.asarray(outputs / self.noise)
 
     def loss(self, e: Real) -> float:

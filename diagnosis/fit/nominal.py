@@ -74,7 +74,7 @@ class NominalParameters:
             for (key, tolerance), d in zip(self.stated.tolerances.items(), deviations, strict=True)
         }
 
-    def within(self, deviations: Real) -> Real:
+    def clipped(self, deviations: Real) -> Real:
         return np.clip(deviations, -self.farthest, self.farthest)
 
 

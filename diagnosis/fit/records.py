@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.coordinates import quotients
+from diagnosis.fit.coordinates import difference_quotients
 from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import Likelihood
 from diagnosis.fit.nominal import LogNormalParameters, NominalParameters
@@ -70,8 +70,10 @@ class RecordsToFit:
         self.simulations = 0
         self.before_each: Callable[[], None] = lambda: None
         ends = np.cumsum([e.output.size for e in experiments])
-        self.parts = [slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)]
-        self._firsts = [part.start // case.noise.size for part in self.parts]
+        self.record_slices = [
+            slice(int(b - e.output.size), int(b)) for b, e in zip(ends, experiments, strict=True)
+        ]
+        self._firsts = [part.start // case.noise.size for part in self.record_slices]
         self._lengths = np.array([[len(e.output)] for e in experiments])
         lacking = [list(getattr(e, "missing", ())) for e in experiments]
         self._missing = [
@@ -89,7 +91,7 @@ class RecordsToFit:
         known = np.isfinite(self.state_spread)
         self.state_steps = np.where(known, _STATE_STEP * self.state_spread, _ANGLE_STEP_RAD)
 
-    def at_rest(self) -> FittedStart:
+    def guessed_start(self) -> FittedStart:
         """Starts as the first samples say, sensors at their zeros."""
         guess = self.case.machine.unknown_start.guess
         return FittedStart(np.array([guess(e) for e in self.experiments]), np.zeros(self.zero_spread.size))
@@ -105,7 +107,7 @@ class RecordsToFit:
         self.simulations += 1
         self.before_each()
         begun = (state, zeros) if state.size or zeros.size else ()
-        e = experiment.output - simulate(experiment.input, *begun, **later(experiment))
+        e = experiment.output - simulate(experiment.input, *begun, **run_start(experiment))
         missing, kept = self._missing[r]
         if missing:
             for column in e.T:
@@ -114,22 +116,28 @@ class RecordsToFit:
         within = np.abs(e) <= np.abs(far)
         return e if np.all(within) else np.where(within, e, far)
 
-    def of_each(self, deviations: Real, effects: Sequence[Any], zeros: Real) -> Callable[[int, Real], Real]:
+    def coefficients_of_record(
+        self, deviations: Real, effects: Sequence[Any], zeros: Real
+    ) -> Callable[[int, Real], Real]:
         """Coefficients (T Y,) of the r-th record by r and the state at its start."""
         simulate = self.nominal.at(deviations).simulator(effects)
-        return lambda r, state: self.likelihood.seen(self._left(simulate, r, state, zeros))
+        return lambda r, state: self.likelihood.to_coefficients(self._left(simulate, r, state, zeros))
 
     def coefficients(self, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
-        return np.concatenate([self.likelihood.seen(e) for e in self.residuals(deviations, effects, start)])
+        return np.concatenate(
+            [self.likelihood.to_coefficients(e) for e in self.residuals(deviations, effects, start)]
+        )
 
-    def size_of(self, change: Real) -> float:
+    def largest_rms(self, change: Real) -> float:
         """Largest RMS, over records and outputs, of a change of the coefficients (N,)."""
         energies = np.add.reduceat(np.square(change).reshape(-1, self.case.noise.size), self._firsts)
         return float(np.sqrt(np.max(energies / self._lengths)))
 
-    def residuals_of(self, e: Real) -> tuple[Real, ...]:
+    def residuals_from(self, e: Real) -> tuple[Real, ...]:
         """measured - model (T, Y) of every record from their coefficients (N,)."""
-        return tuple(self.likelihood.unseen(e[part], self.case.noise.size) for part in self.parts)
+        return tuple(
+            self.likelihood.to_residuals(e[part], self.case.noise.size) for part in self.record_slices
+        )
 
     def start_columns(
         self, deviations: Real, effects: Sequence[Any], start: FittedStart, *, touching: bool = False
@@ -140,15 +148,15 @@ class RecordsToFit:
         outputs = self.case.noise.size
         responses = self.nominal.at(deviations).unknown_start.responses
         if responses is None or touching:
-            of_each = self.of_each(deviations, effects, start.zeros)
+            of_each = self.coefficients_of_record(deviations, effects, start.zeros)
             states = [
-                quotients(partial(of_each, r), state, of_each(r, state), self.state_steps)
+                difference_quotients(partial(of_each, r), state, of_each(r, state), self.state_steps)
                 for r, state in enumerate(start.states)
             ]
         else:
             whole = responses(effects, longest)
             states = [
-                -np.array([self.likelihood.changed(response[: len(e.output)]) for response in whole])
+                -np.array([self.likelihood.linearised(response[: len(e.output)]) for response in whole])
                 .reshape(-1, e.output.size)
                 .T
                 for e in self.experiments
@@ -156,7 +164,7 @@ class RecordsToFit:
         zeros = []
         for e in self.experiments:
             T, shapes = len(e.output), self.case.machine.unknown_start.zero_outputs
-            constant = [self.likelihood.changed(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
+            constant = [self.likelihood.linearised(np.broadcast_to(shape, (T, outputs))) for shape in shapes]
             zeros.append(-np.array(constant).reshape(-1, T * outputs).T)
         return StartColumns.of(np.concatenate(zeros), states, self.case.machine.unknown_start.state_per_zero)
 
@@ -170,7 +178,7 @@ class RecordsToFit:
         moved = self.coefficients(deviations, effects, FittedStart(start.states + shift, start.zeros)) - e
         states = tuple(
             np.column_stack([moved[part] / _ANGLE_STEP_RAD, own[:, 1:]])
-            for part, own in zip(self.parts, columns.states, strict=True)
+            for part, own in zip(self.record_slices, columns.states, strict=True)
         )
         before = np.concatenate([own @ columns.per_zero for own in columns.states])
         return StartColumns.of(columns.zeros - before, states, columns.per_zero)
@@ -197,9 +205,9 @@ class Records(RecordsToFit):
 
     def losses(self, e: Real) -> Real:
         """(R,) -log likelihood of every record, from coefficients (N,)."""
-        return np.array([self.levels.within(part).loss(e[part]) for part in self.parts])
+        return np.array([self.levels.of_record(part).loss(e[part]) for part in self.record_slices])
 
-    def shares(self, residuals: Sequence[Real]) -> Real:
+    def rms_shares(self, residuals: Sequence[Real]) -> Real:
         """(Y,) RMS left beyond what sensors may have over the RMS of the motion (about the mean), all
         records."""
         return np.asarray(np.sqrt(mean_square_left(self.energies(residuals))))
@@ -208,13 +216,13 @@ class Records(RecordsToFit):
         """(2, R, Y) energies left beyond what sensors may have, and of the motion, of every record. carried:
         to compare, noise included, and the motion as far as windows have it."""
         levels, Y = self.levels, self.case.noise.size
-        energy = levels.energy(np.concatenate([levels.seen(e) for e in residuals]))
-        left = np.bincount(levels.belongs, energy if carried else energy - levels.noise)
-        motion = levels.motion if carried else levels.whole
+        energy = levels.energy(np.concatenate([levels.to_coefficients(e) for e in residuals]))
+        left = np.bincount(levels.output_of_band, energy if carried else energy - levels.noise)
+        motion = levels.motion_energy if carried else levels.whole_motion_energy
         return np.array([np.maximum(left, 0.0), motion]).reshape(2, -1, Y)
 
 
-def later(experiment: RecordOfMachine) -> dict[str, int]:
+def run_start(experiment: RecordOfMachine) -> dict[str, int]:
     """What a simulation of a part of a run is told beside its start."""
     first_row: int = getattr(experiment, "first_row", 0)
     return {"first_row": first_row} if first_row else {}

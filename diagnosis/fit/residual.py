@@ -19,7 +19,7 @@ class ResidualModel(RecordsToFit):
     def __init__(self, case: CaseOfMachine) -> None:
         noise = White(case.noise, case.steps)
         super().__init__(case, case.estimation, noise, NominalParameters(case.machine))
-        self.start = self.at_rest()
+        self.start = self.guessed_start()
 
     def of(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
@@ -31,7 +31,7 @@ class ResidualModel(RecordsToFit):
         if experiments is None:
             return self.coefficients(deviations, effects, self.start)
         left = self.by_experiment(deviations, effects, experiments)
-        return np.concatenate([self.likelihood.seen(e * self.case.noise) for e in left.values()])
+        return np.concatenate([self.likelihood.to_coefficients(e * self.case.noise) for e in left.values()])
 
     def by_experiment(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from diagnosis.fit.coordinates import effects_at
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.descent import Fit
 from diagnosis.fit.residual import ResidualModel
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
@@ -28,7 +28,7 @@ _MOST_LEFT = 0.75
 
 
 def solver_spread(
-    model: ResidualModel, end: Descent, experiments: Sequence[RecordOfMachine] | None = None
+    model: ResidualModel, end: Fit, experiments: Sequence[RecordOfMachine] | None = None
 ) -> Real:
     """Variance (N,) in units of the noise's that correct solvers may add to the residuals of a fit.
 

@@ -11,7 +11,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
 from scipy.signal import czt
 
-from diagnosis.fit.descent import Descent, follow
+from diagnosis.fit.descent import Fit, follow_linearly
 from diagnosis.fit.records import FittedStart, RecordsToFit
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
@@ -47,13 +47,11 @@ class StartPoint:
         return bool(moved > _APART or turned > _APART)
 
 
-def point_of(end: Descent) -> StartPoint:
+def point_of(end: Fit) -> StartPoint:
     return StartPoint(end.loss, end.coordinates, end.deviations, end.start)
 
 
-def points_of(
-    records: RecordsToFit, around: Descent, candidate: Candidate, every: int = 1
-) -> list[StartPoint]:
+def points_of(records: RecordsToFit, around: Fit, candidate: Candidate, every: int = 1) -> list[StartPoint]:
     """Every start of a candidate beside a fit, or one in several of its grid, best first."""
     found = _harmonic(records, around, candidate) if candidate.kind.harmonic else []
     if not found:
@@ -67,7 +65,7 @@ def points_of(
 
 
 def beside(
-    records: RecordsToFit, around: Descent, candidate: Candidate, points: Sequence[StartPoint]
+    records: RecordsToFit, around: Fit, candidate: Candidate, points: Sequence[StartPoint]
 ) -> list[StartPoint]:
     """The same points beside the effects of another fit, best first."""
     found = []
@@ -82,23 +80,25 @@ def beside(
 
 
 def point_at(
-    records: RecordsToFit, around: Descent, candidate: Candidate, x: Real, start: FittedStart
+    records: RecordsToFit, around: Fit, candidate: Candidate, x: Real, start: FittedStart
 ) -> StartPoint | None:
     e = records.coefficients(around.deviations, (*around.effects, candidate.effect_at(x)), start)
     if not np.all(np.isfinite(e)):
         return None
-    loss, deviations = follow(records, around, e, start)
-    change = e - around.left
-    return StartPoint(loss, x, deviations, start, records.size_of(change), change.astype(np.float32))
+    loss, deviations = follow_linearly(records, around, e, start)
+    change = e - around.residual_coefficients
+    return StartPoint(loss, x, deviations, start, records.largest_rms(change), change.astype(np.float32))
 
 
-def superposed(records: RecordsToFit, parent: Descent, points: Sequence[StartPoint]) -> list[StartPoint]:
+def superposed(records: RecordsToFit, parent: Fit, points: Sequence[StartPoint]) -> list[StartPoint]:
     """The same points beside the effects of another fit, changes simply added, best first: no simulation. A
     second effect large enough for superposition to fail shows all the same."""
     found = []
     for point in points:
         if point.change is not None:
-            loss, deviations = follow(records, parent, parent.left + point.change, parent.start)
+            loss, deviations = follow_linearly(
+                records, parent, parent.residual_coefficients + point.change, parent.start
+            )
             found.append(replace(point, loss=loss, deviations=deviations))
     return sorted(found, key=lambda point: point.loss)
 
@@ -115,7 +115,7 @@ def _with_zeros(records: RecordsToFit, start: FittedStart, zeros: Real) -> Fitte
     return start.with_zeros(zeros, records.case.machine.unknown_start.state_per_zero)
 
 
-def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> list[StartPoint]:
+def _harmonic(records: RecordsToFit, around: Fit, candidate: Candidate) -> list[StartPoint]:
     """Amplitude and phase by linear least squares at each frequency: the torque acts on a linear arm."""
     machine = records.nominal.at(around.deviations)
     periodic = candidate.kind.harmonic == "time"
@@ -127,10 +127,10 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
     size = next_fast_len(2 * longest, real=True)
     # For points to descend from single precision will do, and takes half the time.
     transfer, weights = rfft(response.astype(np.float32), size, axis=0), around.weights
-    normal = around.normal(records)
-    H, g = normal.hessian, normal.gradient(around.start, around.left)
+    normal = around.normal_equations(records)
+    H, g = normal.hessian, normal.gradient(around.start, around.residual_coefficients)
     factor = cho_factor(H + np.diag(1e-9 * np.diag(H) + 1e-12))
-    shared = np.column_stack([around.jacobian, around.columns.zeros])
+    shared = np.column_stack([around.jacobian, around.start_columns.zeros])
     k, S = shared.shape[1], around.start.states.shape[1]
     time_s = (np.arange(longest) + 0.5) * dt_s
     low, high = candidate.axes[1].low, candidate.axes[1].high
@@ -147,7 +147,7 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         return np.asarray(irfft(rfft(torque, size)[..., None] * transfer, size, axis=2))
 
     def columns_of(moved: Real) -> Real:
-        return -records.likelihood.changed(moved).reshape(2 * len(moved), -1).T.astype(np.float64)
+        return -records.likelihood.linearised(moved).reshape(2 * len(moved), -1).T.astype(np.float64)
 
     found, lines = [], lines[(lines >= low) & (lines <= high)]
     if periodic and lines.size > MOST_LINES:
@@ -165,11 +165,11 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         columns = np.concatenate(parts)
         weighted, cross = columns * weights[:, None], np.empty((g.size, columns.shape[1]))
         cross[:k] = shared.T @ weighted
-        for r, (part, own) in enumerate(zip(records.parts, around.columns.states, strict=True)):
+        for r, (part, own) in enumerate(zip(records.record_slices, around.start_columns.states, strict=True)):
             cross[k + r * S : k + (r + 1) * S] = own.T @ weighted[part]
         solved = cho_solve(factor, cross)
         inner = _of_pairs(columns, weighted) - _of_pairs(cross, solved)
-        slopes = (weighted.T @ around.left - solved.T @ g).reshape(-1, 2)
+        slopes = (weighted.T @ around.residual_coefficients - solved.T @ g).reshape(-1, 2)
         tiny = 1e-12 * np.trace(inner, axis1=1, axis2=2)[:, None, None] * np.eye(2)
         ab = -np.linalg.solve(inner + tiny, slopes[:, :, None])[:, :, 0]
         amplitudes = np.clip(np.hypot(*ab.T), candidate.axes[0].low, candidate.axes[0].high)
@@ -177,19 +177,19 @@ def _harmonic(records: RecordsToFit, around: Descent, candidate: Candidate) -> l
         losses = around.loss + 0.5 * np.sum(slopes * ab, axis=1)
         changes = np.einsum("nlk,lk->ln", columns.reshape(len(columns), -1, 2), ab)
         found += [
-            StartPoint(float(loss), x, around.deviations, around.start, records.size_of(change))
+            StartPoint(float(loss), x, around.deviations, around.start, records.largest_rms(change))
             for loss, x, change in zip(losses, coordinates, changes, strict=True)
         ]
     return found
 
 
-def _loudest(records: RecordsToFit, around: Descent, lines: Real, response: Real, dt_s: float) -> Real:
+def _loudest(records: RecordsToFit, around: Fit, lines: Real, response: Real, dt_s: float) -> Real:
     """Those of evenly spaced frequencies [Hz] at which a torque would take most from what is left, its
     response (T, Y to a pulse) taken to be settled, and the lowest, at which it is not."""
     T, noise = len(response), records.case.noise
     size = next_fast_len(2 * T, real=True)
     transfer, correlation = rfft(response / noise, size, axis=0), np.zeros(T)
-    for part in records.residuals_of(around.left):
+    for part in records.residuals_from(around.residual_coefficients):
         correlation += irfft(np.sum(rfft(part / noise, size, axis=0) * transfer.conj(), axis=1), size)[:T]
     turn = 2j * np.pi * dt_s
     found = np.abs(

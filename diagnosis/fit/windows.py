@@ -57,7 +57,7 @@ class Windows:
             samples = int(np.ceil(1.5 * samples))
         return None
 
-    def parts(self, samples: int) -> list[tuple[slice, int, int]]:
+    def window_groups(self, samples: int) -> list[tuple[slice, int, int]]:
         """Of a record: rows of windows of one length, their number and length."""
         # Of about this length, and none longer than what states are known to do.
         count = max(samples // self.samples, -(-samples // len(self.responses)))
@@ -66,7 +66,7 @@ class Windows:
         found = [(slice(0, first), longer, length + 1), (slice(first, samples), count - longer, length)]
         return [part for part in found if part[1]]
 
-    def seen(self, signals: Real) -> Real:
+    def to_coefficients(self, signals: Real) -> Real:
         """(..., T, Y) -> the same shape: cosine transforms of windows less what their starts do; the first
         window starts as its record."""
         return self._each(signals, lambda part, first: self._freed(part, int(first)))
@@ -85,13 +85,13 @@ class Windows:
         own[..., :kept, :] = 0.0
         return np.asarray(dct((flat - own @ span.T).reshape(part.shape) * self.noise, axis=-2, norm="ortho"))
 
-    def unseen(self, seen: Real) -> Real:
+    def to_residuals(self, seen: Real) -> Real:
         """The inverse, without what starts do."""
         return self._each(seen, lambda part, first: np.asarray(idct(part, axis=-2, norm="ortho")))
 
     def _each(self, signals: Real, change: Callable[[Real, bool], Real]) -> Real:
         found, (T, Y) = np.empty(signals.shape), signals.shape[-2:]
-        for rows, count, length in self.parts(T):
+        for rows, count, length in self.window_groups(T):
             part = signals[..., rows, :].reshape(*signals.shape[:-2], count, length, Y)
             found[..., rows, :] = change(part, rows.start == 0).reshape(*signals.shape[:-2], -1, Y)
         return found

@@ -11,12 +11,12 @@ import numpy as np
 
 from diagnosis.answer import BLOCK, Shares
 from diagnosis.evidence.explanation import Explanation
-from diagnosis.fit.coordinates import DRAWS
+from diagnosis.fit.coordinates import MONTE_CARLO_DRAWS
 from diagnosis.fit.records import Records
 from diagnosis.judge.set_features import is_silent
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import rounding_effect
-from diagnosis.search.loop import SEVERAL
+from diagnosis.search.loop import FOLLOWED_SETS
 from diagnosis.search.search import Search
 
 # Share of the validation error that a further effect has to close for a set with it to be listed among the
@@ -67,13 +67,13 @@ def shares_of(
     held_out = search.held_out
     return Shares(
         names=tuple(search.case.machine.output_names),
-        before=tuple(map(float, held_out.shares(nominal.left_held_out))),
-        after=tuple(map(float, held_out.shares(repaired.left_held_out))),
+        before=tuple(map(float, held_out.rms_shares(nominal.held_out_residuals))),
+        after=tuple(map(float, held_out.rms_shares(repaired.held_out_residuals))),
         interests=search.case.machine.weighing.model_error,
         carried=_carried_by_each(search, names, repaired, nominal, rng),
         small=tuple(name for name in names if name not in matter),
         closes=_sets_that_close(search, nominal),
-        not_tried=tuple(search.left_out),
+        not_tried=tuple(search.skipped_for_time),
         silent=tuple(name for name in interesting if is_silent(search, repaired, name)),
         in_windows=search.windows is not None,
         **_over_horizon(search, repaired, nominal),
@@ -97,7 +97,7 @@ def _carried_by_each(
 ) -> dict[str, tuple[float, float, float]]:
     """Effect -> share of the validation error, and ends of its 95 % interval, none above 1."""
     parts = [part for count in range(len(names) + 1) for part in combinations(names, count)]
-    fitted_keys = {repaired.key, *(explanation.key for explanation in search.found)}
+    fitted_keys = {repaired.sorted_names, *(explanation.sorted_names for explanation in search.explanations)}
     all_fitted = all(tuple(sorted(part)) in fitted_keys for part in parts)
     if search.out_of_time and not all_fitted:
         return {}
@@ -106,11 +106,11 @@ def _carried_by_each(
     nominal_blocks = _blocks(search, nominal)
     blocks = {}
     for part in parts:
-        part_blocks = _blocks(search, search.by_these(part, repaired))
+        part_blocks = _blocks(search, search.with_only(part, repaired))
         blocks[part] = min(part_blocks, nominal_blocks, key=np.sum)
 
     count = blocks[()].size
-    drawn = rng.integers(0, count, (DRAWS, count))
+    drawn = rng.integers(0, count, (MONTE_CARLO_DRAWS, count))
     totals = {part: energy.sum(keepdims=True) for part, energy in blocks.items()}
     drawn_totals = {part: energy[drawn].sum(axis=1) for part, energy in blocks.items()}
     carried = {}
@@ -122,11 +122,11 @@ def _carried_by_each(
 
 
 def _sets_that_close(search: Search, nominal: Explanation) -> tuple[tuple[Names, float], ...]:
-    """The `SEVERAL` sets that close most of the validation error, each more than any part of it, with the
-    share that it closes."""
-    by_evidence = sorted(search.found, key=lambda explanation: explanation.evidence)
+    """The `FOLLOWED_SETS` sets that close most of the validation error, each more than any part of it, with
+    the share that it closes."""
+    by_evidence = sorted(search.explanations, key=lambda explanation: explanation.log_evidence)
     # The likeliest fit of a set comes last and stays.
-    closed = {e.key: closed_by(search, e, nominal) for e in by_evidence if e.names}
+    closed = {e.sorted_names: closed_by(search, e, nominal) for e in by_evidence if e.names}
     listed = []
     for key, share in closed.items():
         parts = combinations(key, len(key) - 1)
@@ -135,18 +135,18 @@ def _sets_that_close(search: Search, nominal: Explanation) -> tuple[tuple[Names,
         if share > best_part + least_gain:
             listed.append((share, key))
     listed.sort(reverse=True)
-    return tuple((key, share) for share, key in listed[:SEVERAL])
+    return tuple((key, share) for share, key in listed[:FOLLOWED_SETS])
 
 
 def _over_horizon(search: Search, repaired: Explanation, nominal: Explanation) -> dict[str, Any]:
     """Fields of `Shares` about windows of a machine that does not forget its inputs; empty for others."""
-    if search.horizon is None:
+    if search.drift_free_windows is None:
         return {}
-    windows = Records(search.case, search.case.held_out, search.horizon)
+    windows = Records(search.case, search.case.held_out, search.drift_free_windows)
     return {
-        "horizon_samples": search.horizon.samples,
-        "horizon_before": tuple(map(float, windows.shares(nominal.left_held_out))),
-        "horizon_after": tuple(map(float, windows.shares(repaired.left_held_out))),
+        "horizon_samples": search.drift_free_windows.samples,
+        "horizon_before": tuple(map(float, windows.rms_shares(nominal.held_out_residuals))),
+        "horizon_after": tuple(map(float, windows.rms_shares(repaired.held_out_residuals))),
     }
 
 
@@ -159,7 +159,7 @@ def _blocks(search: Search, explanation: Explanation) -> Real:
     if rounding is not None:
         expected = expected + rounding.variances / noise**2
     blocks = []
-    for residual in explanation.left_held_out:
+    for residual in explanation.held_out_residuals:
         beyond_noise = np.sum((residual / noise) ** 2 - expected, axis=1)
         blocks.append(np.add.reduceat(beyond_noise, np.arange(0, beyond_noise.size, BLOCK)))
     return np.concatenate(blocks)

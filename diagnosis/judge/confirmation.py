@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.evidence.hypotheses import Hypothesis, disagreement_gain
-from diagnosis.fit.coordinates import box, effects_at, quotients
-from diagnosis.fit.descent import Descent, steps_of
+from diagnosis.fit.coordinates import bounds_of, difference_quotients, effects_at
+from diagnosis.fit.descent import Fit, steps_of
 from diagnosis.fit.discrepancy import Discrepancy, discrepancy
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL
 from diagnosis.fit.residual import ResidualModel
@@ -51,18 +51,18 @@ def confronted(
     """
     if not model.case.held_out:
         return None
-    leading_prediction = _prediction(model, leading.end)
+    leading_prediction = _prediction(model, leading.fit)
     leaves_nothing = leading.is_answer and leading_prediction.unknown_gain < SUBSTANTIAL
     if leaves_nothing and not _contradicted(model, hypotheses, leading, leading_prediction):
         return None
 
-    best_evidence = max(hypothesis.evidence for hypothesis in hypotheses)
+    best_evidence = max(hypothesis.log_evidence for hypothesis in hypotheses)
     predictions = {}
     for k, hypothesis in enumerate(hypotheses):
         if hypothesis is leading:
             predictions[k] = leading_prediction
-        elif hypothesis.evidence > best_evidence - DECISIVE:
-            predictions[k] = _prediction(model, hypothesis.end)
+        elif hypothesis.log_evidence > best_evidence - DECISIVE:
+            predictions[k] = _prediction(model, hypothesis.fit)
     # Others are not worth a simulation: with the best prediction they stay behind by what they were behind.
     best_gain = max(prediction.gain for prediction in predictions.values())
     not_predicted = _Prediction(best_gain, 0.0, 0.0)
@@ -81,24 +81,26 @@ def _contradicted(
     """
     needed = leading.log_weight + leading_prediction.gain + SUBSTANTIAL
     rivals: dict[tuple[frozenset[str], bool], Hypothesis] = {}
-    for hypothesis in sorted(hypotheses, key=lambda h: -h.weight):
+    for hypothesis in sorted(hypotheses, key=lambda h: -h.log_cause_weight):
         if len(hypothesis.names) <= len(leading.names) or not leading.names:
             rivals.setdefault((frozenset(hypothesis.names), hypothesis.is_answer), hypothesis)
     for rival in rivals.values():
-        if rival is leading or rival.weight <= leading.log_weight - DECISIVE:
+        if rival is leading or rival.log_cause_weight <= leading.log_weight - DECISIVE:
             continue
-        if rival.weight + _prediction(model, rival.end).gain > needed:
+        if rival.log_cause_weight + _prediction(model, rival.fit).gain > needed:
             return True
     return False
 
 
 def _with(hypothesis: Hypothesis, prediction: _Prediction) -> Hypothesis:
     """A hypothesis with what validation records add to its log weights."""
-    unknown_weight = hypothesis.unknown_weight + prediction.gain
+    log_weight_with_unknown = hypothesis.log_weight_with_unknown + prediction.gain
     if hypothesis.is_answer:
-        unknown_weight += prediction.unknown_gain
+        log_weight_with_unknown += prediction.unknown_gain
     return replace(
-        hypothesis, log_weight=hypothesis.log_weight + prediction.gain, unknown_weight=unknown_weight
+        hypothesis,
+        log_weight=hypothesis.log_weight + prediction.gain,
+        log_weight_with_unknown=log_weight_with_unknown,
     )
 
 
@@ -126,13 +128,13 @@ class _Prediction:
         return self.log_density + self.allowed_gain
 
 
-def _prediction(model: ResidualModel, end: Descent) -> _Prediction:
+def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
     """What validation records say of the end of a fit."""
     case = model.case
     outputs = case.noise.size
     estimation_samples = [len(record.output) for record in case.estimation]
     validation_samples = [len(record.output) for record in case.held_out]
-    fitted, _ = without_drift(end.left, solver_spread(model, end))
+    fitted, _ = without_drift(end.residual_coefficients, solver_spread(model, end))
     unpredicted, log_density = _unpredicted(model, end)
     before = discrepancy(fitted, estimation_samples, outputs)
     after = discrepancy(
@@ -142,12 +144,12 @@ def _prediction(model: ResidualModel, end: Descent) -> _Prediction:
     return _Prediction(log_density, allowed_gain, _unknown_odds(end, after) - _unknown_odds(end, before))
 
 
-def _unknown_odds(end: Descent, left: Discrepancy) -> float:
+def _unknown_odds(end: Fit, left: Discrepancy) -> float:
     """Log odds of an unknown cause for what is left, beyond the disagreement of correct solvers."""
     return left.log_gain_some - disagreement_gain(end, left)
 
 
-def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
+def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     """Validation residuals without what the fitted values' uncertainty may do to them, and their log density.
 
     Returns
@@ -169,18 +171,18 @@ def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
     if not end.jacobian.shape[1]:
         return residuals, -0.5 * float(residuals @ residuals)
     step_sizes = steps_of(end.candidates)
-    by_deviations = quotients(
+    by_deviations = difference_quotients(
         lambda deviations: model.of(deviations, end.effects, held_out),
         end.deviations,
         residuals,
         np.full(end.deviations.size, step_sizes[0]),
     )
-    by_coordinates = quotients(
+    by_coordinates = difference_quotients(
         lambda coordinates: model.of(end.deviations, effects_at(end.candidates, coordinates), held_out),
         end.coordinates,
         residuals,
         step_sizes[1],
-        box(end.candidates)[1],
+        bounds_of(end.candidates)[1],
     )
     J = np.hstack([by_deviations, by_coordinates])
 
@@ -209,10 +211,10 @@ def _unpredicted(model: ResidualModel, end: Descent) -> tuple[Real, float]:
     return np.asarray(residuals + J @ step), log_density - 0.5 * (quadratic + log_determinant)
 
 
-def _inside(end: Descent, step: Real) -> npt.NDArray[np.bool_]:
+def _inside(end: Fit, step: Real) -> npt.NDArray[np.bool_]:
     """(P + A,) which unknowns stay in their ranges after a step (P + A,): P deviations always do, of A
     coordinates those within the bounds of their effects."""
     P = end.deviations.size
     coordinates = end.coordinates + step[P:]
-    low, high = box(end.candidates)
+    low, high = bounds_of(end.candidates)
     return np.concatenate([np.ones(P, dtype=bool), (low <= coordinates) & (coordinates <= high)])

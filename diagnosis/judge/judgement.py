@@ -27,7 +27,7 @@ from diagnosis.answer import (
 )
 from diagnosis.evidence.explanation import E
 from diagnosis.evidence.hypotheses import Probabilities
-from diagnosis.fit.coordinates import parameter_intervals, widened_by
+from diagnosis.fit.coordinates import parameter_intervals, widening_tolerance
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.repair.repair import Trial
@@ -174,9 +174,9 @@ class Judge(ABC, Generic[E]):
         case = self.search.case
         probabilities = self.said.probabilities
         value_names = self.search.records.nominal.keys
-        residuals_before = self.search.whitened(self.stated)
-        residuals_refit = self.search.whitened(self.refit)
-        residuals_after = self.search.whitened(self.repaired)
+        residuals_before = self.search.whitened_residuals(self.stated)
+        residuals_refit = self.search.whitened_residuals(self.refit)
+        residuals_after = self.search.whitened_residuals(self.repaired)
         # Simulations for the intervals below are not the search's.
         simulations = self.search.simulations
 
@@ -192,11 +192,11 @@ class Judge(ABC, Generic[E]):
             probability = probabilities.cause[name]
             entries.append(NamedEffect(name, probability, probability, {}, {}, not_a_number, explains))
 
-        repair = self.repaired.end.effects
+        repair = self.repaired.fit.effects
         if self.said.rounding is not None:
             repair = (*repair, self.said.rounding.effect)
         is_effect = self.said.verdict == "effect"
-        deviations = self.repaired.end.deviations
+        deviations = self.repaired.fit.deviations
         return Diagnosis(
             case=case,
             verdict=self.said.verdict,
@@ -213,7 +213,7 @@ class Judge(ABC, Generic[E]):
             gap_closed=closed,
             gap_closed_interval=closed_interval,
             deviations=dict(zip(value_names, map(float, deviations), strict=True)),
-            deviations_refit=dict(zip(value_names, map(float, self.refit.end.deviations), strict=True)),
+            deviations_refit=dict(zip(value_names, map(float, self.refit.fit.deviations), strict=True)),
             rig=self.search.records.nominal.at(deviations).description,
             repair=repair,
             residuals_before=residuals_before,
@@ -271,14 +271,14 @@ class Judge(ABC, Generic[E]):
             )
 
         place = fit.names.index(name)
-        candidate = fit.end.candidates[place]
-        coordinates = fit.end.coordinates_of(place)
+        candidate = fit.fit.candidates[place]
+        coordinates = fit.fit.coordinates_of(place)
         by_records, covariance = self.covariance(fit, place)
         intervals = parameter_intervals(candidate, coordinates, covariance, rng)
-        gap_after = held_out_gap(case, self.search.whitened(fit, case.held_out))
+        gap_after = held_out_gap(case, self.search.whitened_residuals(fit, case.held_out))
         # The nominal value whose uncertainty widens the interval of the effect's size most.
-        first_row = fit.end.rows_of(place).start
-        value = widened_by(by_records, fit.end.deviations.size, first_row, float(covariance[0, 0]))
+        first_row = fit.fit.unknowns_of(place).start
+        value = widening_tolerance(by_records, fit.fit.deviations.size, first_row, float(covariance[0, 0]))
         return replace(
             entry,
             parameters=candidate.parameters(coordinates),

@@ -56,16 +56,16 @@ class KnownNoise(Judge[Hypothesis]):
         """
         self.search = search
         case = search.case
-        base = search.base
-        self.found: Sequence[Hypothesis] = search.found
+        base = search.nominal_alone
+        self.found: Sequence[Hypothesis] = search.explanations
         weighed = probabilities(self.found)
         accepted = _accepted(self.found, weighed.answer)
 
         # Validation records decide where they contradict what estimation records say.
         is_unknown = weighed.answer == "unknown"
-        leading = max(self.found, key=lambda h: h.unknown_weight) if is_unknown else accepted
+        leading = max(self.found, key=lambda h: h.log_weight_with_unknown) if is_unknown else accepted
         confronted_hypotheses = None
-        is_late = search.late("confrontation with validation records")
+        is_late = search.skips("confrontation with validation records")
         if not is_late and not (is_unknown and leading.is_answer):
             confronted_hypotheses = confronted(search.records, self.found, leading)
         self.held_out_decided = confronted_hypotheses is not None
@@ -75,8 +75,8 @@ class KnownNoise(Judge[Hypothesis]):
             accepted = _accepted(self.found, weighed.answer)
 
         # The models to compare: as stated, with values re-estimated, with effects added.
-        as_stated = replace(base.end, deviations=np.zeros(search.records.nominal.count))
-        self.stated = replace(base, end=as_stated)
+        as_stated = replace(base.fit, deviations=np.zeros(search.records.nominal.count))
+        self.stated = replace(base, fit=as_stated)
         self.refit = base
         repairs = Repairs(search, base)
         self.repair = repairs.best(accepted.names)
@@ -89,15 +89,17 @@ class KnownNoise(Judge[Hypothesis]):
         self.floor = NOISE_FLOOR
         if rounding is not None:
             self.floor = rounding.floor
-            leads = leads_over(case, rounding, search.whitened(base), search.whitened(self.repaired))
-            weighed = weighed.beside(rounding.name, leads=leads)
+            leads = leads_over(
+                case, rounding, search.whitened_residuals(base), search.whitened_residuals(self.repaired)
+            )
+            weighed = weighed.with_certain_effect(rounding.name, leads=leads)
             if leads or not accepted_names:
                 accepted_names = (rounding.name, *accepted_names)
             else:
                 accepted_names = (*accepted_names, rounding.name)
 
         untried = search.untried
-        if search.left_out:
+        if search.skipped_for_time:
             weighed = weighed.with_untried(untried, larger=True)
         # What was not tried counts as unknown.
         answer = weighed.counting_as_unknown(untried).answer
@@ -108,10 +110,10 @@ class KnownNoise(Judge[Hypothesis]):
             untried,
             rounding,
             () if answer == "unknown" else self._fitting_as_well(accepted),
-            converged=self.repaired.end.converged or is_late,
+            converged=self.repaired.fit.converged or is_late,
         )
         self.complete = 1 - sum(weighed.cause[name] for name in ("unknown", *untried))
-        self.gap_refit = held_out_gap(case, search.whitened(base, case.held_out))
+        self.gap_refit = held_out_gap(case, search.whitened_residuals(base, case.held_out))
         if answer == "unknown":
             presence = {**weighed.presence, **self._presence_by_prediction()}
             self.said = replace(self.said, probabilities=replace(weighed, presence=presence))
@@ -124,9 +126,9 @@ class KnownNoise(Judge[Hypothesis]):
         fitting = []
         for hypothesis in self.found:
             is_same_size = hypothesis.is_answer and len(hypothesis.names) == len(accepted.names)
-            if is_same_size and hypothesis.end.loss <= accepted.end.loss + SUBSTANTIAL:
+            if is_same_size and hypothesis.fit.loss <= accepted.fit.loss + SUBSTANTIAL:
                 fitting.append(hypothesis)
-        fitting.sort(key=lambda hypothesis: hypothesis.end.loss)
+        fitting.sort(key=lambda hypothesis: hypothesis.fit.loss)
         return tuple(name for hypothesis in fitting for name in hypothesis.names)
 
     def _presence_by_prediction(self) -> dict[str, float]:
@@ -153,15 +155,15 @@ class KnownNoise(Judge[Hypothesis]):
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
         """The record of the judgement; what a time limit left out is a doubt."""
-        likeliest = max(self.found, key=lambda hypothesis: hypothesis.unknown_weight)
-        left_out = [what for what in self.search.left_out if what not in self.said.untried]
+        likeliest = max(self.found, key=lambda hypothesis: hypothesis.log_weight_with_unknown)
+        left_out = [what for what in self.search.skipped_for_time if what not in self.said.untried]
         doubts = (f"the time limit left out {', '.join(left_out)}",) if left_out else ()
         looks_like = self.said.verdict == "unknown" and not likeliest.is_answer
         return self.recorded(
             rng,
             held_out_decided=self.held_out_decided,
             doubts=doubts,
-            unlisted=likeliest.end.effects if looks_like else (),
+            unlisted=likeliest.fit.effects if looks_like else (),
             competing=self._competing(),
         )
 
@@ -180,12 +182,12 @@ class KnownNoise(Judge[Hypothesis]):
         What is left beyond the noise widens intervals in proportion. So does what solvers disagree about
         where contacts switch: that is correlated over a record, so that its whole length counts as one value.
         """
-        end = fit.end
+        end = fit.fit
         mean_samples = float(np.mean([len(record.output) for record in self.search.case.estimation]))
         disagreement = _HALF_NORMAL_MEDIAN * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
         widening = max(1.0, end.rms**2) * (1 + disagreement**2 * mean_samples)
         covariance = widening * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
-        return covariance, covariance[end.rows_of(k), end.rows_of(k)]
+        return covariance, covariance[end.unknowns_of(k), end.unknowns_of(k)]
 
     def explains(self, fit: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
         """See `Judge.explains`: without an interval, and NaN where the set without the effect was not
@@ -202,7 +204,7 @@ class KnownNoise(Judge[Hypothesis]):
     def _validation_gap(self, hypothesis: Hypothesis) -> float:
         """RMS that a hypothesis leaves of validation records, in noise deviations."""
         case = self.search.case
-        return held_out_gap(case, self.search.whitened(hypothesis, case.held_out))
+        return held_out_gap(case, self.search.whitened_residuals(hypothesis, case.held_out))
 
     def _competing(self) -> tuple[CompetingHypothesis, ...]:
         """What the next experiment is to separate, most probable first.
@@ -219,11 +221,11 @@ class KnownNoise(Judge[Hypothesis]):
         competing = competing_hypotheses(case, answers, weighed.sets)
         if not look_alikes:
             return competing
-        likeliest = max(look_alikes, key=lambda h: h.unknown_weight)
+        likeliest = max(look_alikes, key=lambda h: h.log_weight_with_unknown)
         looked_like = [str(LOOK_ALIKES[n].look_alike_of) for n in likeliest.names if n in LOOK_ALIKES]
         if min([weighed.cause["unknown"], *(weighed.presence[name] for name in looked_like)]) < POSSIBLE:
             return competing
-        look_alike = competing_hypothesis(case, likeliest.end, weighed.cause["unknown"])
+        look_alike = competing_hypothesis(case, likeliest.fit, weighed.cause["unknown"])
         ranked = sorted((*competing, look_alike), key=lambda hypothesis: -hypothesis.probability)
         return tuple(ranked[:MOST_COMPETING])
 

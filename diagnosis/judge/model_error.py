@@ -6,7 +6,7 @@ import numpy as np
 
 from diagnosis.answer import Diagnosis
 from diagnosis.evidence.explanation import Explanation, best_of_sets
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.descent import Fit
 from diagnosis.judge import verdict as judging
 from diagnosis.judge.carried import closed_by, shares_of
 from diagnosis.judge.judgement import Judge
@@ -45,16 +45,16 @@ def looked_at_again(
     named = set(answer.combination)
     windows = None
     if judge.names_something and isinstance(answer.case, PlantCase):
-        windows = first.horizon
+        windows = first.drift_free_windows
     if windows is None:
         return answer
     search = Search(answer.case, progress, deadline_s, windows)
-    holding = [e for e in first.found if named <= set(e.names)]
+    holding = [e for e in first.explanations if named <= set(e.names)]
     if holding:
-        named_alone = first.by_these(answer.combination, max(holding, key=lambda e: e.evidence))
+        named_alone = first.with_only(answer.combination, max(holding, key=lambda e: e.log_evidence))
         # The same effects in windows, descended on from where the free run ended.
-        left = np.sqrt(search.explained(named_alone.end.on(search.records)).mean_squares)
-        if max(np.max(left), np.max(named_alone.shares)) < answer.case.machine.weighing.model_error:
+        left = np.sqrt(search.explain(named_alone.fit.continued(search.records)).energy_ratios)
+        if max(np.max(left), np.max(named_alone.residual_shares)) < answer.case.machine.weighing.model_error:
             return answer
     in_windows = BesideModelError(search.run_in_time(), rng)
     again = in_windows.answer(rng)
@@ -66,8 +66,9 @@ def looked_at_again(
 def reaches_noise(search: Search) -> bool:
     """Whether some set leaves little beyond the noise of any output and record: it may be exact."""
     return any(
-        max(np.sqrt(np.mean(part**2, axis=0)).max() for part in search.whitened(e).values()) < _NEAR_NOISE
-        for e in search.found
+        max(np.sqrt(np.mean(part**2, axis=0)).max() for part in search.whitened_residuals(e).values())
+        < _NEAR_NOISE
+        for e in search.explanations
     )
 
 
@@ -120,10 +121,10 @@ class BesideModelError(Judge[Explanation]):
         self.looks_like = self.said.answer == "unknown" and not set(likeliest.names) <= set(
             search.case.machine.weighing.listed
         )
-        self.stated = search.stated()
+        self.stated = search.at_stated_values()
         self.refit = self.said.nominal
         self.complete = judging.below_threshold(search, self.repaired)
-        self.sets = best_of_sets(search.found)
+        self.sets = best_of_sets(search.explanations)
 
     def _surely_worse(self, repairs: Repairs[Explanation], named: set[str]) -> set[str]:
         """Named effects with which logs are surely predicted worse than without them.
@@ -145,7 +146,7 @@ class BesideModelError(Judge[Explanation]):
         """The record of the judgement, with shares and what the next experiment is to part."""
         return self.recorded(
             rng,
-            unlisted=self.said.judged[0].explanation.end.effects if self.looks_like else (),
+            unlisted=self.said.judged[0].explanation.fit.effects if self.looks_like else (),
             shares=self.shares,
             competing=_competing(self.search, self.said),
         )
@@ -160,15 +161,15 @@ class BesideModelError(Judge[Explanation]):
 
     def covariance(self, fit: Explanation, k: int) -> tuple[Real, Real]:
         """See `Judge.covariance`: imperfections of the model that may act as the effect does widen it."""
-        end = fit.end
-        inverse = np.linalg.pinv(end.normal(self.search.records).hessian, hermitian=True)
+        end = fit.fit
+        inverse = np.linalg.pinv(end.normal_equations(self.search.records).hessian, hermitian=True)
         by_records = TEMPER * np.asarray(inverse, dtype=np.float64)
         without = best_without(self.sets, fit, fit.names[k])
         imperfections = LITTLE * self.search.case.machine.weighing.model_error
         share = max(share_beside(without, fit), imperfections)
         changes = [_size(end.candidates[k], i, x) for i, x in enumerate(end.coordinates_of(k))]
         sizes = imperfections / share * np.array(changes)
-        return by_records, by_records[end.rows_of(k), end.rows_of(k)] + np.outer(sizes, sizes)
+        return by_records, by_records[end.unknowns_of(k), end.unknowns_of(k)] + np.outer(sizes, sizes)
 
     def explains(self, fit: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
         """See `Judge.explains`: as the repaired model shares it out, or by this fit alone."""
@@ -188,17 +189,17 @@ def _competing(search: Search, said: JudgedSets) -> tuple[CompetingHypothesis, .
     """
     case = search.case
     records = search.records
-    contradicting: dict[tuple[str, ...], Descent] = {}
+    contradicting: dict[tuple[str, ...], Fit] = {}
     for one in said.judged:
         key = tuple(sorted(one.holding(0.5)))
         related = [other for other in contradicting if set(key) <= set(other) or set(other) <= set(key)]
         if key and not related:
-            contradicting[key] = one.explanation.end
+            contradicting[key] = one.explanation.fit
 
     # Bands are ordered by record, octave and output.
     outputs = case.noise.size
     uninteresting = records.levels.floor.reshape(-1, outputs).sum(axis=0)
-    independent_values = records.levels.counted.reshape(-1, outputs).sum(axis=0)
+    independent_values = records.levels.independent_counts.reshape(-1, outputs).sum(axis=0)
     noise = np.sqrt(TEMPER * uninteresting / independent_values)
     if isinstance(case, Case):
         of_output = dict(zip(case.outputs, noise, strict=True))

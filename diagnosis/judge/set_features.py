@@ -111,14 +111,16 @@ class SetFeatures:
     rest_features: tuple[float, ...]
 
 
-def features_of_sets(search: Search, fits: Mapping[tuple[str, ...], Explanation]) -> list[SetFeatures]:
+def features_of_sets(
+    search: Search, explanations: Mapping[tuple[str, ...], Explanation]
+) -> list[SetFeatures]:
     """The features of every set, in the order given.
 
     Parameters
     ----------
     search : Search
         That has fitted them.
-    fits : mapping
+    explanations : mapping
         Sorted names -> the likeliest fit of these effects; () is the nominal without an effect.
 
     Notes
@@ -129,24 +131,26 @@ def features_of_sets(search: Search, fits: Mapping[tuple[str, ...], Explanation]
     model error the linear part counts less.
     """
     weighing = search.case.machine.weighing
-    evidence = {key: fit.log_likelihood + fit.log_volume for key, fit in fits.items()}
+    evidence = {
+        key: explanation.log_likelihood + explanation.log_volume for key, explanation in explanations.items()
+    }
     best_evidence = max(evidence.values())
     most_likely = max(evidence, key=lambda key: evidence[key])
-    left_by_it = share_left(fits[most_likely]) / weighing.model_error
+    left_by_it = share_left(explanations[most_likely]) / weighing.model_error
     # What a cause on no list leaves is no noise: the more of it, the less differences of likelihood say.
     trust = 1 / (1 + left_by_it**2)
     sets = []
-    for key, fit in fits.items():
+    for key, explanation in explanations.items():
         behind = best_evidence - evidence[key]
-        left_to_model_error = _log_ratio(share_left(fit), weighing.model_error, _LOG_RATIO_LIMIT)
-        unlisted = sum(name not in weighing.listed for name in fit.names)
+        left_to_model_error = _log_ratio(share_left(explanation), weighing.model_error, _LOG_RATIO_LIMIT)
+        unlisted = sum(name not in weighing.listed for name in explanation.names)
         # An effect that contains another (Stribeck and Coulomb friction) fits as well where it looks like it:
         # the simpler name is the better one.
-        further_parameters = sum(len(candidate.axes) - 1 for candidate in fit.end.candidates)
-        log_prior = fit.log_prior - log(max(comb(len(weighing.listed), len(fit.names)), 1))
+        further_parameters = sum(len(candidate.axes) - 1 for candidate in explanation.fit.candidates)
+        log_prior = explanation.log_prior - log(max(comb(len(weighing.listed), len(explanation.names)), 1))
         sets.append(
             SetFeatures(
-                explanation=fit,
+                explanation=explanation,
                 log_prior=log_prior + unlisted * log(UNLISTED) - further_parameters,
                 features=(
                     -float(np.log1p(behind)),
@@ -160,7 +164,7 @@ def features_of_sets(search: Search, fits: Mapping[tuple[str, ...], Explanation]
 
 
 def features_of_effects(
-    search: Search, fit: Explanation, fits: Mapping[tuple[str, ...], Explanation]
+    search: Search, explanation: Explanation, explanations: Mapping[tuple[str, ...], Explanation]
 ) -> tuple[EffectFeatures, ...]:
     """The features of the effects of one set, the one that carries most first.
 
@@ -168,21 +172,21 @@ def features_of_effects(
     ----------
     search : Search
         That has fitted the sets.
-    fit : Explanation
+    explanation : Explanation
         The likeliest fit of the set.
-    fits : mapping
+    explanations : mapping
         Sorted names -> the likeliest fit: what is left without one of the effects.
     """
     weighing = search.case.machine.weighing
-    left = share_left(fit)
+    left = share_left(explanation)
     left_beyond_model_error = max(_log_ratio(left, weighing.model_error, _LOG_RATIO_LIMIT), 0.0)
-    shares = _shares_carried(search, fit, fits)
+    shares = _shares_carried(search, explanation, explanations)
     effects = []
-    for place, name in enumerate(fit.names):
+    for place, name in enumerate(explanation.names):
         share = shares[name]
         interests = _exceeds(share, weighing.model_error)
-        by_name = is_none_but_by_name(search, fit, place)
-        tolerances_off = _tolerances_off(search, fit, place)
+        by_name = is_none_but_by_name(search, explanation, place)
+        tolerances_off = _tolerances_off(search, explanation, place)
         if tolerances_off is None:
             to_model_error = _log_ratio(share, weighing.model_error, _LOG_RATIO_LIMIT)
             to_left = _log_ratio(share, left, _LOG_RATIO_LIMIT)
@@ -193,38 +197,40 @@ def features_of_effects(
             features = (0.0, 0.0, 0.0, 1.0, left_beyond_model_error, off)
             interests = max(interests, _exceeds(tolerances_off, _FAR_OFF_TOLERANCES))
             interests *= _exceeds(tolerances_off, _NEAR_TOLERANCES)
-        is_listed = name in weighing.listed and fit.end.effects[place].as_listed
+        is_listed = name in weighing.listed and explanation.fit.effects[place].as_listed
         is_answer = is_listed and name not in search.refuted
         effects.append(EffectFeatures(name, is_answer, share, interests, by_name, features))
     return tuple(sorted(effects, key=lambda effect: -effect.share))
 
 
-def share_left(fit: Explanation) -> float:
+def share_left(explanation: Explanation) -> float:
     """Share of the motion that a set leaves beyond noise: RMS of estimation and of validation records."""
-    largest = np.max(fit.shares, axis=1)
+    largest = np.max(explanation.residual_shares, axis=1)
     return float(np.sqrt(np.mean(largest**2)))
 
 
-def share_beside(without: Explanation, fit: Explanation) -> float:
+def share_beside(without: Explanation, explanation: Explanation) -> float:
     """Share of the motion that a set carries beyond a part of it: geometric mean of estimation and of
     validation records."""
-    return float(np.sqrt(np.prod(_carried(without, fit))))
+    return float(np.sqrt(np.prod(_carried(without, explanation))))
 
 
-def best_without(fits: Mapping[tuple[str, ...], Explanation], fit: Explanation, name: str) -> Explanation:
+def best_without(
+    explanations: Mapping[tuple[str, ...], Explanation], explanation: Explanation, name: str
+) -> Explanation:
     """The set without this effect; where nobody fitted that, the likeliest of its parts."""
-    others = {other for other in fit.names if other != name}
-    parts = [part for key, part in fits.items() if others.issuperset(key)]
-    return max(parts, key=lambda part: (len(part.names) == len(others), part.evidence))
+    others = {other for other in explanation.names if other != name}
+    parts = [part for key, part in explanations.items() if others.issuperset(key)]
+    return max(parts, key=lambda part: (len(part.names) == len(others), part.log_evidence))
 
 
-def is_silent(search: Search, fit: Explanation, name: str) -> bool:
+def is_silent(search: Search, explanation: Explanation, name: str) -> bool:
     """Whether validation records say nothing about an effect: it does next to nothing there."""
-    acts = search.acts_on_held_out(fit, fit.names.index(name))
+    acts = search.held_out_share_of(explanation, explanation.names.index(name))
     return acts < LITTLE * search.case.machine.weighing.model_error
 
 
-def is_none_but_by_name(search: Search, fit: Explanation, place: int) -> float:
+def is_none_but_by_name(search: Search, explanation: Explanation, place: int) -> float:
     """Probability that an effect of a set is none but by its name: the records do not show what makes it one.
 
     At an end of its range it is: 1. A constant is what a static error of an unlisted cause adds, too, where
@@ -235,19 +241,19 @@ def is_none_but_by_name(search: Search, fit: Explanation, place: int) -> float:
     ----------
     search : Search
         That has fitted the set.
-    fit : Explanation
+    explanation : Explanation
         The set.
     place : int
         Of the effect among its names.
     """
-    end = fit.end
+    end = explanation.fit
     records = search.records
     if end.candidates[place].at_edge(end.coordinates_of(place)):
         return 1.0
     first_column = end.deviations.size + sum(len(c.axes) for c in end.candidates[:place])
     by_size = end.jacobian[:, first_column]
     outputs = search.case.noise.size
-    added = [-records.likelihood.unseen(by_size[part], outputs) for part in records.parts]
+    added = [-records.likelihood.to_residuals(by_size[part], outputs) for part in records.record_slices]
     constants = np.array([np.mean(signal, axis=0) for signal in added])
     if not np.any(constants):
         return 0.0
@@ -257,7 +263,7 @@ def is_none_but_by_name(search: Search, fit: Explanation, place: int) -> float:
                 return 0.0
 
     # The constant of every record and output against the operating point there.
-    modelled = [e.output - left for e, left in zip(records.experiments, fit.left, strict=True)]
+    modelled = [e.output - left for e, left in zip(records.experiments, explanation.residuals, strict=True)]
     points = np.array([np.mean(output, axis=0) for output in modelled]) - constants
     points = np.where(constants, points, 0.0)
     share = np.sum(constants * points) / (np.sum(points**2) or 1.0)
@@ -268,7 +274,7 @@ def is_none_but_by_name(search: Search, fit: Explanation, place: int) -> float:
 
 
 def _shares_carried(
-    search: Search, fit: Explanation, fits: Mapping[tuple[str, ...], Explanation]
+    search: Search, explanation: Explanation, explanations: Mapping[tuple[str, ...], Explanation]
 ) -> dict[str, float]:
     """Effect -> share of the motion that it carries within the set, or within a part of it.
 
@@ -277,48 +283,48 @@ def _shares_carried(
     asked again within what is left of the set.
     """
     model_error = search.case.machine.weighing.model_error
-    shares = dict.fromkeys(fit.names, 0.0)
-    reduced = fit
+    shares = dict.fromkeys(explanation.names, 0.0)
+    reduced = explanation
     while reduced.names:
-        without = {name: best_without(fits, reduced, name) for name in reduced.names}
+        without = {name: best_without(explanations, reduced, name) for name in reduced.names}
         for name in reduced.names:
             shares[name] = max(shares[name], _share_carried(search, reduced, name, without[name]))
         small = [without[name] for name in reduced.names if shares[name] < model_error]
         smaller_by_one = [part for part in small if len(part.names) == len(reduced.names) - 1]
         if not smaller_by_one:
             break
-        reduced = max(smaller_by_one, key=lambda part: part.evidence)
+        reduced = max(smaller_by_one, key=lambda part: part.log_evidence)
     return shares
 
 
-def _share_carried(search: Search, fit: Explanation, name: str, without: Explanation) -> float:
+def _share_carried(search: Search, explanation: Explanation, name: str, without: Explanation) -> float:
     """Share of the motion that an effect carries of validation records.
 
     Estimation records say less: an effect that they were fitted with makes up for a drift, and one that
     others imitate, with values that validation records refute, carries nothing of them. They count where
     validation records say nothing about the effect.
     """
-    estimation, validation = map(float, _carried(without, fit))
+    estimation, validation = map(float, _carried(without, explanation))
     model_error = search.case.machine.weighing.model_error
-    if validation < model_error < estimation and is_silent(search, fit, name):
+    if validation < model_error < estimation and is_silent(search, explanation, name):
         return estimation
     return validation
 
 
-def _carried(without: Explanation, fit: Explanation) -> Real:
+def _carried(without: Explanation, explanation: Explanation) -> Real:
     """(2,) share of the motion that a set carries beyond a part of it, of estimation and of validation
     records."""
-    energy = np.maximum(without.mean_squares - fit.mean_squares, 0.0)
+    energy = np.maximum(without.energy_ratios - explanation.energy_ratios, 0.0)
     return np.asarray(np.max(np.sqrt(energy), axis=1))
 
 
-def _tolerances_off(search: Search, fit: Explanation, place: int) -> float | None:
+def _tolerances_off(search: Search, explanation: Explanation, place: int) -> float | None:
     """How far an effect and the deviations together move the value that it changes, in tolerances.
 
     None for effects that change no stated value, and for values without a tolerance: none of theirs is there
     to imitate what the effect does.
     """
-    end = fit.end
+    end = explanation.fit
     machine = search.case.machine
     kind = end.candidates[place].kind
     key = kind.multiplies or kind.adds_to

@@ -17,7 +17,7 @@ from diagnosis.judge.judgement import Judgement
 from diagnosis.judge.naming_model import NamingModel, fitted_model
 from diagnosis.judge.set_features import EffectFeatures, SetFeatures, features_of_effects, features_of_sets
 from diagnosis.machine.rounding import Rounding, rounding_effect
-from diagnosis.search.loop import SEVERAL
+from diagnosis.search.loop import FOLLOWED_SETS
 from diagnosis.search.search import Search
 
 # Sets less probable than this are not looked at: a hundred of them would add a tenth to no effect.
@@ -110,22 +110,28 @@ def judged(search: Search) -> JudgedSets:
     for another one, with a simpler one, and without one. What that finds is judged with all others, until
     nothing new is found or the time is up.
     """
-    nominal = min(search.base, search.stated(), key=lambda fit: fit.pooled_held_out(search.case.noise))
+    nominal = min(
+        search.nominal_alone,
+        search.at_stated_values(),
+        key=lambda explanation: explanation.held_out_energy(search.case.noise),
+    )
     model = fitted_model()
-    for _ in range(SEVERAL):
-        known = len(search.found)
+    for _ in range(FOLLOWED_SETS):
+        known = len(search.explanations)
         sets = _judged_sets(search, model, nominal)
         if search.out_of_time:
             break
         for near in _nearly_as_probable(sets):
-            search.exchanged(near.explanation, near.holding(0.5))
+            search.add_exchanged(near.explanation, near.holding(0.5))
         likeliest = sets[0].explanation
         for place in range(len(likeliest.names)):
             if len(likeliest.names) > 1:
-                search.without(likeliest, place)
-        for explanation in [near.explanation for near in _nearly_as_probable(sets)] + search.found[known:]:
-            search.simpler(explanation)
-        if len(search.found) == known:
+                search.without_effect(likeliest, place)
+        for explanation in [near.explanation for near in _nearly_as_probable(sets)] + search.explanations[
+            known:
+        ]:
+            search.add_simpler(explanation)
+        if len(search.explanations) == known:
             break
 
     probabilities = _probabilities(sets, search.case.machine.weighing.listed)
@@ -134,12 +140,12 @@ def judged(search: Search) -> JudgedSets:
     rounding_share = 0.0 if rounding is None else _rounding_share(search, rounding)
     if rounding is not None and rounding_share > search.case.machine.weighing.model_error:
         largest = max((effect.features.share for effect in sets[0].effects), default=0.0)
-        probabilities = probabilities.beside(rounding.name, leads=rounding_share > largest)
+        probabilities = probabilities.with_certain_effect(rounding.name, leads=rounding_share > largest)
     else:
         rounding = None
     # What was not tried may be there, and counts as unknown.
     untried = search.untried
-    probabilities = probabilities.with_untried(untried, larger=len(search.left_out) > 0)
+    probabilities = probabilities.with_untried(untried, larger=len(search.skipped_for_time) > 0)
     answer = probabilities.counting_as_unknown(untried).answer
     shares = {effect.features.name: effect.features.share for one in reversed(sets) for effect in one.effects}
     if rounding is not None:
@@ -163,13 +169,19 @@ def below_threshold(search: Search, explanation: Explanation) -> float:
     """
     case = search.case
     ways = [(search.records, search.held_out)]
-    if search.horizon and not search.windows:
+    if search.drift_free_windows and not search.windows:
         ways.append(
-            (Records(case, case.estimation, search.horizon), Records(case, case.held_out, search.horizon))
+            (
+                Records(case, case.estimation, search.drift_free_windows),
+                Records(case, case.held_out, search.drift_free_windows),
+            )
         )
     probabilities = []
     for estimation, validation in ways:
-        energies = [estimation.energies(explanation.left), validation.energies(explanation.left_held_out)]
+        energies = [
+            estimation.energies(explanation.residuals),
+            validation.energies(explanation.held_out_residuals),
+        ]
         squares = [np.max(mean_square_left(energy)) for energy in energies]
         left = max(float(np.sqrt(np.mean(squares))), _NOTHING)
         # Of every record, of the output that shows most of it.
@@ -187,12 +199,12 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
     None leaves more of the validation records than the nominal, as stated or re-estimated.
     """
     noise = search.case.noise
-    farthest = nominal.pooled_held_out(noise)
-    fits = {}
-    for key, fit in best_of_sets(search.found).items():
-        if not key or fit.pooled_held_out(noise) <= farthest:
-            fits[key] = fit
-    features = features_of_sets(search, fits)
+    farthest = nominal.held_out_energy(noise)
+    explanations = {}
+    for key, explanation in best_of_sets(search.explanations).items():
+        if not key or explanation.held_out_energy(noise) <= farthest:
+            explanations[key] = explanation
+    features = features_of_sets(search, explanations)
     probabilities = model.set_probabilities(features)
     kept: list[tuple[float, SetFeatures]] = []
     for probability, one in zip(probabilities, features, strict=True):
@@ -204,7 +216,7 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
     for probability, one in kept:
         effects = tuple(
             JudgedEffect(effect, model.is_genuine(effect))
-            for effect in features_of_effects(search, one.explanation, fits)
+            for effect in features_of_effects(search, one.explanation, explanations)
         )
         # Where nobody has said what does not interest, whatever is left has a cause.
         is_stated = search.case.machine.weighing.stated
@@ -278,6 +290,6 @@ def _rounding_share(search: Search, rounding: Rounding) -> float:
     """Share of the motion that rounding is, of the output that shows most of it."""
     outputs = search.case.noise.size
     samples = sum(len(record.output) for record in (*search.case.estimation, *search.case.held_out))
-    motion = np.concatenate([search.records.levels.motion, search.held_out.levels.motion])
+    motion = np.concatenate([search.records.levels.motion_energy, search.held_out.levels.motion_energy])
     motion_energy = motion.reshape(-1, outputs).sum(axis=0)
     return float(np.sqrt(np.max(rounding.variances * samples / motion_energy)))

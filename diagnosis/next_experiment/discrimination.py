@@ -22,8 +22,8 @@ from scipy.linalg import block_diag
 
 from diagnosis.evidence.explanation import best_of_sets
 from diagnosis.evidence.hypotheses import Hypothesis
-from diagnosis.fit.coordinates import box, effects_at, quotients
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.coordinates import bounds_of, difference_quotients, effects_at
+from diagnosis.fit.descent import Fit
 from diagnosis.fit.nominal import NominalParameters
 from diagnosis.machine.case import Case
 from diagnosis.machine.flexible_arm import FlexibleArm
@@ -110,10 +110,10 @@ def competing_hypotheses(
         # No effect at all competes with everything, though it is contained in every set.
         if not any(key and other and (set(key) <= set(other) or set(other) <= set(key)) for other in kept):
             kept.append(key)
-    return tuple(competing_hypothesis(case, best[key].end, sets.get(key, 0.0)) for key in kept)
+    return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
 
 
-def competing_hypothesis(case: Case, fit: Descent, probability: float) -> CompetingHypothesis:
+def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
     nominal = NominalParameters(case.machine)
     return fitted_hypothesis(
@@ -145,7 +145,7 @@ def fitted_hypothesis(
         # Contacts say little about a small change of a nominal parameter and cost most of the time.
         calm = effects_at([c for c in candidates if c.dependence != "non-smooth"], calm_coordinates)
         start = outputs(deviations, calm, voltage)
-        by_d = quotients(
+        by_d = difference_quotients(
             lambda d: outputs(d, calm, voltage),
             deviations,
             start,
@@ -153,12 +153,12 @@ def fitted_hypothesis(
         )
         if len(calm) < len(fitted):
             start = outputs(deviations, fitted, voltage)
-        by_x = quotients(
+        by_x = difference_quotients(
             lambda x: outputs(deviations, effects_at(candidates, x), voltage),
             coordinates,
             start,
             np.array([axis.step for candidate in candidates for axis in candidate.axes]),
-            box(candidates)[1],
+            bounds_of(candidates)[1],
         )
         return np.hstack([by_d, by_x])
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from diagnosis.fit.coordinates import box, solved
-from diagnosis.fit.descent import LARGEST_STEP, Descent
+from diagnosis.fit.coordinates import bounds_of, solve_or_least_squares
+from diagnosis.fit.descent import LARGEST_STEP, Fit
 from diagnosis.fit.nominal import prior_curvature, prior_slope
 from diagnosis.fit.records import FittedStart, RecordsToFit
 from diagnosis.machine.machine_protocol import Real
@@ -42,7 +42,7 @@ class SharedUnknowns:
 
 
 def fitted_without_each_log(
-    records: RecordsToFit, end: Descent, moved: npt.NDArray[np.bool_]
+    records: RecordsToFit, end: Fit, moved: npt.NDArray[np.bool_]
 ) -> list[SharedUnknowns]:
     """The end of a fit as every log would have left it, had that log not been fitted.
 
@@ -66,7 +66,7 @@ def fitted_without_each_log(
     ValueError
         With a single log: nothing is left to be fitted.
     """
-    logs = len(records.parts)
+    logs = len(records.record_slices)
     if logs < 2:
         raise ValueError("a log can be left out of two or more; got one")
     curvatures, gradients = _parts_of_logs(records, end)
@@ -81,7 +81,7 @@ def fitted_without_each_log(
     prior_gradient[:P] = prior_slope(end.deviations)
     prior_gradient[P + A :] = end.start.zeros / records.zero_spread**2
 
-    low, high = box(end.candidates)
+    low, high = bounds_of(end.candidates)
     free = np.concatenate([np.flatnonzero(moved), np.arange(P, prior_diagonal.size)])
     without = []
     for log in range(logs):
@@ -89,12 +89,12 @@ def fitted_without_each_log(
         curvature += _REGULAR * np.diag(np.diag(curvature) + _REGULAR)
         gradient = np.sum(gradients, axis=0) - gradients[log] + prior_gradient
         step = np.zeros(gradient.size)
-        step[free] = -solved(curvature[np.ix_(free, free)], gradient[free])
+        step[free] = -solve_or_least_squares(curvature[np.ix_(free, free)], gradient[free])
         step[: P + A] = np.clip(step[: P + A], -LARGEST_STEP, LARGEST_STEP)
         zeros = end.start.zeros + step[P + A :]
         without.append(
             SharedUnknowns(
-                records.nominal.within(end.deviations + step[:P]),
+                records.nominal.clipped(end.deviations + step[:P]),
                 np.clip(end.coordinates + step[P : P + A], low, high),
                 end.start.with_zeros(zeros, records.case.machine.unknown_start.state_per_zero),
             )
@@ -102,28 +102,28 @@ def fitted_without_each_log(
     return without
 
 
-def _parts_of_logs(records: RecordsToFit, end: Descent) -> tuple[Real, Real]:
+def _parts_of_logs(records: RecordsToFit, end: Fit) -> tuple[Real, Real]:
     """Every log's part of the curvature (R, K, K) and of the gradient (R, K) of the loss.
 
     By the K shared unknowns: deviations, coordinates, zeros. The states at the start of a log belong to it
     alone and follow (Schur complement), so that a log which tells its own start by much tells the rest by
     less.
     """
-    shared = np.column_stack([end.jacobian, end.columns.zeros])
+    shared = np.column_stack([end.jacobian, end.start_columns.zeros])
     curvatures = []
     gradients = []
-    for log, part in enumerate(records.parts):
-        states = end.columns.states[log]
+    for log, part in enumerate(records.record_slices):
+        states = end.start_columns.states[log]
         weights = end.weights[part]
         weighted = shared[part] * weights[:, None]
         curvature = shared[part].T @ weighted
-        gradient = weighted.T @ end.left[part]
+        gradient = weighted.T @ end.residual_coefficients[part]
         if states.shape[1]:
             across = weighted.T @ states
             spread = records.state_spread
             of_states = states.T @ (weights[:, None] * states) + np.diag(1 / spread**2)
-            slope = states.T @ (weights * end.left[part]) + end.start.states[log] / spread**2
-            following = solved(of_states, np.column_stack([across.T, slope]))
+            slope = states.T @ (weights * end.residual_coefficients[part]) + end.start.states[log] / spread**2
+            following = solve_or_least_squares(of_states, np.column_stack([across.T, slope]))
             curvature = curvature - across @ following[:, :-1]
             gradient = gradient - across @ following[:, -1]
         curvatures.append(curvature)

@@ -19,11 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from diagnosis.evidence.explanation import E, best_of_sets
-from diagnosis.fit.coordinates import box, effects_at, solved
-from diagnosis.fit.descent import Descent, descend, loss_at
+from diagnosis.fit.coordinates import bounds_of, effects_at, solve_or_least_squares
+from diagnosis.fit.descent import Fit, descend, loss_at
 from diagnosis.repair.left_out import SharedUnknowns, fitted_without_each_log
 from diagnosis.repair.prediction_error import PredictionError
-from diagnosis.search.loop import SEVERAL, SearchLoop
+from diagnosis.search.loop import FOLLOWED_SETS, SearchLoop
 
 # Simulations of a repair, as a share of those of its search: it may cost a fifth of a diagnosis, and the last
 # descent comes on top. With half of it the pendulum and the joints of `real_machine_gaps` have the same
@@ -89,10 +89,10 @@ class Repairs(Generic[E]):
         self._nominal_validation = self._validation_error(nominal)
         self.trials: list[Trial[E]] = []
         for explanation in self._shortlist():
-            variants = [self._tried(explanation.end, self._all_moved(), explanation)]
+            variants = [self._tried(explanation.fit, self._all_moved(), explanation)]
             # What may be moved and need not.
-            if explanation.end.deviations.size:
-                variants.append(self._tried(explanation.end, ~self._all_moved()))
+            if explanation.fit.deviations.size:
+                variants.append(self._tried(explanation.fit, ~self._all_moved()))
             self.trials.append(min(variants, key=lambda trial: trial.error.rms))
             if search.simulations > self._budget_end or search.out_of_time:
                 break
@@ -129,14 +129,14 @@ class Repairs(Generic[E]):
         """
         trials = []
         for key in (tuple(sorted(names)), tuple(sorted(set(names) - {name}))):
-            known = [trial for trial in self.trials if trial.explanation.key == key]
+            known = [trial for trial in self.trials if trial.explanation.sorted_names == key]
             if known:
                 trials.append(known[0])
                 continue
-            explanation = best_of_sets(self.search.found).get(key)
+            explanation = best_of_sets(self.search.explanations).get(key)
             if explanation is None:
                 return False
-            trials.append(self._tried(explanation.end, self._all_moved(), explanation))
+            trials.append(self._tried(explanation.fit, self._all_moved(), explanation))
         with_it, without = trials
         difference, standard_error = with_it.error.beyond(without.error)
         return difference > _SURELY * standard_error
@@ -148,24 +148,26 @@ class Repairs(Generic[E]):
         of the set, or is contained in one, is left out.
         """
         search = self.search
-        end = chosen.explanation.end
+        end = chosen.explanation.fit
         candidates = list(end.candidates)
         coordinates = [end.coordinates]
         for name in further:
             holding = max(
-                (fit for fit in search.found if name in fit.names), key=lambda fit: fit.evidence, default=None
+                (fit for fit in search.explanations if name in fit.names),
+                key=lambda fit: fit.log_evidence,
+                default=None,
             )
             if holding is None:
                 continue
             place = holding.names.index(name)
-            candidate = holding.end.candidates[place]
+            candidate = holding.fit.candidates[place]
             related = {candidate.kind.contains, *(c.kind.contains for c in candidates)}
             if related & {candidate.effect, *(c.effect for c in candidates)}:
                 continue
             candidates.append(candidate)
-            coordinates.append(holding.end.coordinates_of(place))
+            coordinates.append(holding.fit.coordinates_of(place))
         key = tuple(sorted(candidate.effect for candidate in candidates))
-        known = any(trial.explanation.key == key for trial in self.trials)
+        known = any(trial.explanation.sorted_names == key for trial in self.trials)
         if known or len(candidates) == len(end.candidates) or search.out_of_time:
             return False
         fitted = descend(search.records, candidates, end.deviations, np.concatenate(coordinates), end.start)
@@ -179,7 +181,7 @@ class Repairs(Generic[E]):
         For every number of effects the `SEVERAL` that leave least of the validation records and the likeliest
         one; none that leaves more of these than the nominal does.
         """
-        likeliest = best_of_sets(self.search.found)
+        likeliest = best_of_sets(self.search.explanations)
         energies = {}
         for key, explanation in likeliest.items():
             validation = self._validation_error(explanation)
@@ -188,11 +190,11 @@ class Repairs(Generic[E]):
         shortlist: list[tuple[str, ...]] = []
         for count in range(1, max(len(key) for key in likeliest) + 1):
             keys = [key for key in energies if len(key) == count]
-            predicting = sorted(keys, key=lambda key: energies[key])[:SEVERAL]
+            predicting = sorted(keys, key=lambda key: energies[key])[:FOLLOWED_SETS]
             # The dictionary has the likeliest first.
             shortlist += list(dict.fromkeys([*predicting, *keys[:1]]))
         shortlist.sort(key=lambda key: energies[key])
-        return [self.search.base, *(likeliest[key] for key in shortlist)]
+        return [self.search.nominal_alone, *(likeliest[key] for key in shortlist)]
 
     def _all_moved(self) -> npt.NDArray[np.bool_]:
         return np.ones(self.search.records.nominal.count, dtype=bool)
@@ -200,10 +202,10 @@ class Repairs(Generic[E]):
     def _validation_error(self, explanation: E) -> PredictionError:
         """Of a model as it was fitted, in the validation records."""
         held_out = self.search.case.held_out
-        residuals = self.search.whitened(explanation, held_out)
+        residuals = self.search.whitened_residuals(explanation, held_out)
         return PredictionError.of([residuals[record.name] for record in held_out])
 
-    def _tried(self, end: Descent, moved: npt.NDArray[np.bool_], explanation: E | None = None) -> Trial[E]:
+    def _tried(self, end: Fit, moved: npt.NDArray[np.bool_], explanation: E | None = None) -> Trial[E]:
         """The end of a fit with these values moved and the others as stated, and its prediction error.
 
         explanation : of that end, where all values are moved.
@@ -212,9 +214,9 @@ class Repairs(Generic[E]):
         if explanation is None:
             if not np.all(moved):
                 end = self._with_values_as_stated(end, moved)
-            explanation = search.explained(end)
+            explanation = search.explain(end)
         held_out = search.case.held_out
-        whitened = search.whitened(explanation, held_out)
+        whitened = search.whitened_residuals(explanation, held_out)
         residuals = [whitened[record.name] for record in held_out]
         validation = PredictionError.of(residuals)
         logs = len(search.case.estimation)
@@ -223,36 +225,36 @@ class Repairs(Generic[E]):
         left_out = []
         for log, without in enumerate(fitted_without_each_log(search.records, end, moved)):
             effects = effects_at(end.candidates, without.coordinates)
-            left_out.append(search.predicted(log, without.deviations, effects, without.start))
+            left_out.append(search.prediction_residuals(log, without.deviations, effects, without.start))
         return Trial(explanation, moved, PredictionError.of([*left_out, *residuals]), validation)
 
-    def _with_values_as_stated(self, end: Descent, moved: npt.NDArray[np.bool_]) -> Descent:
+    def _with_values_as_stated(self, end: Fit, moved: npt.NDArray[np.bool_]) -> Fit:
         """The end of a fit with the other values put back to what is stated, all else following linearly.
 
         Sizes that stay where they are, are tried too: where the values were far off a linearisation says
         little.
         """
         records = self.search.records
-        normal = end.normal(records)
+        normal = end.normal_equations(records)
         P = end.deviations.size
         A = end.coordinates.size
         back = np.zeros(normal.hessian.shape[0])
         back[:P] = np.where(moved, 0.0, -end.deviations)
         fixed = np.flatnonzero(~moved)
         free = np.setdiff1d(np.arange(back.size), fixed)
-        gradient = normal.gradient(end.start, end.left) + normal.hessian @ back
+        gradient = normal.gradient(end.start, end.residual_coefficients) + normal.hessian @ back
         following = back.copy()
-        following[free] -= solved(normal.hessian[np.ix_(free, free)], gradient[free])
+        following[free] -= solve_or_least_squares(normal.hessian[np.ix_(free, free)], gradient[free])
 
-        low, high = box(end.candidates)
+        low, high = bounds_of(end.candidates)
         ends = []
         for step in (following, back):
-            deviations = records.nominal.within(end.deviations + step[:P])
+            deviations = records.nominal.clipped(end.deviations + step[:P])
             deviations[fixed] = 0.0
             point = SharedUnknowns(
                 deviations,
                 np.clip(end.coordinates + step[P : P + A], low, high),
-                end.columns.moved(end.start, step[P + A :]),
+                end.start_columns.moved(end.start, step[P + A :]),
             )
             left = records.coefficients(
                 point.deviations, effects_at(end.candidates, point.coordinates), point.start
@@ -264,10 +266,10 @@ class Repairs(Generic[E]):
                     deviations=point.deviations,
                     coordinates=point.coordinates,
                     start=point.start,
-                    left=left,
+                    residual_coefficients=left,
                     weights=records.likelihood.weights(left),
                     loss=loss,
-                    prior=prior,
+                    prior_loss=prior,
                 )
             )
         return min(ends, key=lambda tried: tried.loss)
@@ -281,7 +283,7 @@ class Repairs(Generic[E]):
 
         def rank(trial: Trial[E]) -> tuple[int, int, float]:
             named_here = len(set(trial.names) & set(named))
-            return -named_here, len(trial.names), -trial.explanation.evidence
+            return -named_here, len(trial.names), -trial.explanation.log_evidence
 
         return min(as_good, key=rank)
 
@@ -292,11 +294,11 @@ class Repairs(Generic[E]):
         estimation records lose least.
         """
         search = self.search
-        full = best_of_sets(search.found)[chosen.explanation.key].end
+        full = best_of_sets(search.explanations)[chosen.explanation.sorted_names].fit
         P = full.deviations.size
         if not P:
             return chosen
-        order = _order_of_return(full, full.normal(search.records).hessian)
+        order = _order_of_return(full, full.normal_equations(search.records).hessian)
         sizes = sorted({*range(min(P, _EACH_NUMBER) + 1), *(2**k for k in range(2, 8) if 2**k < P), P})
         trials = [chosen]
         for size in sizes:
@@ -317,7 +319,7 @@ class Repairs(Generic[E]):
         """A repair descended to its end, the values that are as stated held; as it was where that predicts
         worse, or no time is left."""
         search = self.search
-        end = chosen.explanation.end
+        end = chosen.explanation.fit
         if search.out_of_time or not (end.candidates or np.any(chosen.moved)):
             return chosen
         descended = descend(
@@ -327,16 +329,16 @@ class Repairs(Generic[E]):
             end.coordinates,
             end.start,
             nominal_jacobian=end.jacobian[:, : end.deviations.size],
-            columns=end.columns,
+            columns=end.start_columns,
             moved=chosen.moved,
         )
-        trial = self._tried(descended, chosen.moved, search.explained(descended))
+        trial = self._tried(descended, chosen.moved, search.explain(descended))
         if trial.error.rms > chosen.error.rms:
             return chosen
         return trial
 
 
-def _order_of_return(end: Descent, hessian: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
+def _order_of_return(end: Fit, hessian: npt.NDArray[np.float64]) -> npt.NDArray[np.int64]:
     """(P,) nominal values in the order in which they go back to what is stated, the least missed first.
 
     Parameters
@@ -359,6 +361,8 @@ def _order_of_return(end: Descent, hessian: npt.NDArray[np.float64]) -> npt.NDAr
         for value in set(range(P)) - set(returned):
             back = [*returned, value]
             covariance = np.asarray(inverse[np.ix_(back, back)], dtype=np.float64)
-            costs[value] = float(end.deviations[back] @ solved(covariance, end.deviations[back]))
+            costs[value] = float(
+                end.deviations[back] @ solve_or_least_squares(covariance, end.deviations[back])
+            )
         returned.append(min(costs, key=lambda value: (costs[value], value)))
     return np.array(returned, dtype=np.int64)

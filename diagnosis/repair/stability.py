@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from diagnosis.fit.coordinates import DRAWS
+from diagnosis.fit.coordinates import MONTE_CARLO_DRAWS
 from diagnosis.repair.repair import Trial
 
 
@@ -33,7 +33,7 @@ def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
     """
     energies = np.array([trial.error.energy for trial in trials])
     blocks = energies.shape[1]
-    weights = blocks * np.random.default_rng(0).dirichlet(np.ones(blocks), DRAWS)
+    weights = blocks * np.random.default_rng(0).dirichlet(np.ones(blocks), MONTE_CARLO_DRAWS)
     totals = energies @ weights.T
     sizes = np.array([len(trial.names) for trial in trials])
     shares = dict.fromkeys((name for trial in trials for name in trial.names), 0.0)
@@ -44,5 +44,5 @@ def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
         as_good = [int(k) for k in np.flatnonzero(total - total[best] <= standard_errors)]
         chosen = min(as_good, key=lambda k: (sizes[k], total[k]))
         for name in trials[chosen].names:
-            shares[name] += 1 / DRAWS
+            shares[name] += 1 / MONTE_CARLO_DRAWS
     return shares

@@ -1,6 +1,7 @@
 """What a search may try next. Each move says what it is, and descends when it is applied.
 
-What moves lead to is one of `Search.found`; which of them are proposed depends on what was found before.
+What moves lead to is one of `Search.explanations`; which of them are proposed depends on what was found
+before.
 """
 
 from __future__ import annotations
@@ -12,16 +13,16 @@ from typing import Any
 import numpy as np
 from scipy.signal import find_peaks
 
-from diagnosis.evidence.explanation import Weighed, best_of_sets
-from diagnosis.fit.descent import Descent, best_following, descend, refined, scanned
+from diagnosis.evidence.explanation import WeighedFit, best_of_sets
+from diagnosis.fit.descent import Fit, best_after_following, descend, refine_sizes, scan_far_values
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL, WORTH_IT
 from diagnosis.fit.nominal import EDGE
 from diagnosis.fit.records import FittedStart, Records
 from diagnosis.fit.starts import StartPoint, beside, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.search.loop import MANY, NEAREST, SEVERAL, Move, SearchLoop
-from diagnosis.search.settled import settled
+from diagnosis.search.loop import FOLLOWED_COSTLY, FOLLOWED_EFFECTS, FOLLOWED_SETS, Move, SearchLoop
+from diagnosis.search.settled import fit_record_starts
 from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, Effect
 from plant.effects.search_space import Candidate
@@ -50,11 +51,11 @@ class Alone(Move):
         return [cls(candidate) for candidate in spaces if candidate.kind.contains is None]
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        points = points_of(search.records, search.base.end, self.candidate)
+        points = points_of(search.records, search.nominal_alone.fit, self.candidate)
         if points:
-            candidate, points = search.looked_for(self.candidate, points)
+            candidate, points = search.candidate_alone(self.candidate, points)
         if points:
-            search.points.append((candidate, points))
+            search.start_points.append((candidate, points))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,25 +72,25 @@ class FromPoints(Move):
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[FromPoints]:
         """Of many those whose starts leave least; the others are still tried beside these."""
-        return [cls(*one) for one in sorted(search.points, key=lambda one: one[1][0].loss)[:_DESCENDED]]
+        return [cls(*one) for one in sorted(search.start_points, key=lambda one: one[1][0].loss)[:_DESCENDED]]
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        around = search.base.end
+        around = search.nominal_alone.fit
         end = descended(search, around, self.candidate, self.points, around.jacobian)
-        search.rough.append((end, self.points))
+        search.unfinished.append((end, self.points))
 
 
 def descended(
     search: SearchLoop[Any],
-    around: Descent,
+    around: Fit,
     candidate: Candidate,
     points: Sequence[StartPoint],
     nominal: Real,
-) -> Descent:
+) -> Fit:
     """The best end of a candidate beside a fit, from its best points that are apart."""
-    chosen, most = [points[0]], SEVERAL if _turned(search, candidate) else NEAREST
+    chosen, most = [points[0]], FOLLOWED_SETS if _turned(search, candidate) else FOLLOWED_COSTLY
     for point in points[1:]:
-        if len(chosen) == most or point.loss > search.base.end.loss + WORTH_IT:
+        if len(chosen) == most or point.loss > search.nominal_alone.fit.loss + WORTH_IT:
             break
         if all(point.far_from(other) for other in chosen):
             chosen.append(point)
@@ -105,11 +106,11 @@ def _turned(search: SearchLoop[Any], candidate: Candidate) -> bool:
 
 def _from(
     search: SearchLoop[Any],
-    around: Descent,
+    around: Fit,
     candidate: Candidate,
     point: StartPoint,
     nominal: Real,
-) -> Descent:
+) -> Fit:
     return descend(
         search.records,
         (*around.candidates, candidate),
@@ -117,7 +118,7 @@ def _from(
         np.concatenate([around.coordinates, point.coordinates]),
         point.start,
         nominal_jacobian=nominal,
-        columns=around.columns,
+        columns=around.start_columns,
         iterations=_ITERATIONS,
     )
 
@@ -127,7 +128,7 @@ class Enlarge(Move):
     """An effect that contains a simpler one (Stribeck friction Coulomb's), from where a set of that ended."""
 
     candidate: Candidate
-    inner: Descent
+    inner: Fit
     starts: Sequence[Real]
 
     @property
@@ -135,12 +136,12 @@ class Enlarge(Move):
         return self.candidate.effect
 
     @classmethod
-    def proposed(cls, search: SearchLoop[Any], sets: Sequence[Weighed]) -> Iterator[Enlarge]:
+    def proposed(cls, search: SearchLoop[Any], sets: Sequence[WeighedFit]) -> Iterator[Enlarge]:
         """With several further values the first time, then with those that this found."""
         pool = list(best_of_sets(sets).values())
         for candidate in search.case.machine.candidates(search.case.experiments):
-            for inner in [e.end for e in pool if candidate.kind.contains in e.names]:
-                known = [points[0] for c, points in search.points if c.effect == candidate.effect]
+            for inner in [e.fit for e in pool if candidate.kind.contains in e.names]:
+                known = [points[0] for c, points in search.start_points if c.effect == candidate.effect]
                 starts = [point.coordinates[1:] for point in known]
                 starts = starts or [np.array(x) for x in sorted({x[1:] for x in candidate.starts})[::2]]
                 yield cls(candidate, inner, starts)
@@ -157,14 +158,14 @@ class Enlarge(Move):
                 np.concatenate([inner.coordinates[:first], further, inner.coordinates[first:]]),
                 inner.start,
                 nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
-                columns=inner.columns,
+                columns=inner.start_columns,
                 iterations=_ITERATIONS,
             )
             for further in self.starts
         ]
         best = min(ends, key=lambda end: end.loss)
         if len(best.names) == 1:
-            search.points.append((candidate, [point_of(best)]))
+            search.start_points.append((candidate, [point_of(best)]))
         search.add(best)
 
 
@@ -172,7 +173,7 @@ class Enlarge(Move):
 class BesideSet(Move):
     """The most promising effects beside a set."""
 
-    parent: Descent
+    parent: Fit
     most: int
 
     @property
@@ -185,16 +186,16 @@ class BesideSet(Move):
         interests is left, for what is left says little about which member of the true set has been found;
         then those as likely as the likeliest of all sets: a small effect beside one of two that look alike
         decides between them. What interests is unknown where nobody has stated it."""
-        pool = list(best_of_sets(search.found).values())
+        pool = list(best_of_sets(search.explanations).values())
         parents = [e for e in pool if len(e.names) == count - 1][: 3 if count == 2 else 1]
         if search.case.machine.weighing.stated and not search.unexplained:
-            parents = [e for e in parents if e.evidence > pool[0].evidence - DECISIVE]
-        return [cls(parent.end, MANY if count == 2 else SEVERAL) for parent in parents]
+            parents = [e for e in parents if e.log_evidence > pool[0].log_evidence - DECISIVE]
+        return [cls(parent.fit, FOLLOWED_EFFECTS if count == 2 else FOLLOWED_SETS) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:
         parent = self.parent
         trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
-        most_pulled = NEAREST * self.most if len(search.points) > _DESCENDED else len(trials)
+        most_pulled = FOLLOWED_COSTLY * self.most if len(search.start_points) > _DESCENDED else len(trials)
         chosen: dict[tuple[str, float], tuple[Candidate, StartPoint]] = {}
         for candidate, point in trials:
             pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > EDGE)
@@ -212,13 +213,13 @@ class BesideSet(Move):
             if not -DECISIVE < parent.loss - point.loss < SUBSTANTIAL
         ]
         for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
-            search.add(search.polished(end, k, parent))
+            search.add(search.polish(end, k, parent))
 
     def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, StartPoint]]:
         """The best point of every candidate beside the parent."""
         held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
-        listed = [(c, p) for c, p in search.points if not {c.effect, c.kind.contains} & held]
-        if len(search.points) > _DESCENDED:
+        listed = [(c, p) for c, p in search.start_points if not {c.effect, c.kind.contains} & held]
+        if len(search.start_points) > _DESCENDED:
 
             def left(one: tuple[Candidate, list[StartPoint]]) -> float:
                 return min((p.loss for p in superposed(search.records, self.parent, one[1])), default=-np.inf)
@@ -227,9 +228,9 @@ class BesideSet(Move):
         for candidate, points in listed:
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
             anew = candidate.kind.harmonic is not None or _turned(search, candidate)
-            candidate, near = search.looked_at_beside(self.parent, candidate, points[:1] if anew else points)
+            candidate, near = search.candidate_beside(self.parent, candidate, points[:1] if anew else points)
             if anew:
-                further = points_of(search.records, self.parent, candidate, every=2)[:SEVERAL]
+                further = points_of(search.records, self.parent, candidate, every=2)[:FOLLOWED_SETS]
                 if candidate.kind.harmonic is not None:
                     # Their losses are a linear arm's; where it is not, they may leave less than it would.
                     further += beside(search.records, self.parent, candidate, further)
@@ -241,7 +242,7 @@ class BesideSet(Move):
 class InPlaceOf(Move):
     """An effect that multiplies a nominal value, in place of that value pulled beyond belief."""
 
-    parent: Descent
+    parent: Fit
     candidate: Candidate
     coordinates: Real
     deviations: Real
@@ -251,8 +252,8 @@ class InPlaceOf(Move):
         return self.candidate.effect
 
     @classmethod
-    def proposed(cls, search: SearchLoop[Any], parent: Descent) -> Iterator[InPlaceOf]:
-        nominal, listed = search.records.nominal, [candidate for candidate, _ in search.points]
+    def proposed(cls, search: SearchLoop[Any], parent: Fit) -> Iterator[InPlaceOf]:
+        nominal, listed = search.records.nominal, [candidate for candidate, _ in search.start_points]
         factors = nominal.factors(parent.deviations)
         for k, key in enumerate(nominal.keys):
             if abs(parent.deviations[k]) < EDGE:
@@ -265,7 +266,7 @@ class InPlaceOf(Move):
         point = StartPoint(self.parent.loss, self.coordinates, self.deviations, self.parent.start)
         nominal = self.parent.jacobian[:, : self.deviations.size]
         end = _from(search, self.parent, self.candidate, point, nominal)
-        search.add(search.polished(end, 0, self.parent))
+        search.add(search.polish(end, 0, self.parent))
 
 
 def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
@@ -289,39 +290,41 @@ class InWindows(Move):
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[InWindows]:
-        acting = [c for c, _ in search.points if c.kind.absolute_angle or c.kind.harmonic == "hub_angle"]
+        acting = [
+            c for c, _ in search.start_points if c.kind.absolute_angle or c.kind.harmonic == "hub_angle"
+        ]
         return [cls(acting)] if acting and isinstance(search.case, Case) else []
 
     def apply(self, search: SearchLoop[Any]) -> None:
         assert isinstance(search.case, Case)
-        base, states = search.base.end, search.records.state_spread.size
-        windows = search.anew(in_windows(search.case))
+        base, states = search.nominal_alone.fit, search.records.state_spread.size
+        windows = search.for_case(in_windows(search.case))
         assert isinstance(windows.records, Records)
-        start, _ = settled(windows.records, base.deviations, (), windows.records.at_rest())
-        windows.add(base.on(windows.records, start))
-        around = windows.base.end
+        start, _ = fit_record_starts(windows.records, base.deviations, (), windows.records.guessed_start())
+        windows.add(base.continued(windows.records, start))
+        around = windows.nominal_alone.fit
         for candidate in self.acting:
             points = points_of(windows.records, around, candidate)
-            if points and not search.late(self.what):
+            if points and not search.skips(self.what):
                 windows.add(descended(windows, around, candidate, points, around.jacobian))
-        windows.points = [(c, points) for c, points in search.points if c.kind.harmonic != "time"]
-        best = min((e.end for e in windows.found), key=lambda end: end.loss)
+        windows.start_points = [(c, points) for c, points in search.start_points if c.kind.harmonic != "time"]
+        best = min((e.fit for e in windows.explanations), key=lambda end: end.loss)
         if best.loss > around.loss - DECISIVE:
             return
-        if not search.late(self.what):
-            BesideSet(best, SEVERAL).apply(windows)
+        if not search.skips(self.what):
+            BesideSet(best, FOLLOWED_SETS).apply(windows)
         for count in (1, 2):
-            of_count = [e.end for e in windows.found if len(e.names) == count]
-            for end in sorted(of_count, key=lambda end: end.loss)[:NEAREST]:
+            of_count = [e.fit for e in windows.explanations if len(e.names) == count]
+            for end in sorted(of_count, key=lambda end: end.loss)[:FOLLOWED_COSTLY]:
                 start = FittedStart(end.start.states[:, :states], end.start.zeros)
-                search.add(refined(search.records, end.on(search.records, start)))
+                search.add(refine_sizes(search.records, end.continued(search.records, start)))
 
 
 @dataclass(frozen=True, eq=False)
 class Scan(Move):
     """A set with contacts once more from far values of all its parameters."""
 
-    end: Descent
+    end: Fit
 
     @property
     def what(self) -> str:
@@ -331,27 +334,27 @@ class Scan(Move):
     def proposed(cls, search: SearchLoop[Any]) -> Iterator[Scan]:
         """The likeliest that is left, or has gained since its last."""
         done: dict[tuple[str, ...], float] = {}
-        for _ in range(NEAREST):
+        for _ in range(FOLLOWED_COSTLY):
             likeliest = (
                 e
-                for key, e in best_of_sets(search.found).items()
-                if e.end.non_smooth and e.end.loss < done.get(key, np.inf) - SUBSTANTIAL
+                for key, e in best_of_sets(search.explanations).items()
+                if e.fit.non_smooth and e.fit.loss < done.get(key, np.inf) - SUBSTANTIAL
             )
             this = next(likeliest, None)
             if this is None:
                 return
-            done[this.key] = this.end.loss
-            yield cls(this.end)
+            done[this.sorted_names] = this.fit.loss
+            yield cls(this.fit)
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        search.add(refined(search.records, scanned(search.records, self.end)))
+        search.add(refine_sizes(search.records, scan_far_values(search.records, self.end)))
 
 
 @dataclass(frozen=True, eq=False)
 class FromContacts(Move):
     """A set with contacts once more from starts of the records that feel them."""
 
-    end: Descent
+    end: Fit
 
     @property
     def what(self) -> str:
@@ -362,18 +365,20 @@ class FromContacts(Move):
         """The likeliest sets of each size."""
         if not search.case.machine.unknown_start.tried.size:
             return
-        search.touching = True
-        sets = [e for e in best_of_sets(search.found).values() if e.end.non_smooth]
+        search.starts_feel_contacts = True
+        sets = [e for e in best_of_sets(search.explanations).values() if e.fit.non_smooth]
         for count in range(1, search.case.machine.weighing.most_effects + 1):
-            for e in [e for e in sets if len(e.names) == count][:NEAREST]:
-                yield cls(e.end)
+            for e in [e for e in sets if len(e.names) == count][:FOLLOWED_COSTLY]:
+                yield cls(e.fit)
 
     def apply(self, search: SearchLoop[Any]) -> None:
         end = self.end
         assert isinstance(search.records, Records)
-        start, _ = settled(search.records, end.deviations, end.effects, end.start, touching=True)
+        start, _ = fit_record_starts(search.records, end.deviations, end.effects, end.start, touching=True)
         nominal = end.jacobian[:, : end.deviations.size]
-        again = end.on(search.records, start, nominal_jacobian=nominal, touching=True, iterations=_ITERATIONS)
+        again = end.continued(
+            search.records, start, nominal_jacobian=nominal, touching=True, iterations=_ITERATIONS
+        )
         search.add(min(end, again, key=lambda one: one.loss))
 
 
@@ -381,7 +386,7 @@ class FromContacts(Move):
 class LookAlike(Move):
     """A cause beyond the list in place of the effect that it looks like."""
 
-    end: Descent
+    end: Fit
     kind: type[Effect]
 
     @property
@@ -394,12 +399,12 @@ class LookAlike(Move):
         well."""
         if not isinstance(search.case, Case):
             return
-        best = best_of_sets(search.found)
-        likeliest = list(best.values())[:MANY]
+        best = best_of_sets(search.explanations)
+        likeliest = list(best.values())[:FOLLOWED_EFFECTS]
         for kind in LOOK_ALIKES.values():
-            sets = [e for e in likeliest if kind.look_alike_of in e.names][:SEVERAL]
+            sets = [e for e in likeliest if kind.look_alike_of in e.names][:FOLLOWED_SETS]
             alone = [e for e in best.values() if e.names == (kind.look_alike_of,) and e not in sets]
-            yield from (cls(e.end, kind) for e in (*sets, *alone))
+            yield from (cls(e.fit, kind) for e in (*sets, *alone))
 
     def apply(self, search: SearchLoop[Any]) -> None:
         end, k = self.end, self.end.names.index(str(self.kind.look_alike_of))
@@ -409,7 +414,7 @@ class LookAlike(Move):
         first = sum(len(c.axes) for c in end.candidates[:k])
         rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
         trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
-        _, d, x = best_following(search.records, end, candidates, trials)
+        _, d, x = best_after_following(search.records, end, candidates, trials)
         search.add(descend(search.records, candidates, d, x, end.start))
 
 

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from diagnosis.fit.coordinates import quotients, solved
+from diagnosis.fit.coordinates import difference_quotients, solve_or_least_squares
 from diagnosis.fit.levels import Levels
-from diagnosis.fit.records import FittedStart, Records, later
+from diagnosis.fit.records import FittedStart, Records, run_start
 from diagnosis.machine.machine_protocol import Real
 
 _ITERATIONS, _STILL = 30, 1e-7
@@ -29,7 +29,7 @@ _PARTS = (1.0, 0.3, 0.1, 0.03)
 _BEGINNINGS, _FEWEST, _STEP, _CALLS, _LITTLE = (16, 4), 20, 0.02, 15, 1e-3
 
 
-def settled(
+def fit_record_starts(
     records: Records, d: Real, effects: Sequence[Any], start: FittedStart, *, touching: bool = False
 ) -> tuple[FittedStart, Real]:
     """The start from which the records fit best, and their coefficients (N,) there.
@@ -40,8 +40,8 @@ def settled(
     if not start.states.size:
         return start, records.coefficients(d, effects, start)
     columns, unknown = records.start_columns(d, effects, start).states, records.case.machine.unknown_start
-    rest = records.at_rest().with_zeros(start.zeros, unknown.state_per_zero)
-    left = records.of_each(d, effects, start.zeros)
+    rest = records.guessed_start().with_zeros(start.zeros, unknown.state_per_zero)
+    left = records.coefficients_of_record(d, effects, start.zeros)
     found = []
     for r, state in enumerate(start.states):
         best = _RecordStart(records, r, left, state)
@@ -71,12 +71,12 @@ def _begun(records: Records, r: int, d: Real, effects: Sequence[Any], start: Fit
 
         def left(z: Real, T: int = T) -> Real:
             e = (
-                record.output[:T] - simulate(record.input[:T], z * spread, start.zeros, **later(record))
+                record.output[:T] - simulate(record.input[:T], z * spread, start.zeros, **run_start(record))
             ) / scale
             return np.append(np.clip(e, -1 / _LITTLE, 1 / _LITTLE), _LITTLE * z)
 
         def slopes(z: Real, left: Callable[[Real], Real] = left) -> Real:
-            return quotients(left, z, left(z), np.full(z.size, _STEP))
+            return difference_quotients(left, z, left(z), np.full(z.size, _STEP))
 
         z = least_squares(left, z, slopes, max_nfev=_CALLS).x
     return np.asarray(z * spread)
@@ -86,7 +86,7 @@ class _RecordStart:
     """The best so far of the states (S,) at the start of the r-th record, e (T Y,) its coefficients there."""
 
     def __init__(self, records: Records, r: int, left: Callable[[int, Real], Real], state: Real) -> None:
-        self.records, self.levels = records, records.levels.within(records.parts[r])
+        self.records, self.levels = records, records.levels.of_record(records.record_slices[r])
         self.left = partial(left, r)
         self.state, self.e = state, self.left(state)
         self.loss = self._loss(state, self.e)
@@ -108,14 +108,19 @@ class _RecordStart:
         records, parts = self.records, _PARTS if columns is None else (1.0,)
         for _ in range(_STEPS):
             own = (
-                quotients(self.left, self.state, self.e, records.state_steps) if columns is None else columns
+                difference_quotients(self.left, self.state, self.e, records.state_steps)
+                if columns is None
+                else columns
             )
-            before, move = self.loss, best_move(self.levels, records.state_spread, own, self.e, self.state)
+            before, move = (
+                self.loss,
+                best_state_step(self.levels, records.state_spread, own, self.e, self.state),
+            )
             if not any(self.better(self.state + part * move) for part in parts) or self.loss > before - _GAIN:
                 return
 
 
-def best_move(levels: Levels, spread: Real, columns: Real, e: Real, state: Real) -> Real:
+def best_state_step(levels: Levels, spread: Real, columns: Real, e: Real, state: Real) -> Real:
     """(S,) from the state at the start of a record to the one that leaves least of its coefficients e (T Y,),
     these being linear in it; columns (T Y, S), levels: of this record.
 
@@ -133,14 +138,17 @@ def best_move(levels: Levels, spread: Real, columns: Real, e: Real, state: Real)
         return levels.loss_of(left(move)) + 0.5 * float(np.sum(((state + move) / spread) ** 2))
 
     found: list[Real] = []
-    for weights in (levels.counted / (left(np.zeros(state.size)) + levels.floor), 1 / levels.floor):
+    for weights in (
+        levels.independent_counts / (left(np.zeros(state.size)) + levels.floor),
+        1 / levels.floor,
+    ):
         move = np.zeros(state.size)
         for _ in range(_ITERATIONS):
             weighted, before = np.tensordot(weights, energies, 1), move
             H, g = weighted[:-1, :-1] + np.diag(1 / spread**2), weighted[:-1, -1] + state / spread**2
-            move = -solved(H, g)
+            move = -solve_or_least_squares(H, g)
             if np.all(np.abs(move - before) < _STILL * spread):
                 break
-            weights = levels.counted / (left(move) + levels.floor)
+            weights = levels.independent_counts / (left(move) + levels.floor)
         found.append(move)
     return min(found, key=loss)

@@ -13,7 +13,7 @@ from diagnosis.evidence.hypotheses import (
     UNLISTED,
     Hypothesis,
 )
-from diagnosis.fit.descent import FINE, Descent, descend, refined
+from diagnosis.fit.descent import FINE, Fit, descend, refine_sizes
 from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.fit.likelihood import DECISIVE, WORTH_IT
 from diagnosis.fit.records import FittedStart
@@ -21,7 +21,7 @@ from diagnosis.fit.residual import ResidualModel
 from diagnosis.fit.solver_spread import NO_DRIFT, solver_spread, without_drift
 from diagnosis.fit.starts import StartPoint, beside, superposed
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
-from diagnosis.search.loop import NEAREST, SEVERAL, Progress, SearchLoop
+from diagnosis.search.loop import FOLLOWED_COSTLY, FOLLOWED_SETS, Progress, SearchLoop
 from diagnosis.search.moves import Alone, BesideSet, Enlarge, FromPoints, InPlaceOf, LookAlike
 from plant.effects.search_space import Candidate
 
@@ -34,9 +34,9 @@ _HOPELESS = 0.1
 _NEAR = 0.25
 
 
-def fitted_to(
+def descend_to_end(
     model: ResidualModel, candidates: Sequence[Candidate], coordinates: Real, deviations: Real
-) -> Descent:
+) -> Fit:
     """Descended to its end."""
     return descend(
         model,
@@ -56,101 +56,107 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def __init__(self, case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf) -> None:
         super().__init__(case, progress, deadline_s)
         self.records = ResidualModel(case)
-        self.watched = (self.records,)
+        self.timed_records = (self.records,)
 
     def run(self) -> None:
         """The nominal, every effect alone, and sets of effects as long as they gain."""
-        self.add(fitted_to(self.records, (), np.zeros(0), np.zeros(self.records.nominal.count)))
-        self.tried(Alone.proposed(self), 0.05, 0.1)
-        self.tried(FromPoints.proposed(self), 0.15, 0.3)
-        self.finish()
-        self.tried(Enlarge.proposed(self, self.found), 0.5)
-        self.tried(InPlaceOf.proposed(self, self.base.end), 0.55)
+        self.add(descend_to_end(self.records, (), np.zeros(0), np.zeros(self.records.nominal.count)))
+        self.apply_moves(Alone.proposed(self), 0.05, 0.1)
+        self.apply_moves(FromPoints.proposed(self), 0.15, 0.3)
+        self.finish_single_effects()
+        self.apply_moves(Enlarge.proposed(self, self.explanations), 0.5)
+        self.apply_moves(InPlaceOf.proposed(self, self.nominal_alone.fit), 0.55)
         for count in range(2, self.case.machine.weighing.most_effects + 1):
             moves = BesideSet.proposed(self, count)
             if not moves or (count > 2 and self._hopeless(moves[0].parent)):
                 break
             pulled = [m for move in moves for m in InPlaceOf.proposed(self, move.parent)]
-            self.tried([*moves, *pulled], 0.4 + 0.1 * count, 0.1)
-            for one in sorted(self.found, key=lambda h: -h.log_weight)[:NEAREST]:
-                if self._near(one.end) and len(one.names) > 1:
-                    self.simpler(one)
+            self.apply_moves([*moves, *pulled], 0.4 + 0.1 * count, 0.1)
+            for one in sorted(self.explanations, key=lambda h: -h.log_weight)[:FOLLOWED_COSTLY]:
+                if self._near(one.fit) and len(one.names) > 1:
+                    self.add_simpler(one)
                     for k in range(len(one.names)):
-                        self.without(one, k)
-        self.tried(LookAlike.proposed(self), 0.95)
+                        self.without_effect(one, k)
+        self.apply_moves(LookAlike.proposed(self), 0.95)
 
     @property
     def unexplained(self) -> bool:
         """Whether the best set leaves something over, by its own evidence against that of an unknown rest."""
-        return max(h.log_weight for h in self.found) < max(h.unknown_weight for h in self.found)
+        return max(h.log_weight for h in self.explanations) < max(
+            h.log_weight_with_unknown for h in self.explanations
+        )
 
-    def _hopeless(self, parent: Descent) -> bool:
+    def _hopeless(self, parent: Fit) -> bool:
         """Whether a third effect would follow something unknown, or what correct solvers of backlash differ
         by."""
-        if _beyond_noise(parent) > _HOPELESS * _beyond_noise(self.base.end):
+        if _beyond_noise(parent) > _HOPELESS * _beyond_noise(self.nominal_alone.fit):
             return True
         if not parent.non_smooth:
             return False
-        e, drift = without_drift(parent.left, solver_spread(self.records, parent))
+        e, drift = without_drift(parent.residual_coefficients, solver_spread(self.records, parent))
         return float(np.mean(e**2)) - 1.0 < max(DISAGREEMENT["non-smooth"], drift.size) ** 2
 
-    def looked_for(
+    def candidate_alone(
         self, candidate: Candidate, points: list[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
         """From the size on at which it changes a record."""
         smallest = smallest_size(candidate, points, _SMALLEST)
         return (candidate, []) if smallest is None else (candidate.from_size(smallest), points)
 
-    def looked_at_beside(
-        self, parent: Descent, candidate: Candidate, points: Sequence[StartPoint]
+    def candidate_beside(
+        self, parent: Fit, candidate: Candidate, points: Sequence[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
         smallest = smallest_size(candidate, points, _SMALLEST_BESIDE)
         if smallest is not None:
             candidate = candidate.from_size(smallest)
-        near = superposed(self.records, parent, points)[:SEVERAL]
+        near = superposed(self.records, parent, points)[:FOLLOWED_SETS]
         return candidate, beside(self.records, parent, candidate, near or points[:1])
 
-    def polished(self, end: Descent, rank: int, around: Descent) -> Descent:
+    def polish(self, end: Fit, rank: int, around: Fit) -> Fit:
         """Finished where it may matter: among faint effects alone a few units of loss decide, and stated
         values that a gap has pulled far off need more than rough steps to come back."""
-        best = min(h.end.loss for h in self.found)
+        best = min(h.fit.loss for h in self.explanations)
         faint = all(c.dependence == "smooth" for c in end.candidates) and not around.candidates
         close = end.loss < best + DECISIVE and (faint or end.loss < around.loss - WORTH_IT)
         # A backlash that only looks like something else takes as long as everything besides.
         if not (close or rank == 0) or (rank > 0 and end.non_smooth and not self._near(end)):
             return end
-        fine = fitted_to(self.records, end.candidates, end.coordinates, end.deviations)
+        fine = descend_to_end(self.records, end.candidates, end.coordinates, end.deviations)
         best_end = min(fine, end, key=lambda one: one.loss)
-        return refined(self.records, best_end) if self._near(best_end) else best_end
+        return refine_sizes(self.records, best_end) if self._near(best_end) else best_end
 
-    def _near(self, end: Descent) -> bool:
+    def _near(self, end: Fit) -> bool:
         """Whether backlash or the like may be the answer; beside much of a gap jumps do not matter."""
-        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.found[0].end), _NEAR)
+        return _beyond_noise(end) < max(_NEAR * _beyond_noise(self.explanations[0].fit), _NEAR)
 
-    def explained(self, end: Descent) -> Hypothesis:
+    def explain(self, end: Fit) -> Hypothesis:
         """With its log weights; a cause beyond the list is no answer but part of what is unknown."""
-        model, e, drift = self.records, end.left, NO_DRIFT
-        if not self.found or self._near(end):
+        model, e, drift = self.records, end.residual_coefficients, NO_DRIFT
+        if not self.explanations or self._near(end):
             e, drift = without_drift(e, solver_spread(model, end))
         segments = [len(experiment.output) for experiment in self.case.estimation]
         left, listed = discrepancy(e, segments, self.case.noise.size), self.case.machine.weighing.listed
         found = Hypothesis.of(end, left, drift, listed)
         if {*end.names} <= {*listed}:
             return found
-        return replace(found, log_weight=-np.inf, unknown_weight=found.log_weight + float(np.log(UNLISTED)))
+        return replace(
+            found, log_weight=-np.inf, log_weight_with_unknown=found.log_weight + float(np.log(UNLISTED))
+        )
 
-    def whitened(
+    def whitened_residuals(
         self, found: Hypothesis, experiments: Sequence[RecordOfMachine] | None = None
     ) -> dict[str, Real]:
-        return self.records.by_experiment(found.end.deviations, found.end.effects, experiments)
+        return self.records.by_experiment(found.fit.deviations, found.fit.effects, experiments)
 
-    def predicted(self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart) -> Real:
+    def prediction_residuals(
+        self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart
+    ) -> Real:
         """See `SearchLoop.predicted`; starts are known here."""
         record = self.case.estimation[log]
         return self.records.by_experiment(deviations, effects, (record,))[record.name]
 
 
-def _beyond_noise(end: Descent) -> float:
+def _beyond_noise(end: Fit) -> float:
     return max(end.rms**2 - 1.0, 0.0)
 
 

@@ -5,7 +5,7 @@ import tomllib
 import numpy as np
 
 from diagnosis import Case, Experiment
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.descent import Fit
 from diagnosis.fit.nominal import prior_cost
 from diagnosis.fit.records import FittedStart, StartColumns
 from plant import Rig, prbs
@@ -49,4 +49,4 @@ def end_of_fit(candidates, coordinates, left, jacobian, deviations=()):
     start, weights = FittedStart(np.zeros((1, 0)), np.zeros(0)), np.ones(left.size)
     columns = StartColumns(np.zeros((left.size, 0)), (), np.zeros((0, 0)))
     x = np.concatenate([np.zeros(0), *coordinates])
-    return Descent(tuple(candidates), d, x, start, left, weights, jacobian, columns, loss, prior, True)
+    return Fit(tuple(candidates), d, x, start, left, weights, jacobian, columns, loss, prior, True)

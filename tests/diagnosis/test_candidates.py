@@ -87,8 +87,8 @@ def test_a_period_that_no_record_completes_is_rather_something_unknown(listed):
     # A swing of 0.5 rad is a quarter of a period there.
     assert least == pytest.approx(np.pi)
     inside, at_edge = _ripple(listed, 3 * least), _ripple(listed, least)
-    assert inside.log_weight > inside.unknown_weight
-    assert at_edge.log_weight < at_edge.unknown_weight
+    assert inside.log_weight > inside.log_weight_with_unknown
+    assert at_edge.log_weight < at_edge.log_weight_with_unknown
 
 
 def test_what_comes_once_per_revolution_is_a_weight_and_no_ripple():

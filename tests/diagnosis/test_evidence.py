@@ -97,4 +97,4 @@ def _fit_with(residuals, effect):
 
 
 def _weighed(fit):
-    return Hypothesis.of(fit, discrepancy(fit.left, [1000, 1500]))
+    return Hypothesis.of(fit, discrepancy(fit.residual_coefficients, [1000, 1500]))

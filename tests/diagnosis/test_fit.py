@@ -5,11 +5,11 @@ import pytest
 
 from diagnosis import Experiment, ResidualModel
 from diagnosis.fit import starts as starts_module
-from diagnosis.fit.coordinates import widened_by
+from diagnosis.fit.coordinates import widening_tolerance
 from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import White
 from diagnosis.fit.starts import points_of
-from diagnosis.search.white import fitted_to
+from diagnosis.search.white import descend_to_end
 from tests.diagnosis.recorded import simulated_case
 from validation.blind.rigs import draw_rig, draw_tolerances, stated
 
@@ -36,12 +36,12 @@ def compliant(tmp_path_factory):
 def ends(compliant):
     """Where the best starts of the screening end, as in a search."""
     model = ResidualModel(compliant)
-    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
+    base = descend_to_end(model, (), np.zeros(0), np.zeros(model.nominal.count))
     (space,) = [
         c for c in compliant.machine.candidates(compliant.experiments) if c.effect == "joint_compliance"
     ]
     starts = points_of(model, base, space)[:12]
-    return [fitted_to(model, (space,), s.coordinates, s.deviations) for s in starts]
+    return [descend_to_end(model, (space,), s.coordinates, s.deviations) for s in starts]
 
 
 @pytest.mark.slow
@@ -57,7 +57,7 @@ def test_most_starts_end_in_one_minimum_although_it_lies_in_a_flat_valley(ends):
 @pytest.mark.slow
 def test_the_minimum_leaves_white_noise(ends):
     best = min(ends, key=lambda end: end.cost)
-    n = best.left.size
+    n = best.residual_coefficients.size
     assert best.converged
     # White noise leaves n +- sqrt(2 n), three of them; ten fitted values take ten.
     assert abs(best.cost - (n - 10)) < 3 * np.sqrt(2 * n) + 10
@@ -72,7 +72,7 @@ def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch,
     records = [(role, [sine, friction], 8, 0.25) for role in ("estimation", "held_out")]
     case = simulated_case(tmp_path, draw_rig(rng), records, rng)
     model = ResidualModel(case)
-    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
+    base = descend_to_end(model, (), np.zeros(0), np.zeros(model.nominal.count))
     (space,) = [c for c in case.machine.candidates(case.experiments) if c.effect == sine["name"]]
     everywhere = points_of(model, base, space)
     for name, few in (("MOST_LINES", 10), ("BEST_LINES", 40), ("SLOW_LINES", 10)):
@@ -96,8 +96,8 @@ def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed)
     listed = {c.effect: c for c in case.machine.candidates(case.experiments)}
     sets = [listed["backlash"], listed["periodic_disturbance"]]
     start = np.array([np.log(0.0295), np.log(0.036), 0.56, 4.6])
-    end = fitted_to(ResidualModel(case), sets, start, np.zeros(0))
-    assert end.cost < end.left.size + 4 * np.sqrt(2 * end.left.size)
+    end = descend_to_end(ResidualModel(case), sets, start, np.zeros(0))
+    assert end.cost < end.residual_coefficients.size + 4 * np.sqrt(2 * end.residual_coefficients.size)
     assert end.candidates[1].parameters(end.coordinates_of(1))["amplitude_Nm"] == pytest.approx(
         0.03, rel=0.01
     )
@@ -123,14 +123,14 @@ def test_a_descent_may_stand_before_either_likelihood(likelihood):
     `unseen` its inverse."""
     rng = np.random.default_rng(1)
     residuals = [rng.standard_normal((60, 2)) for _ in range(2)]
-    e = np.concatenate([likelihood.seen(r) for r in residuals])
+    e = np.concatenate([likelihood.to_coefficients(r) for r in residuals])
     way = rng.standard_normal(e.size)
     slope = (likelihood.loss(e + 1e-5 * way) - likelihood.loss(e - 1e-5 * way)) / 2e-5
     assert slope == pytest.approx(likelihood.weights(e) * e @ way, rel=1e-6)
-    np.testing.assert_allclose(likelihood.unseen(e[:120], 2), residuals[0], atol=1e-12)
+    np.testing.assert_allclose(likelihood.to_residuals(e[:120], 2), residuals[0], atol=1e-12)
     change = rng.standard_normal((60, 2))
-    moved = likelihood.seen(residuals[0] + change) - likelihood.seen(residuals[0])
-    np.testing.assert_allclose(likelihood.changed(change).ravel(), moved, atol=1e-12)
+    moved = likelihood.to_coefficients(residuals[0] + change) - likelihood.to_coefficients(residuals[0])
+    np.testing.assert_allclose(likelihood.linearised(change).ravel(), moved, atol=1e-12)
 
 
 @pytest.mark.parametrize(("known", "blamed"), [(0.1, None), (10.0, 0)])
@@ -141,6 +141,6 @@ def test_an_interval_that_tolerances_make_wide_says_by_which(known, blamed):
     inverse = np.linalg.inv(rows.T @ rows + np.diag([1.0, 1.0, 0.0]))
     exact = 1 / (rows.T @ rows)[2, 2]
     assert (exact < 0.25 * inverse[2, 2]) == (blamed is not None)
-    assert widened_by(inverse, 2, 2, inverse[2, 2]) == blamed
-    assert widened_by(inverse, 2, 2, 100 * inverse[2, 2]) is None  # other doubts are larger
-    assert widened_by(inverse[2:, 2:], 0, 0, inverse[2, 2]) is None
+    assert widening_tolerance(inverse, 2, 2, inverse[2, 2]) == blamed
+    assert widening_tolerance(inverse, 2, 2, 100 * inverse[2, 2]) is None  # other doubts are larger
+    assert widening_tolerance(inverse[2:, 2:], 0, 0, inverse[2, 2]) is None

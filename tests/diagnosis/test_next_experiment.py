@@ -14,7 +14,7 @@ from diagnosis.next_experiment import discrimination
 from diagnosis.next_experiment.experiment_choices import Limits, excitations
 from diagnosis.next_experiment.next_experiment import next_experiment
 from diagnosis.next_experiment.repeat import best_repeat
-from diagnosis.search.white import fitted_to
+from diagnosis.search.white import descend_to_end
 from plant import prbs, simulate
 from plant.effects.actuator import ActuatorLag, ActuatorSaturation, InputDelay
 from plant.effects.joint import CoulombFriction, ViscousFriction
@@ -175,7 +175,7 @@ def test_records_sharpen_the_separation():
     for name in ("input_delay", "actuator_lag"):
         candidate = _candidate(name, case)
         start = np.array([candidate.axes[0].coordinate(0.006)])
-        fits.append(fitted_to(ResidualModel(case), (candidate,), start, np.zeros(0)))
+        fits.append(descend_to_end(ResidualModel(case), (candidate,), start, np.zeros(0)))
     known = [discrimination.competing_hypothesis(case, f, 0.5) for f in fits]
     vague = [replace(one, precision=np.eye(1)) for one in known]
     voltage = prbs(9, 4, Limits.of_records(case).voltage_V / 2, 700)
@@ -190,7 +190,7 @@ def test_sets_that_name_the_same_cause_do_not_compete():
     for names, p in sets.items():
         candidates = [_candidate(name) for name in names]
         start = np.array([c.axes[0].coordinate(0.004) for c in candidates])
-        end = fitted_to(ResidualModel(CASE), candidates, start, np.zeros(0))
+        end = descend_to_end(ResidualModel(CASE), candidates, start, np.zeros(0))
         found.append(Hypothesis(end, np.log(p), -np.inf))
     competing = discrimination.competing_hypotheses(CASE, found, sets)
     assert competing[0].name == "input_delay"

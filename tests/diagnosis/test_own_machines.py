@@ -265,21 +265,21 @@ def test_an_effect_is_exchanged_for_its_twin():
             if chosen
             else nothing[:0]
         )
-        return search.add(descend(search.records, chosen, nothing, x, search.records.at_rest()))
+        return search.add(descend(search.records, chosen, nothing, x, search.records.guessed_start()))
 
     fitted()
     for name in ("input_offset", "actuator_dead_zone", "output_drift", "actuator_lag"):
         fitted(name)
     pair = fitted("input_offset", "output_drift")
-    search.exchanged(pair, ())
-    assert search.found[-1] is pair
-    search.exchanged(pair, {"input_offset"})
+    search.add_exchanged(pair, ())
+    assert search.explanations[-1] is pair
+    search.add_exchanged(pair, {"input_offset"})
     # The lag explains much less alone and is not tried.
-    (twin,) = search.found[search.found.index(pair) + 1 :]
-    assert twin.key == ("actuator_dead_zone", "output_drift")
+    (twin,) = search.explanations[search.explanations.index(pair) + 1 :]
+    assert twin.sorted_names == ("actuator_dead_zone", "output_drift")
     assert abs(twin.log_likelihood - pair.log_likelihood) < 1
-    search.exchanged(pair, {"input_offset"})
-    assert search.found[-1] is twin
+    search.add_exchanged(pair, {"input_offset"})
+    assert search.explanations[-1] is twin
 
 
 @pytest.mark.parametrize(("gained", "sizes"), [(14.0, [2, 3]), (16.0, [2, 3, 4, 5])])
@@ -288,11 +288,13 @@ def test_larger_sets_are_sought_while_the_last_size_was_worth_it(gained, sizes, 
 
     def together(search, count):
         # What a size gains; and everything leaves more than interests.
-        likeliest = max(search.found, key=lambda e: e.evidence)
+        likeliest = max(search.explanations, key=lambda e: e.log_evidence)
         names, gain = tuple(f"effect {k}" for k in range(count)), gained if count > 1 else 0.0
-        end = replace(likeliest.end, candidates=tuple(SimpleNamespace(effect=name) for name in names))
+        end = replace(likeliest.fit, candidates=tuple(SimpleNamespace(effect=name) for name in names))
         log_prior = likeliest.log_prior + gain
-        search.found.append(replace(likeliest, end=end, log_prior=log_prior, shares=np.ones((2, 1))))
+        search.explanations.append(
+            replace(likeliest, fit=end, log_prior=log_prior, residual_shares=np.ones((2, 1)))
+        )
         tried.append(count)
 
     def moved(count):

@@ -8,7 +8,7 @@ from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExper
 from diagnosis.fit.descent import descend
 from diagnosis.fit.records import FittedStart, Records
 from diagnosis.search.search import Search
-from diagnosis.search.settled import settled
+from diagnosis.search.settled import fit_record_starts
 
 DT_S, SAMPLES, NOISE_RAD = 0.02, 500, 1e-3
 
@@ -108,9 +108,9 @@ def test_a_start_is_found_where_friction_holds_the_first_guess():
     )
     case = PlantCase("rubs", plant, records)
     fitted = Records(case, case.experiments)
-    start, left = settled(fitted, np.zeros(0), (), fitted.at_rest())
+    start, left = fit_record_starts(fitted, np.zeros(0), (), fitted.guessed_start())
     np.testing.assert_allclose(start.states, begun, atol=0.01)
-    assert np.all(fitted.shares(fitted.residuals_of(left)) < 0.01)
+    assert np.all(fitted.rms_shares(fitted.residuals_from(left)) < 0.01)
 
 
 def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
@@ -131,8 +131,8 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
     held = FittedStart(np.array([[0.05, 0.0], [-0.6, -4.0]]), np.zeros(0))
     stuck = descend(search.records, (dry,), np.zeros(0), np.log([0.1]), held, iterations=3)
     assert abs(stuck.start.states[0, 0] - 1.1) > 0.5
-    again = search.begun(stuck)
+    again = search.restarted(stuck)
     np.testing.assert_allclose(again.start.states, begun, atol=0.01)
     assert again.loss < 0.1 * stuck.loss
     # Nothing to gain: the same.
-    assert search.begun(again) is again
+    assert search.restarted(again) is again

@@ -15,7 +15,7 @@ from diagnosis.repair.left_out import fitted_without_each_log
 from diagnosis.repair.prediction_error import FEWEST_BLOCKS, PredictionError
 from diagnosis.repair.repair import Repairs, _order_of_return
 from diagnosis.repair.stability import share_of_repairs
-from diagnosis.search.white import WhiteSearch, fitted_to
+from diagnosis.search.white import WhiteSearch, descend_to_end
 
 DT_S = 0.005
 STATED = {"inertia": 0.3, "viscous": 0.5, "gravity": 4.0}
@@ -116,9 +116,9 @@ def test_the_repair_moves_the_values_that_are_wrong_and_few_others():
             role = "held_out" if log == 3 else "estimation"
             experiments.append(PlantExperiment(f"log {log}", role, inputs, measured))
         search = WhiteSearch(PlantCase("eight", plant, tuple(experiments)), lambda done, what: None)
-        search.add(fitted_to(search.records, (), np.zeros(0), np.zeros(8)))
+        search.add(descend_to_end(search.records, (), np.zeros(0), np.zeros(8)))
         search.records.simulations += 1000
-        repair = Repairs(search, search.base).best(())
+        repair = Repairs(search, search.nominal_alone).best(())
         moved_rightly += int(np.sum(repair.moved[[2, 5]]))
         moved_needlessly += int(np.sum(repair.moved)) - int(np.sum(repair.moved[[2, 5]]))
         assert repair.validation.rms < 1.1
@@ -239,14 +239,14 @@ def test_what_is_surely_worse_is_not_as_good_however_little():
 def trial(names, energy):
     error = PredictionError(np.array(energy), np.ones(len(energy)))
     key = tuple(sorted(names))
-    return SimpleNamespace(names=names, explanation=SimpleNamespace(key=key), error=error)
+    return SimpleNamespace(names=names, explanation=SimpleNamespace(sorted_names=key), error=error)
 
 
 def test_an_effect_with_which_logs_are_surely_predicted_worse_is_refuted():
     blocks = np.linspace(1.0, 2.0, 16)
     trials = [trial((), 2 * blocks), trial(("lag",), 2.2 * blocks), trial(("drag", "lag"), blocks)]
     trials.append(trial(("drag",), blocks + 0.2 * (-1.0) ** np.arange(16)))
-    repairs = SimpleNamespace(trials=trials, search=SimpleNamespace(found=[]))
+    repairs = SimpleNamespace(trials=trials, search=SimpleNamespace(explanations=[]))
     assert Repairs.refutes(repairs, "lag", ("lag",))
     # Better without by chance alone, and a set that nobody fitted.
     assert not Repairs.refutes(repairs, "lag", ("drag", "lag"))

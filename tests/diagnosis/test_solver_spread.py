@@ -39,13 +39,13 @@ def _near_the_truth(folder, effect, values, *, seed, off=1.0):
 def test_a_machine_that_is_off_by_a_hair_leaves_no_more(tmp_path, seed, off):
     model, end = _near_the_truth(tmp_path, "backlash", {"gap_rad": 0.03}, seed=seed, off=off)
     spread = solver_spread(model, end, model.case.experiments)
-    e, drift = without_drift(end.left, spread)
+    e, drift = without_drift(end.residual_coefficients, spread)
     chance = 4 * np.sqrt(2 / e.size)
-    assert np.mean(end.left**2) - 1 < np.mean(spread) + chance
+    assert np.mean(end.residual_coefficients**2) - 1 < np.mean(spread) + chance
     assert 0.8 < np.mean(e**2) < 1 + chance
     if seed == 0:
         # Here a thousandth of the gap makes a gap of a third of the noise: not to be called a cause.
-        assert np.mean(end.left**2) > 1.1
+        assert np.mean(end.residual_coefficients**2) > 1.1
         assert drift.log_gain > 100
 
 

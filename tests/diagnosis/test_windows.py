@@ -115,23 +115,23 @@ def test_what_a_state_does_is_left_out_but_for_the_first_window():
     assert 3 * 0.2 / DT_S - 1 <= windows.samples <= SAMPLES // 3
     # No window is longer than what states are known to do, of a record of any length.
     for samples in (20, windows.samples + 1, 2 * windows.samples - 1, SAMPLES):
-        parts = windows.parts(samples)
+        parts = windows.window_groups(samples)
         assert sum(count * length for _, count, length in parts) == samples
         assert max(length for _, _, length in parts) <= len(windows.responses)
-        assert windows.seen(np.ones((samples, 1))).shape == (samples, 1)
+        assert windows.to_coefficients(np.ones((samples, 1))).shape == (samples, 1)
     t = np.arange(SAMPLES) * DT_S
     free = (1.0 + 2.0 * np.exp(-t / 0.2))[:, None]
-    left = windows.unseen(windows.seen(free))
-    length = windows.parts(SAMPLES)[0][2]
+    left = windows.to_residuals(windows.to_coefficients(free))
+    length = windows.window_groups(SAMPLES)[0][2]
     np.testing.assert_allclose(left[:length], free[:length], atol=1e-9)
     assert np.max(np.abs(left[length:])) < 1e-4
     # Left out once, there is nothing more to leave out; and energies are those of the signal.
     moved = np.random.default_rng(0).standard_normal((SAMPLES, 1))
-    seen = windows.seen(moved)
-    np.testing.assert_allclose(windows.seen(windows.unseen(seen)), seen, atol=1e-9)
+    seen = windows.to_coefficients(moved)
+    np.testing.assert_allclose(windows.to_coefficients(windows.to_residuals(seen)), seen, atol=1e-9)
     assert np.sum(seen**2) <= np.sum(moved**2)
     stacked = np.stack([moved, free])
-    np.testing.assert_allclose(windows.seen(stacked)[1], windows.seen(free), atol=1e-9)
+    np.testing.assert_allclose(windows.to_coefficients(stacked)[1], windows.to_coefficients(free), atol=1e-9)
 
 
 def test_a_machine_that_forgets_has_no_windows():

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from diagnosis.fit.descent import Descent
+from diagnosis.fit.descent import Fit
 from diagnosis.fit.residual import ResidualModel, pooled_rms
 from diagnosis.machine.case import Case
-from diagnosis.search.white import fitted_to
+from diagnosis.search.white import descend_to_end
 
 # A false alarm in a thousand cases without effect, if noise were all there is.
 _SIGNIFICANCE = 1e-3
@@ -28,17 +28,17 @@ _EXPLAINED = 0.8
 def baselines(case: Case) -> dict[str, dict[str, Any]]:
     """Answers of both methods, in the form `flexlink diagnose` gives them."""
     model = ResidualModel(case)
-    base = fitted_to(model, (), np.zeros(0), np.zeros(model.nominal.count))
+    base = descend_to_end(model, (), np.zeros(0), np.zeros(model.nominal.count))
     after = pooled_rms(model.of(base.deviations, (), case.held_out))
-    energy = float(base.left @ base.left)
-    noise_alone = float(chi2.sf(energy, base.left.size - model.nominal.count))
+    energy = float(base.residual_coefficients @ base.residual_coefficients)
+    noise_alone = float(chi2.sf(energy, base.residual_coefficients.size - model.nominal.count))
     quiet = noise_alone > _SIGNIFICANCE
     refit = _document(case, "none" if quiet else "unknown", {}, after)
     if quiet:
         return {"parameters only": refit, "residual correlation": _document(case, "none", {}, after)}
     shares = _shares(case, model, base)
     name = max(shares, key=lambda effect: shares[effect])
-    beyond = max(1.0 - base.left.size / energy, 1e-12)
+    beyond = max(1.0 - base.residual_coefficients.size / energy, 1e-12)
     found = shares[name] >= _EXPLAINED * beyond
     ranked = dict(sorted(shares.items(), key=lambda item: -item[1]))
     return {
@@ -47,17 +47,20 @@ def baselines(case: Case) -> dict[str, dict[str, Any]]:
     }
 
 
-def _shares(case: Case, model: ResidualModel, base: Descent) -> dict[str, float]:
+def _shares(case: Case, model: ResidualModel, base: Fit) -> dict[str, float]:
     """Effect -> largest squared correlation of its change with the residuals, nominals projected out."""
     P = base.deviations.size
-    Q = np.linalg.qr(base.jacobian[:, :P])[0] if P else np.zeros((base.left.size, 0))
-    left = base.left - Q @ (Q.T @ base.left)
+    Q = np.linalg.qr(base.jacobian[:, :P])[0] if P else np.zeros((base.residual_coefficients.size, 0))
+    left = base.residual_coefficients - Q @ (Q.T @ base.residual_coefficients)
     found: dict[str, float] = {}
     for candidate in case.machine.candidates(case.experiments):
         for start in candidate.starts:
-            change = model.of(base.deviations, (candidate.effect_at(np.array(start)),)) - base.left
+            change = (
+                model.of(base.deviations, (candidate.effect_at(np.array(start)),))
+                - base.residual_coefficients
+            )
             change = change - Q @ (Q.T @ change)
-            size = float(np.linalg.norm(change) * np.linalg.norm(base.left))
+            size = float(np.linalg.norm(change) * np.linalg.norm(base.residual_coefficients))
             # An effect that is there lowers the residuals: only changes that point against them count.
             cosine = -float(change @ left) / size if size > 0 and np.isfinite(size) else 0.0
             found[candidate.effect] = max(found.get(candidate.effect, 0.0), max(cosine, 0.0) ** 2)
