@@ -7,6 +7,7 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from diagnosis.answer import Diagnosis
 from diagnosis.fit.levels import quietest
@@ -52,26 +53,28 @@ def diagnose(
     Warns where the records of an own machine show less noise than is stated, and an effect in what that hid,
     and of what makes its answer doubtful (`doubts_about`, which raises ValueError where it is random).
     """
-    rng = np.random.default_rng(0) if rng is None else rng
-    progress = progress or (lambda fraction, message: None)
-    deadline_s = time.monotonic() + _SEARCHED * time_limit_s
-    if not isinstance(case, PlantCase):
-        answer = _at_noise_seen(case, progress, rng, deadline_s)
-        return replace(answer, doubts=(*_asked_of(case, answer), *answer.doubts))
-
-    # Every failure takes one candidate off the list: there are no more rounds than candidates.
-    left_out: tuple[str, ...] = ()
-    while True:
-        try:
-            doubts = (*left_out, *doubts_about(case, deadline_s))
+    # Matrices are small: threads of linear algebra would only wait for one another, at several times the CPU.
+    with threadpool_limits(1):
+        rng = np.random.default_rng(0) if rng is None else rng
+        progress = progress or (lambda fraction, message: None)
+        deadline_s = time.monotonic() + _SEARCHED * time_limit_s
+        if not isinstance(case, PlantCase):
             answer = _at_noise_seen(case, progress, rng, deadline_s)
-            break
-        except SimulationError as error:
-            case, said = case.without_failing(error)
-            left_out = (*left_out, said)
-    for doubt in doubts:
-        warnings.warn(f"plant: {doubt}", stacklevel=2)
-    return replace(answer, doubts=(*doubts, *_asked_of(case, answer), *answer.doubts))
+            return replace(answer, doubts=(*_asked_of(case, answer), *answer.doubts))
+
+        # Every failure takes one candidate off the list: there are no more rounds than candidates.
+        left_out: tuple[str, ...] = ()
+        while True:
+            try:
+                doubts = (*left_out, *doubts_about(case, deadline_s))
+                answer = _at_noise_seen(case, progress, rng, deadline_s)
+                break
+            except SimulationError as error:
+                case, said = case.without_failing(error)
+                left_out = (*left_out, said)
+        for doubt in doubts:
+            warnings.warn(f"plant: {doubt}", stacklevel=2)
+        return replace(answer, doubts=(*doubts, *_asked_of(case, answer), *answer.doubts))
 
 
 def _asked_of(case: CaseOfMachine, answer: Diagnosis) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from numba import njit
 from scipy.signal import lfilter
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.fit.descent import descend
@@ -250,6 +251,30 @@ def _pumped():
     plant = Plant(_shaft, stated, known, ("speed_rad_s",), np.array([0.05]), model_error=0.05)
     names = ["actuator_dead_zone", "input_offset", "output_drift", "input_drift", "actuator_lag"]
     return PlantCase("pump", with_effects(plant, names, records, dt_s=DT_S), tuple(records))
+
+
+def test_a_diagnosis_takes_one_thread_of_linear_algebra():
+    """Threads that wait for one another cost several times the CPU; the caller's own setting comes back."""
+    seen = set()
+
+    def simulate(parameters, effects, inputs):
+        seen.update(pool["num_threads"] for pool in threadpool_info())
+        return parameters["gain"] * inputs
+
+    rng = np.random.default_rng(3)
+    records = []
+    for name, role in (("a", "estimation"), ("b", "held_out")):
+        force = rng.standard_normal((40, 1))
+        records.append(PlantExperiment(name, role, force, 2.0 * force + 0.01 * rng.standard_normal((40, 1))))
+    plant = Plant(simulate, {"gain": 2.0}, {"gain": 0.05}, ("y",), np.array([0.01]), model_error=0.0)
+    plant = with_effects(plant, ["output_drift"], records, dt_s=DT_S)
+    case = PlantCase("scaled", plant, tuple(records))
+    with threadpool_limits(2):
+        before = threadpool_info()
+        seen.clear()
+        assert diagnose(case).verdict == "none"
+        assert threadpool_info() == before
+    assert seen == {1}
 
 
 def test_an_effect_is_exchanged_for_its_twin():
