@@ -1,4 +1,4 @@
-"""Coordinates of candidates in a row: bounds, effects, difference quotients, intervals."""
+"""Coordinates of several candidates in a row: bounds, effects, difference quotients, intervals."""
 
 from __future__ import annotations
 
@@ -10,79 +10,143 @@ import numpy as np
 from diagnosis.machine.machine_protocol import Real
 from plant.effects.search_space import Candidate
 
-# Of every Monte Carlo: quantiles of 2.5 % are then known to half a per cent.
+# Draws of a Monte Carlo: quantiles of 2.5 % are then known to half a per cent, sqrt(0.025 / 1000).
 MONTE_CARLO_DRAWS = 1000
+# Share of a variance that tolerances must make up to be called what widens an interval: without this share
+# the interval would be half as wide, sqrt(1 - 0.75).
+_SHARE_THAT_WIDENS = 0.75
+# Quantiles between which 95 % of the draws lie.
+_INTERVAL_QUANTILES = (0.025, 0.975)
 
 
 def bounds_of(candidates: Sequence[Candidate]) -> tuple[Real, Real]:
-    """Bounds (A,), (A,) of all coordinates in a row."""
+    """Lower and upper bounds (A,), (A,) of all coordinates in a row; empty without candidates."""
     boxes = [candidate.box for candidate in candidates]
-    low = np.concatenate([np.zeros(0), *(bounds[0] for bounds in boxes)])
-    return low, np.concatenate([np.zeros(0), *(bounds[1] for bounds in boxes)])
+    low = np.concatenate([np.zeros(0), *(box[0] for box in boxes)])
+    high = np.concatenate([np.zeros(0), *(box[1] for box in boxes)])
+    return low, high
 
 
 def effects_at(candidates: Sequence[Candidate], x: Real) -> tuple[Any, ...]:
-    """Effects at the coordinates of all candidates in a row (A,)."""
-    splits = np.cumsum([len(c.axes) for c in candidates])[:-1]
-    return tuple(c.effect_at(part) for c, part in zip(candidates, np.split(x, splits), strict=False))
+    """Effects, one for each candidate, at the coordinates x (A,) of all candidates in a row."""
+    splits = np.cumsum([len(candidate.axes) for candidate in candidates])[:-1]
+    coordinates = np.split(x, splits)
+    return tuple(candidate.effect_at(part) for candidate, part in zip(candidates, coordinates, strict=False))
 
 
 def non_smooth(candidates: Sequence[Candidate]) -> bool:
-    """Whether contacts switch in any of these."""
-    return any(c.dependence == "non-smooth" for c in candidates)
+    """Whether contacts switch in any of the candidates."""
+    return any(candidate.dependence == "non-smooth" for candidate in candidates)
 
 
 def difference_quotients(
-    function: Callable[[Real], Real], at: Real, start: Real, steps: Real, high: Real | float = np.inf
+    function: Callable[[Real], Real],
+    point: Real,
+    value: Real,
+    steps: Real,
+    high: Real | float = np.inf,
 ) -> Real:
-    """Derivatives (N, A) at a point (A,) of a function (A,) -> (N,) that is `start` there.
+    """Derivatives of a function by difference quotients, one call a column.
 
-    Difference quotients, forwards by steps (A,) where that stays below `high`, else backwards.
+    Parameters
+    ----------
+    function : callable
+        (A,) -> (N,).
+    point : (A,) array
+        Where the derivatives are sought.
+    value : (N,) array
+        The function there.
+    steps : (A,) array
+        Above 0, in the units of the point.
+    high : (A,) array or float
+        A step that would go above it is taken backwards.
+
+    Returns
+    -------
+    (N, A) array
+        Of first order: the error is half the second derivative times the step.
     """
-    J = np.empty((start.size, at.size))
-    for i, step in enumerate(np.where(at + steps <= high, steps, -steps)):
-        moved = at.copy()
+    derivatives = np.empty((value.size, point.size))
+    signed_steps = np.where(point + steps <= high, steps, -steps)
+    for i, step in enumerate(signed_steps):
+        moved = point.copy()
         moved[i] += step
-        J[:, i] = (function(moved) - start) / step
-    return J
+        derivatives[:, i] = (function(moved) - value) / step
+    return derivatives
 
 
 def solve_or_least_squares(matrix: Real, right: Real) -> Real:
-    """x of matrix x = right, the smallest where trials that ran away leave the matrix singular."""
+    """x (M,) of matrix x = right; the smallest least-squares solution where the matrix (M, M) is singular.
+
+    It becomes so where a trial ran away and everything else is lost in rounding.
+    """
     try:
         return np.asarray(np.linalg.solve(matrix, right))
     except np.linalg.LinAlgError:
         return np.asarray(np.linalg.lstsq(matrix, right, rcond=None)[0])
 
 
-# Of the variance: without this share the interval would be half as wide.
-_MOST = 0.75
-
-
 def widening_tolerance(inverse: Real, nominal: int, size: int, variance: float) -> int | None:
-    """Where the tolerances of the first `nominal` unknowns make up most of the variance of unknown `size`:
-    the one that makes up most of it; else None. inverse (M, M): covariance of the unknowns as far as the
-    likelihood tells; variance: of that unknown, from all sources."""
-    with_them = inverse[size, :nominal]
-    together = with_them @ solve_or_least_squares(inverse[:nominal, :nominal], with_them)
-    if not nominal or not together > _MOST * variance:
+    """Which nominal value's tolerance makes the interval of an effect wide.
+
+    Parameters
+    ----------
+    inverse : (M, M) array
+        Covariance of the unknowns as far as the likelihood tells.
+    nominal : int
+        Number of nominal values, which come first among the unknowns.
+    size : int
+        Place of the effect's size among the unknowns.
+    variance : float
+        Of that size, from all sources.
+
+    Returns
+    -------
+    int or None
+        Place of the value that makes up most of the variance, if all of them together make up more than
+        `_SHARE_THAT_WIDENS` of it; else None, as without nominal values.
+    """
+    if nominal == 0:
         return None
-    return int(np.argmax(with_them**2 / np.diag(inverse)[:nominal]))
+    covariances = inverse[size, :nominal]
+    by_tolerances = covariances @ solve_or_least_squares(inverse[:nominal, :nominal], covariances)
+    # Written so that a variance that is not a number is no reason either.
+    if not by_tolerances > _SHARE_THAT_WIDENS * variance:
+        return None
+    return int(np.argmax(covariances**2 / np.diag(inverse)[:nominal]))
 
 
 def parameter_intervals(
     candidate: Candidate, coordinates: Real, covariance: Real, rng: np.random.Generator
 ) -> dict[str, tuple[float, float]]:
-    """95 % intervals by Gaussian draws of the coordinates (A,), kept inside their box; covariance (A, A)."""
+    """95 % interval of every parameter of an effect, by Gaussian draws of its coordinates.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        With A coordinates; draws are kept inside its bounds.
+    coordinates : (A,) array
+        Where the fit ended.
+    covariance : (A, A) array
+        Symmetric; negative eigenvalues, which only rounding makes, count as 0.
+    rng : Generator
+        Gives `MONTE_CARLO_DRAWS` draws.
+
+    Returns
+    -------
+    dict
+        Parameter -> (low, high) in its unit. A phase may leave its range: the interval contains the estimate.
+    """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    moved = coordinates + rng.standard_normal((MONTE_CARLO_DRAWS, coordinates.size)) @ root.T
-    sampled = [candidate.parameters(draw) for draw in np.clip(moved, *candidate.box)]
-    found = {}
-    for key, value in candidate.parameters(coordinates).items():
-        spread = np.array([p[key] for p in sampled]) - value
-        if key == "phase_rad":
-            spread = np.mod(spread + np.pi, 2 * np.pi) - np.pi
-        below, above = np.quantile(spread, [0.025, 0.975])
-        found[key] = (float(value + below), float(value + above))
-    return found
+    drawn = coordinates + rng.standard_normal((MONTE_CARLO_DRAWS, coordinates.size)) @ root.T
+    drawn_parameters = [candidate.parameters(draw) for draw in np.clip(drawn, *candidate.box)]
+    intervals = {}
+    for name, estimate in candidate.parameters(coordinates).items():
+        deviations = np.array([parameters[name] for parameters in drawn_parameters]) - estimate
+        if name == "phase_rad":
+            # The nearest turn: a phase just below a whole turn is near one just above 0.
+            deviations = np.mod(deviations + np.pi, 2 * np.pi) - np.pi
+        below, above = np.quantile(deviations, _INTERVAL_QUANTILES)
+        intervals[name] = (float(estimate + below), float(estimate + above))
+    return intervals

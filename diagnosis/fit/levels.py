@@ -11,13 +11,16 @@ E_b being the energy of the residuals in band b, F_b the energy that does not in
 and the stated model error spread evenly over the octaves. A band that nothing explains stops counting;
 removing a share of one counts whatever its size. Coefficients of one band are not as many independent
 witnesses as they are numbers where what is left is a deterministic function of the motion: no band counts
-more than `_MOST`.
+more than `_MOST_INDEPENDENT`.
+
+Letters of the shapes: N coefficients of R records with Y outputs each, in B bands.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,41 +29,68 @@ from scipy.fft import dct, idct
 from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine
 
-_LOWEST = 4  # coefficients in the lowest band: of fewer a variance says nothing
-_MOST = 16.0  # of one band, see above: its variance is then known to a third, sqrt(2 / 16)
+# Coefficients in the lowest band: of fewer a variance says nothing.
+_LOWEST_COEFFICIENTS = 4
+# Independent values that a band counts as at most: its variance is then known to a third, sqrt(2 / 16). With
+# more the highest octaves, which have most coefficients, decide alone.
+_MOST_INDEPENDENT = 16.0
 # Share of the stated model error below which a gain is none: what does not interest is not fitted.
 UNINTERESTING = 0.4
-# Noise is allowed half as much again as a data sheet says.
+# Noise is allowed half as much again as a data sheet says before anything is called left over.
 _NOISE_ALLOWED = 1.5
 
 
 def octaves_of(samples: int) -> npt.NDArray[np.int64]:
-    """(T,) octave of every coefficient of the cosine transform, the first four in one."""
-    octave = np.maximum(np.log2(np.maximum(np.arange(samples), 1) / _LOWEST), -1).astype(np.int64) + 1
-    octave[: min(_LOWEST, samples)] = 0
+    """(T,) octave of every coefficient of the cosine transform of T samples: 0 for the first four, then 1, 2,
+    ... for 4 to 7, 8 to 15 and so on."""
+    index = np.maximum(np.arange(samples), 1)
+    octave = np.maximum(np.log2(index / _LOWEST_COEFFICIENTS), -1).astype(np.int64) + 1
+    octave[: min(_LOWEST_COEFFICIENTS, samples)] = 0
     return octave
 
 
 def quietest(signals: Sequence[Real]) -> Real:
-    """(Y,) white noise that no signal (T, Y) has more of: at most the RMS of its quietest octave."""
-    rms = []
+    """(Y,) standard deviations of the most white noise that every signal may have.
+
+    Parameters
+    ----------
+    signals : sequence of (T, Y) arrays
+        At least one. White noise has the same RMS in every octave, so a signal has no more of it than its
+        quietest octave that is long enough to tell; the largest over all signals is taken.
+    """
+    quietest_rms = []
     for signal in signals:
         octave = octaves_of(len(signal))
-        samples = np.bincount(octave)
-        many = samples >= min(_MOST, float(np.max(samples)))
-        energies = np.array([np.bincount(octave, c * c) for c in dct(signal, axis=0, norm="ortho").T])
-        rms.append(np.sqrt(np.min(energies[:, many] / samples[many], axis=1)))
-    return np.asarray(np.max(rms, axis=0))
+        counts = np.bincount(octave)
+        is_long = counts >= min(_MOST_INDEPENDENT, float(np.max(counts)))
+        coefficients = dct(signal, axis=0, norm="ortho")
+        energies = np.array([np.bincount(octave, column * column) for column in coefficients.T])
+        quietest_rms.append(np.sqrt(np.min(energies[:, is_long] / counts[is_long], axis=1)))
+    return np.asarray(np.max(quietest_rms, axis=0))
 
 
 @dataclass(frozen=True, eq=False)
 class Levels:
-    """Bands of the coefficients of some records.
+    """Bands of the coefficients of some records, and the likelihood of residuals of unknown level in them.
 
-    band : (N,) index of the band of every coefficient. counted : (B,) independent values of a band.
-    floor : (B,) energy F_b; noise : (B,) what sensors may have, noise and rounding. belongs : (B,) which of
-    the R Y outputs of records it is of; motion : (R Y,) their energies, whole : about the mean of the record.
-    windows : that the coefficients are of.
+    Attributes
+    ----------
+    band : (N,) int array
+        Index of the band of every coefficient.
+    independent_counts : (B,) array
+        Independent values that a band counts as, n_b.
+    floor : (B,) array
+        Energy that does not interest, F_b, above 0; squares of the outputs' units.
+    noise : (B,) array
+        Energy that sensors may have, noise and rounding.
+    output_of_band : (B,) int array
+        Which of the R Y outputs of records a band is of.
+    motion_energy : (R Y,) array
+        Energy of the measured outputs, in windows where there are some.
+    whole_motion_energy : (R Y,) array
+        Energy of the measured outputs about their mean.
+    windows : Windows or None
+        Windows that the coefficients are of; None for whole records.
     """
 
     band: npt.NDArray[np.int64]
@@ -81,70 +111,96 @@ class Levels:
         rounded: Real | float = 0.0,
         windows: Windows | None = None,
     ) -> Levels:
-        """noise (Y,): standard deviations; model_error: share of the motion that a good model may miss;
-        rounded (Y,): variances of rounding beside the noise. In windows the bands are octaves of these, the
-        motion what they have of it."""
-        rows, first, Y = [], 0, noise.size
+        """Bands of records.
+
+        Parameters
+        ----------
+        records : sequence
+            R records with Y outputs.
+        noise : (Y,) array
+            Standard deviations.
+        model_error : float
+            Share of the motion that a good model may miss, 0 to 1.
+        rounded : (Y,) array or float
+            Variances of rounding beside the noise.
+        windows : Windows, optional
+            The bands are then octaves of these, the motion what they have of it.
+        """
+        outputs = noise.size
+        sensor_variance = noise**2 + rounded
+        allowed_variance = _NOISE_ALLOWED**2 * noise**2 + rounded
+        parts: dict[str, list[Any]] = {}
+        first_band = 0
         for r, record in enumerate(records):
-            T = len(record.output)
-            parts = windows.window_groups(T) if windows else [(slice(0, T), 1, T)]
-            octave = np.concatenate([np.tile(octaves_of(length), count) for _, count, length in parts])
-            octaves = int(np.max(octave)) + 1
-            samples = np.bincount(octave).astype(np.float64)
-            whole = T * np.var(record.output, axis=0)
-            motion = windows.motion(record.output) if windows else whole
-            floor = (UNINTERESTING * model_error) ** 2 * motion / octaves
-            rows.append(
-                (
-                    first + (octave[:, None] * Y + np.arange(Y)).ravel(),
-                    np.repeat(np.minimum(samples, _MOST), Y),
-                    (samples[:, None] * (noise**2 + rounded) + floor).ravel(),
-                    (samples[:, None] * (_NOISE_ALLOWED**2 * noise**2 + rounded)).ravel(),
-                    np.tile(r * Y + np.arange(Y), octaves),
-                    motion,
-                    whole,
+            samples = len(record.output)
+            whole_motion_energy = samples * np.var(record.output, axis=0)
+            if windows is None:
+                octave = octaves_of(samples)
+                motion_energy = whole_motion_energy
+            else:
+                groups = windows.window_groups(samples)
+                octave = np.concatenate(
+                    [np.tile(octaves_of(group.length), group.windows) for group in groups]
                 )
-            )
-            first += octaves * Y
-        return cls(*(np.concatenate(column) for column in zip(*rows, strict=True)), windows=windows)
+                motion_energy = windows.motion(record.output)
+            octaves = int(np.max(octave)) + 1
+            counts = np.bincount(octave).astype(np.float64)
+            uninteresting = (UNINTERESTING * model_error) ** 2 * motion_energy / octaves
+            of_record = {
+                "band": first_band + (octave[:, None] * outputs + np.arange(outputs)).ravel(),
+                "independent_counts": np.repeat(np.minimum(counts, _MOST_INDEPENDENT), outputs),
+                "floor": (counts[:, None] * sensor_variance + uninteresting).ravel(),
+                "noise": (counts[:, None] * allowed_variance).ravel(),
+                "output_of_band": np.tile(r * outputs + np.arange(outputs), octaves),
+                "motion_energy": motion_energy,
+                "whole_motion_energy": whole_motion_energy,
+            }
+            for name, values in of_record.items():
+                parts.setdefault(name, []).append(values)
+            first_band += octaves * outputs
+        joined: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
+        return cls(**joined, windows=windows)
 
     def to_coefficients(self, residuals: Real) -> Real:
-        """See `diagnosis.fit.likelihood.Likelihood`."""
+        """(T Y,) cosine transform of the residuals (T, Y) of one record, coefficient by coefficient."""
         return self.linearised(residuals).ravel()
 
     def to_residuals(self, e: Real, outputs: int) -> Real:
-        e = e.reshape(-1, outputs)
-        return self.windows.to_residuals(e) if self.windows else np.asarray(idct(e, axis=0, norm="ortho"))
+        """(T, Y) residuals of coefficients (T Y,); in windows without what starts of windows do."""
+        coefficients = e.reshape(-1, outputs)
+        if self.windows is not None:
+            return self.windows.to_residuals(coefficients)
+        return np.asarray(idct(coefficients, axis=0, norm="ortho"))
 
     def linearised(self, outputs: Real) -> Real:
-        return (
-            self.windows.to_coefficients(outputs)
-            if self.windows
-            else np.asarray(dct(outputs, axis=-2, norm="ortho"))
-        )
+        """(..., T, Y) cosine transforms of changes (..., T, Y); exact, for the transform is linear."""
+        if self.windows is not None:
+            return self.windows.to_coefficients(outputs)
+        return np.asarray(dct(outputs, axis=-2, norm="ortho"))
 
     def energy(self, e: Real) -> Real:
+        """(B,) energy of the coefficients (N,) in every band, E_b."""
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
     def of_record(self, part: slice) -> Levels:
-        """Of the record that has this part of the coefficients."""
+        """Bands of one record by the place of its coefficients among the N, which it has for itself."""
         band = self.band[part]
-        own = slice(int(band.min()), int(band.max()) + 1)
-        belongs = self.output_of_band[own]
-        outputs = slice(int(belongs.min()), int(belongs.max()) + 1)
+        bands = slice(int(band.min()), int(band.max()) + 1)
+        output_of_band = self.output_of_band[bands]
+        outputs = slice(int(output_of_band.min()), int(output_of_band.max()) + 1)
         return Levels(
-            band - own.start,
-            self.independent_counts[own],
-            self.floor[own],
-            self.noise[own],
-            belongs - outputs.start,
-            self.motion_energy[outputs],
-            self.whole_motion_energy[outputs],
+            band=band - bands.start,
+            independent_counts=self.independent_counts[bands],
+            floor=self.floor[bands],
+            noise=self.noise[bands],
+            output_of_band=output_of_band - outputs.start,
+            motion_energy=self.motion_energy[outputs],
+            whole_motion_energy=self.whole_motion_energy[outputs],
             windows=self.windows,
         )
 
     def loss_of(self, energy: Real) -> float:
-        """-log likelihood of energies (B,)."""
+        """-log likelihood of energies (B,), up to a constant of the records."""
         return 0.5 * float(self.independent_counts @ np.log1p(energy / self.floor))
 
     def loss(self, e: Real) -> float:
@@ -152,5 +208,5 @@ class Levels:
         return self.loss_of(self.energy(e))
 
     def weights(self, e: Real) -> Real:
-        """(N,) w with grad(loss) = w e: the reciprocal variances that e itself shows."""
+        """(N,) w with the gradient of the loss w e: the reciprocal variances that e itself shows."""
         return np.asarray((self.independent_counts / (self.energy(e) + self.floor))[self.band])

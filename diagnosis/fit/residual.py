@@ -14,36 +14,59 @@ from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMach
 
 
 class ResidualModel(RecordsToFit):
-    """The estimation records of a case under white noise."""
+    """The estimation records of a case under white noise; starts of records are known.
+
+    Attributes
+    ----------
+    start : FittedStart
+        Of the estimation records, as their first samples say; without states where a machine has none.
+    """
 
     def __init__(self, case: CaseOfMachine) -> None:
-        noise = White(case.noise, case.steps)
-        super().__init__(case, case.estimation, noise, NominalParameters(case.machine))
+        likelihood = White(case.noise, case.steps)
+        super().__init__(case, case.estimation, likelihood, NominalParameters(case.machine))
         self.start = self.guessed_start()
 
     def of(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
     ) -> Real:
-        """Residuals (N,) of the given experiments (default: estimation): sample by sample, all outputs.
+        """Residuals (N,) in noise deviations, record after record, sample by sample, all outputs.
 
-        Rounded outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
+        Parameters
+        ----------
+        deviations : (P,) array
+            Nominal values, in tolerances off.
+        effects : sequence
+            With their sizes.
+        experiments : sequence, optional
+            Records; by default those of estimation.
+
+        Returns
+        -------
+        (N,) array
+            Rounded outputs enter by the chance of their cells (`diagnosis.machine.quantisation_grid`).
         """
         if experiments is None:
             return self.coefficients(deviations, effects, self.start)
-        left = self.by_experiment(deviations, effects, experiments)
-        return np.concatenate([self.likelihood.to_coefficients(e * self.case.noise) for e in left.values()])
+        residuals = self.by_experiment(deviations, effects, experiments)
+        return np.concatenate(
+            [self.likelihood.to_coefficients(e * self.case.noise) for e in residuals.values()]
+        )
 
     def by_experiment(
         self, deviations: Real, effects: Sequence[Any], experiments: Sequence[RecordOfMachine] | None = None
     ) -> dict[str, Real]:
-        """(measured - model)/noise (T, Y) of the given experiments (default: all), whatever they weigh in a
-        fit."""
-        simulator = self.nominal.at(deviations).simulator(effects)
-        experiments = self.case.experiments if experiments is None else experiments
+        """Name of the record -> (measured - model) / noise (T, Y), whatever it weighs in a fit.
+
+        Arguments are those of `of`, but that by default all records of the case are simulated.
+        """
+        simulate = self.nominal.at(deviations).simulator(effects)
+        if experiments is None:
+            experiments = self.case.experiments
         self.simulations += len(experiments)
-        return {e.name: np.asarray((e.output - simulator(e.input)) / self.case.noise) for e in experiments}
+        return {e.name: np.asarray((e.output - simulate(e.input)) / self.case.noise) for e in experiments}
 
 
 def pooled_rms(residuals: Real) -> float:
-    """Root mean square; 1 is the noise floor."""
+    """Root mean square of all values; of whitened residuals 1 is the noise floor."""
     return float(np.sqrt(np.mean(np.square(residuals))))
