@@ -17,104 +17,138 @@ from diagnosis.fit.starts import StartPoint, point_of
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from plant.effects.search_space import Candidate
 
+# Called with the share done (0 to 1) and what is being done.
 Progress = Callable[[float, str], None]
 
-# How many of what is ranked are followed: what takes many simulations each (ends refined where contacts
-# switch, scans), sets, and effects alone or beside another.
-FOLLOWED_COSTLY, FOLLOWED_SETS, FOLLOWED_EFFECTS = 2, 4, 6
-
-
-class Move(ABC):
-    """what: in words, for whoever waits, and for what a time limit left out."""
-
-    @property
-    @abstractmethod
-    def what(self) -> str: ...
-
-    @abstractmethod
-    def apply(self, search: SearchLoop[Any]) -> None: ...
-
-
-# What an effect needs that a time limit left out.
+# How many of a ranking are followed where each takes many simulations: ends refined where contacts switch,
+# scans. The best and its nearest rival.
+FOLLOWED_COSTLY = 2
+# How many sets, or starts of one effect, are followed.
+FOLLOWED_SETS = 4
+# How many effects are followed, alone or beside another.
+FOLLOWED_EFFECTS = 6
+# What an effect needs that a time limit left out, in the answer's words.
 TIME = "more time"
 
 
+class Move(ABC):
+    """Something that a search may try next."""
+
+    @property
+    @abstractmethod
+    def what(self) -> str:
+        """In words, for whoever waits, and for what a time limit left out."""
+
+    @abstractmethod
+    def apply(self, search: SearchLoop[Any]) -> None:
+        """Fit, and add what comes of it to the search's explanations or start points."""
+
+
 class OutOfTimeError(BaseException):
-    """Ends a fit on its way; a simulation's own errors are none of it."""
+    """Ends a fit on its way.
+
+    No Exception, so that nobody who catches a simulation's own errors catches this one.
+    """
 
 
 class SearchLoop(ABC, Generic[E]):
-    """All that was fitted to the records of a case, the nominal alone first.
+    """All that was fitted to the records of a case.
 
-    deadline_s : of time.monotonic(); after it nothing more is tried, and `skipped_for_time` names what was
-    not.
-    points : of every candidate, where it may start, best first. rough : ends of effects alone that are not
-        yet finished, with these.
+    Attributes
+    ----------
+    case, progress
+        As given.
+    deadline_s : float
+        Of time.monotonic(); after it nothing more is tried.
+    records : RecordsToFit
+        Estimation records that are fitted.
+    explanations : list
+        Everything that was fitted, in the order in which it was; the nominal machine alone is the first.
+    skipped_for_time : list of str
+        What was not tried because of the deadline, as moves call it.
+    start_points : list of (Candidate, list of StartPoint)
+        Of every candidate that may be there, where it may be descended from, best first.
+    unfinished : list of (Fit, list of StartPoint)
+        Ends of effects alone that are not yet finished, with their start points.
+    timed_records : tuple of RecordsToFit
+        Whose simulations are counted, and ended by a time limit.
+    starts_feel_contacts : bool
+        Whether starts of records that are only predicted are sought with contacts that switch.
     """
 
     records: RecordsToFit
 
     def __init__(self, case: CaseOfMachine, progress: Progress, deadline_s: float = np.inf) -> None:
-        self.case, self.progress, self.deadline_s = case, progress, deadline_s
+        self.case = case
+        self.progress = progress
+        self.deadline_s = deadline_s
         self.explanations: list[E] = []
         self.skipped_for_time: list[str] = []
         self.start_points: list[tuple[Candidate, list[StartPoint]]] = []
         self.unfinished: list[tuple[Fit, list[StartPoint]]] = []
-        # Whose simulations are counted, and ended by a time limit.
         self.timed_records: tuple[RecordsToFit, ...] = ()
-        # Whether starts of records that are only predicted feel contacts.
         self.starts_feel_contacts = False
-        # Already tried: sets without one of their effects, with a simpler one, with another in its place.
-        self._reduced: set[tuple[object, ...]] = set()
+        # Already fitted: sets without one of their effects, with a simpler one, with another in its place.
+        self._already_reduced: set[tuple[object, ...]] = set()
 
     def for_case(self, case: CaseOfMachine) -> SearchLoop[E]:
-        """Of the same records in another form."""
+        """An empty search of another form of the same records, within the same time."""
         return type(self)(case, self.progress, self.deadline_s)
 
     @property
     def nominal_alone(self) -> E:
+        """The explanation by no effect. Raises IndexError before it is fitted."""
         return self.explanations[0]
 
     @property
     def likeliest(self) -> E:
-        return max(self.explanations, key=lambda e: e.log_evidence)
+        """The explanation of the largest evidence."""
+        return max(self.explanations, key=lambda explanation: explanation.log_evidence)
 
     @property
     def simulations(self) -> int:
+        """Records that were simulated so far."""
         return sum(records.simulations for records in self.timed_records)
 
     @property
     def out_of_time(self) -> bool:
+        """Whether the deadline is over."""
         return time.monotonic() > self.deadline_s
 
     @abstractmethod
     def run(self) -> None:
-        """All of it, the nominal first."""
+        """The whole search, the nominal machine first."""
 
     def run_in_time(self) -> Self:
-        """To its end or to its deadline, whatever is being fitted then, once the nominal is."""
+        """The search after its end or its deadline, whatever is being fitted then.
 
-        def watch() -> None:
+        The nominal machine is fitted in any case. Effects of which nothing was fitted are named among
+        `skipped_for_time`.
+        """
+
+        def end_when_late() -> None:
             if self.explanations and self.out_of_time:
                 raise OutOfTimeError
 
-        watched = self.timed_records if np.isfinite(self.deadline_s) else ()
-        for records in watched:
-            records.before_each = watch
+        timed_records = self.timed_records if np.isfinite(self.deadline_s) else ()
+        for records in timed_records:
+            records.before_each = end_when_late
         try:
             self.run()
         except OutOfTimeError:
-            fitted = {name for e in self.explanations for name in e.names} | {*self.skipped_for_time}
-            self.skipped_for_time += [n for n in self.case.machine.weighing.listed if n not in fitted]
+            fitted = {name for explanation in self.explanations for name in explanation.names}
+            known = fitted | set(self.skipped_for_time)
+            self.skipped_for_time += [name for name in self.case.machine.weighing.listed if name not in known]
             self.skipped_for_time.append("what was being fitted")
-        for records in watched:
+        for records in timed_records:
             records.before_each = lambda: None
         return self
 
     @property
     def untried(self) -> dict[str, str]:
-        """Effect -> what it needs to be tried."""
-        late = {name: TIME for name in self.case.machine.weighing.listed if name in self.skipped_for_time}
+        """Effect that was not tried -> what it needs: more time, or what the machine says."""
+        listed = self.case.machine.weighing.listed
+        late = {name: TIME for name in listed if name in self.skipped_for_time}
         return late | getattr(self.case.machine, "inactive", {})
 
     @property
@@ -123,14 +157,14 @@ class SearchLoop(ABC, Generic[E]):
         """Whether the likeliest leaves something that interests."""
 
     @abstractmethod
-    def explain(self, end: Fit) -> E:
-        """An end with what it leaves, weighed."""
+    def explain(self, fit: Fit) -> E:
+        """A fit with what it leaves, weighed; not added to the explanations."""
 
     @abstractmethod
     def whitened_residuals(
-        self, found: E, experiments: Sequence[RecordOfMachine] | None = None
+        self, explanation: E, experiments: Sequence[RecordOfMachine] | None = None
     ) -> dict[str, Real]:
-        """experiment -> (measured - model)/noise (T, Y), of the given ones (default: all)."""
+        """Name of the record -> (measured - model)/noise (T, Y), of the given records (default: all)."""
 
     @property
     def uninteresting_energy(self) -> float:
@@ -165,20 +199,43 @@ class SearchLoop(ABC, Generic[E]):
     def candidate_alone(
         self, candidate: Candidate, points: list[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
-        """A candidate and its points beside the nominal as they are tried from then on."""
+        """A candidate and its start points beside the nominal machine, as they are tried from then on.
+
+        No points where it need not be tried.
+        """
 
     @abstractmethod
     def candidate_beside(
         self, parent: Fit, candidate: Candidate, points: Sequence[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
-        """A candidate and some of its points beside a set, simulated, best first."""
+        """A candidate and some of its start points beside a set, simulated, best first."""
 
     @abstractmethod
-    def polish(self, end: Fit, rank: int, around: Fit) -> Fit:
-        """An end beside a fit, the rank-th of those tried together, as far as it is worth."""
+    def polish(self, fit: Fit, rank: int, around: Fit) -> Fit:
+        """A fit descended on as far as it is worth.
+
+        Parameters
+        ----------
+        fit : Fit
+            With one more effect than `around`, roughly descended.
+        rank : int
+            Its place, from 0, by loss among those that were tried together.
+        around : Fit
+            Beside which they were tried.
+        """
 
     def apply_moves(self, moves: Iterable[Move], begin: float, share: float = 0.0) -> None:
-        """As long as there is time; begin, share: of the progress."""
+        """Apply moves as long as there is time.
+
+        Moves of an iterator may depend on what those before them led to.
+
+        Parameters
+        ----------
+        moves : iterable
+            In the order in which they are applied.
+        begin, share : float
+            Of the progress, 0 to 1: where it stands before, and what all of them are.
+        """
         count = len(moves) if isinstance(moves, Sequence) else 1
         for k, move in enumerate(moves):
             self.progress(begin + share * min(k / count, 1.0), move.what)
@@ -186,94 +243,131 @@ class SearchLoop(ABC, Generic[E]):
                 move.apply(self)
 
     def skips(self, what: str) -> bool:
+        """Whether there is no time for something, which is then noted."""
         if not self.out_of_time:
             return False
         if what not in self.skipped_for_time:
             self.skipped_for_time.append(what)
         return True
 
-    def add(self, end: Fit) -> E:
-        explained = self.explain(end)
-        self.explanations.append(explained)
-        return explained
+    def add(self, fit: Fit) -> E:
+        """The explanation by a fit, added to all others."""
+        explanation = self.explain(fit)
+        self.explanations.append(explanation)
+        return explanation
 
     def finish_single_effects(self) -> None:
-        """What was found of every effect alone, as far as it is worth."""
-        for k, (end, points) in enumerate(sorted(self.unfinished, key=lambda one: one[0].loss)):
-            found = self.add(self.polish(end, k, self.nominal_alone.fit))
+        """Descend the unfinished ends of effects alone as far as they are worth, and add them."""
+        ranked = sorted(self.unfinished, key=lambda pair: pair[0].loss)
+        for rank, (fit, points) in enumerate(ranked):
+            explanation = self.add(self.polish(fit, rank, self.nominal_alone.fit))
             # Where it ended alone may be far from every start, and right beside another effect.
-            points.insert(0, point_of(found.fit))
+            points.insert(0, point_of(explanation.fit))
 
     def add_simpler(self, explanation: E) -> None:
-        """The same with effects in place of those that contain them, from where these ended: further values
-        may have led out of a minimum in which the simpler effect was left."""
-        end = explanation.fit
-        for k, containing in enumerate(end.candidates):
-            for candidate in [c for c, _ in self.start_points if c.effect == containing.kind.contains]:
-                if (
-                    this := (*explanation.names, explanation.log_evidence, candidate.effect)
-                ) in self._reduced:
+        """Add the set with effects in place of those that contain them, from where these ended.
+
+        Further values may have led out of a minimum in which the simpler effect was left.
+        """
+        fit = explanation.fit
+        first = 0
+        for k, containing in enumerate(fit.candidates):
+            for simpler, _ in self.start_points:
+                if simpler.effect != containing.kind.contains:
                     continue
-                self._reduced.add(this)
-                candidates = (*end.candidates[:k], candidate, *end.candidates[k + 1 :])
-                first = sum(len(c.axes) for c in end.candidates[:k]) + len(candidate.axes)
-                x = np.delete(
-                    end.coordinates, slice(first, first + len(containing.axes) - len(candidate.axes))
-                )
-                self.add(descend(self.records, candidates, end.deviations, x, end.start))
+                if self._is_known(*explanation.names, explanation.log_evidence, simpler.effect):
+                    continue
+                candidates = (*fit.candidates[:k], simpler, *fit.candidates[k + 1 :])
+                # The further values stand behind those that both have.
+                further = slice(first + len(simpler.axes), first + len(containing.axes))
+                coordinates = np.delete(fit.coordinates, further)
+                self.add(descend(self.records, candidates, fit.deviations, coordinates, fit.start))
+            first += len(containing.axes)
 
     def add_exchanged(self, explanation: E, sought: Iterable[str]) -> None:
-        """The same with one of the effects sought replaced by another, as likely in a part of the set.
+        """Add the set with one of its effects replaced by another that is as likely in a part of the set.
 
         Larger sets are sought beside the likeliest parts alone: of two effects that no record tells apart,
         the one that was extended would win by what was found beside it.
+
+        Parameters
+        ----------
+        explanation
+            The set.
+        sought : iterable of str
+            Effects that may be replaced.
         """
         best = best_of_sets(self.explanations)
         for k, name in enumerate(explanation.names):
             if name not in sought:
                 continue
-            rest = {c.effect: c.kind.contains for c in explanation.fit.candidates if c.effect != name}
-            for rival in [*best.values()]:
-                new = set(rival.names) - {*explanation.names}
-                kept = set(rival.names) - new
-                part = best.get(tuple(sorted({*kept, name})))
-                if len(new) != 1 or not kept <= rest.keys() or part is None:
+            others = {c.effect: c.kind.contains for c in explanation.fit.candidates if c.effect != name}
+            for rival in list(best.values()):
+                # A rival is a part of the set with one new effect in the place of this one.
+                new_names = set(rival.names) - set(explanation.names)
+                shared = set(rival.names) - new_names
+                part = best.get(tuple(sorted({*shared, name})))
+                if len(new_names) != 1 or not shared <= others.keys() or part is None:
                     continue
-                (other,) = (c for c in rival.fit.candidates if c.effect in new)
-                key = tuple(sorted((*rest, other.effect)))
-                contained = other.effect in rest.values() or other.kind.contains in rest
-                if key in best or contained or rival.log_evidence < part.log_evidence - DECISIVE:
+                (new,) = (c for c in rival.fit.candidates if c.effect in new_names)
+                exchanged_set = tuple(sorted((*others, new.effect)))
+                is_contained = new.effect in others.values() or new.kind.contains in others
+                is_unlikely = rival.log_evidence < part.log_evidence - DECISIVE
+                if exchanged_set in best or is_contained or is_unlikely:
                     continue
-                around = (best.get(tuple(sorted(rest))) or self.without_effect(explanation, k)).fit
-                if (
-                    this := (*key, around.loss, explanation.log_evidence, rival.log_evidence)
-                ) in self._reduced:
+
+                without = best.get(tuple(sorted(others))) or self.without_effect(explanation, k)
+                around = without.fit
+                if self._is_known(*exchanged_set, around.loss, explanation.log_evidence, rival.log_evidence):
                     continue
-                self._reduced.add(this)
-                at = rival.fit.coordinates_of(rival.names.index(other.effect))
-                x, candidates = np.concatenate([around.coordinates, at]), (*around.candidates, other)
+                new_coordinates = rival.fit.coordinates_of(rival.names.index(new.effect))
+                coordinates = np.concatenate([around.coordinates, new_coordinates])
+                candidates = (*around.candidates, new)
                 # Not where much more is left than with the effect that is replaced.
-                followed, d, x = best_after_following(self.records, around, candidates, [x])
-                if followed < explanation.fit.loss + DECISIVE:
-                    best[key] = self.add(descend(self.records, candidates, d, x, around.start))
+                loss, d, x = best_after_following(self.records, around, candidates, [coordinates])
+                if loss < explanation.fit.loss + DECISIVE:
+                    fit = descend(self.records, candidates, d, x, around.start)
+                    best[exchanged_set] = self.add(fit)
 
     def without_effect(self, explanation: E, k: int) -> E:
-        """The best explanation by the same effects but the k-th."""
-        end = explanation.fit
-        rest = tuple(c for j, c in enumerate(end.candidates) if j != k)
-        key = tuple(sorted(c.effect for c in rest))
-        if rest and (this := (*explanation.names, explanation.log_evidence, k)) not in self._reduced:
-            self._reduced.add(this)
-            x = np.concatenate([end.coordinates_of(j) for j in range(len(end.candidates)) if j != k])
-            self.add(descend(self.records, rest, end.deviations, x, end.start))
-        return max((e for e in self.explanations if e.sorted_names == key), key=lambda e: e.log_evidence)
+        """The best explanation by the same effects but the k-th, fitted from here if it was not before."""
+        fit = explanation.fit
+        kept = [j for j in range(len(fit.candidates)) if j != k]
+        candidates = tuple(fit.candidates[j] for j in kept)
+        sorted_names = tuple(sorted(candidate.effect for candidate in candidates))
+        if candidates and not self._is_known(*explanation.names, explanation.log_evidence, k):
+            coordinates = np.concatenate([fit.coordinates_of(j) for j in kept])
+            self.add(descend(self.records, candidates, fit.deviations, coordinates, fit.start))
+        return self._best_of_set(sorted_names)
 
-    def with_only(self, chosen: Sequence[str], within: E) -> E:
-        """The best explanation by these effects alone, `within` itself where it has no others."""
-        key = tuple(sorted(chosen))
-        if within.sorted_names == key:
-            return within
-        while not any(e.sorted_names == key for e in self.explanations):
-            k = next(k for k, name in enumerate(within.names) if name not in chosen)
-            within = self.without_effect(within, k)
-        return max((e for e in self.explanations if e.sorted_names == key), key=lambda e: e.log_evidence)
+    def with_only(self, names: Sequence[str], explanation: E) -> E:
+        """The best explanation by some of the effects of an explanation alone.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Effects to be kept, all of them among those of the explanation.
+        explanation
+            Where a fit by these begins if there is none; it is the answer itself if it has no others.
+        """
+        sorted_names = tuple(sorted(names))
+        if explanation.sorted_names == sorted_names:
+            return explanation
+        while not any(other.sorted_names == sorted_names for other in self.explanations):
+            k = next(k for k, name in enumerate(explanation.names) if name not in names)
+            explanation = self.without_effect(explanation, k)
+        return self._best_of_set(sorted_names)
+
+    def _best_of_set(self, sorted_names: tuple[str, ...]) -> E:
+        """The likeliest explanation by a set, which must have one."""
+        of_set = [
+            explanation for explanation in self.explanations if explanation.sorted_names == sorted_names
+        ]
+        return max(of_set, key=lambda explanation: explanation.log_evidence)
+
+    def _is_known(self, *reduction: object) -> bool:
+        """Whether a reduction of a set was fitted before; from now on it was."""
+        if reduction in self._already_reduced:
+            return True
+        self._already_reduced.add(reduction)
+        return False

@@ -1,7 +1,7 @@
 """What a search may try next. Each move says what it is, and descends when it is applied.
 
-What moves lead to is one of `Search.explanations`; which of them are proposed depends on what was found
-before.
+What moves lead to is added to `SearchLoop.explanations` or `SearchLoop.start_points`; which of them are
+proposed depends on what is there.
 """
 
 from __future__ import annotations
@@ -18,106 +18,149 @@ from diagnosis.fit.descent import Fit, best_after_following, descend, refine_siz
 from diagnosis.fit.likelihood import DECISIVE, SUBSTANTIAL, WORTH_IT
 from diagnosis.fit.nominal import EDGE
 from diagnosis.fit.records import FittedStart, Records
-from diagnosis.fit.starts import StartPoint, beside, point_of, points_of, superposed
+from diagnosis.fit.starts import StartPoint, beside, by_loss, point_of, points_of, superposed
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.search.loop import FOLLOWED_COSTLY, FOLLOWED_EFFECTS, FOLLOWED_SETS, Move, SearchLoop
+from diagnosis.search.loop import (
+    FOLLOWED_COSTLY,
+    FOLLOWED_EFFECTS,
+    FOLLOWED_SETS,
+    Move,
+    SearchLoop,
+)
 from diagnosis.search.settled import fit_record_starts
 from diagnosis.search.windows import in_windows
 from plant.effects import LOOK_ALIKES, Effect
 from plant.effects.search_space import Candidate
 
-# Iterations from each start (with five the serial link's first stage ends 5 % higher).
+# Iterations of a descent from each start (with five the serial link's first stage ends 5 % higher).
 _ITERATIONS = 9
-# Effects that are descended on alone; of more, those of which superposition leaves least that are simulated
-# beside a set.
-_DESCENDED, _SIMULATED = 36, 24
+# Most effects that are descended on alone, those whose starts leave least: the registry and a few more.
+# Longer lists are those of simulators with many bodies.
+_MOST_DESCENDED = 36
+# Of a longer list, effects of which superposition leaves least that are simulated beside a set.
+_MOST_SIMULATED = 24
+# Sets of one effect beside which a second is sought: what is left says little about which member of the true
+# set has been found.
+_PARENTS_OF_PAIRS = 3
+# Sets of two and more beside which a further effect is sought: the likeliest.
+_PARENTS_OF_MORE = 1
+# Every so many points of a grid are tried anew beside another effect, or with a further value: half of them
+# are as good starts.
+_EVERY_OTHER = 2
 
 
 @dataclass(frozen=True, eq=False)
 class Alone(Move):
-    """Where an effect alone may start."""
+    """Simulate where an effect alone may start."""
 
     candidate: Candidate
 
     @property
     def what(self) -> str:
+        """Name of the effect."""
         return self.candidate.effect
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[Alone]:
-        """But those that contain a simpler one."""
-        spaces = search.case.machine.candidates(search.case.experiments)
-        return [cls(candidate) for candidate in spaces if candidate.kind.contains is None]
+        """One for every candidate but those that contain a simpler one (see `Enlarge`)."""
+        candidates = search.case.machine.candidates(search.case.experiments)
+        return [cls(candidate) for candidate in candidates if candidate.kind.contains is None]
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        points = points_of(search.records, search.nominal_alone.fit, self.candidate)
+        """Add the start points, unless the effect changes nothing."""
+        candidate = self.candidate
+        points = points_of(search.records, search.nominal_alone.fit, candidate)
         if points:
-            candidate, points = search.candidate_alone(self.candidate, points)
+            candidate, points = search.candidate_alone(candidate, points)
         if points:
             search.start_points.append((candidate, points))
 
 
 @dataclass(frozen=True, eq=False)
 class FromPoints(Move):
-    """An effect alone, from the best of its starts."""
+    """Descend an effect alone, from the best of its start points."""
 
     candidate: Candidate
     points: list[StartPoint]
 
     @property
     def what(self) -> str:
+        """Name of the effect."""
         return self.candidate.effect
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[FromPoints]:
-        """Of many those whose starts leave least; the others are still tried beside these."""
-        return [cls(*one) for one in sorted(search.start_points, key=lambda one: one[1][0].loss)[:_DESCENDED]]
+        """Of many candidates those whose starts leave least; the others are still tried beside these."""
+        ranked = sorted(search.start_points, key=lambda pair: pair[1][0].loss)
+        return [cls(candidate, points) for candidate, points in ranked[:_MOST_DESCENDED]]
 
     def apply(self, search: SearchLoop[Any]) -> None:
+        """Add the end to the search's unfinished fits."""
         around = search.nominal_alone.fit
-        end = descended(search, around, self.candidate, self.points, around.jacobian)
-        search.unfinished.append((end, self.points))
+        fit = descend_from_best(search, around, self.candidate, self.points, around.jacobian)
+        search.unfinished.append((fit, self.points))
 
 
-def descended(
+def descend_from_best(
     search: SearchLoop[Any],
     around: Fit,
     candidate: Candidate,
     points: Sequence[StartPoint],
-    nominal: Real,
+    nominal_jacobian: Real,
 ) -> Fit:
-    """The best end of a candidate beside a fit, from its best points that are apart."""
-    chosen, most = [points[0]], FOLLOWED_SETS if _turned(search, candidate) else FOLLOWED_COSTLY
+    """The best end of a candidate beside a fit, from its best points that are apart.
+
+    Parameters
+    ----------
+    search
+        Whose records are fitted.
+    around : Fit
+        Beside which the candidate acts.
+    candidate : Candidate
+        The further effect.
+    points : sequence of StartPoint
+        Best first, at least one.
+    nominal_jacobian : (N, P) array
+        Derivatives by the nominal values near the points.
+    """
+    most = FOLLOWED_SETS if _has_free_zero(search, candidate) else FOLLOWED_COSTLY
+    chosen = [points[0]]
     for point in points[1:]:
         if len(chosen) == most or point.loss > search.nominal_alone.fit.loss + WORTH_IT:
             break
         if all(point.far_from(other) for other in chosen):
             chosen.append(point)
-    further = [point for point in _local_minima(points) if all(map(point.far_from, chosen))]
-    chosen += further[:1]
-    ends = [_from(search, around, candidate, point, nominal) for point in chosen]
-    return min(ends, key=lambda end: end.loss)
+    # One more local minimum of the grid, even where it is worse than no effect.
+    for point in _local_minima(points):
+        if all(point.far_from(other) for other in chosen):
+            chosen.append(point)
+            break
+    fits = [_descend_from(search, around, candidate, point, nominal_jacobian) for point in chosen]
+    return min(fits, key=lambda fit: fit.loss)
 
 
-def _turned(search: SearchLoop[Any], candidate: Candidate) -> bool:
+def _has_free_zero(search: SearchLoop[Any], candidate: Candidate) -> bool:
+    """Whether a candidate depends on the true angle, and no output tells where its zero is."""
     return candidate.kind.absolute_angle and not search.case.machine.unknown_start.zero_seen
 
 
-def _from(
+def _descend_from(
     search: SearchLoop[Any],
     around: Fit,
     candidate: Candidate,
     point: StartPoint,
-    nominal: Real,
+    nominal_jacobian: Real,
 ) -> Fit:
+    """The end of a candidate beside a fit, from one start point; arguments are those of
+    `descend_from_best`."""
     return descend(
         search.records,
         (*around.candidates, candidate),
         point.deviations,
         np.concatenate([around.coordinates, point.coordinates]),
         point.start,
-        nominal_jacobian=nominal,
+        nominal_jacobian=nominal_jacobian,
         columns=around.start_columns,
         iterations=_ITERATIONS,
     )
@@ -125,7 +168,17 @@ def _from(
 
 @dataclass(frozen=True, eq=False)
 class Enlarge(Move):
-    """An effect that contains a simpler one (Stribeck friction Coulomb's), from where a set of that ended."""
+    """An effect that contains a simpler one (Stribeck friction Coulomb's), from where a set of that ended.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        In the place of the one that it contains.
+    inner : Fit
+        With the simpler effect.
+    starts : sequence of arrays
+        Further values, behind those that both have, from which it is descended.
+    """
 
     candidate: Candidate
     inner: Fit
@@ -133,114 +186,180 @@ class Enlarge(Move):
 
     @property
     def what(self) -> str:
+        """Name of the effect."""
         return self.candidate.effect
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any], sets: Sequence[WeighedFit]) -> Iterator[Enlarge]:
-        """With several further values the first time, then with those that this found."""
-        pool = list(best_of_sets(sets).values())
+        """One for every set with a simpler effect.
+
+        With several further values the first time, then with those that this found.
+        """
+        best = list(best_of_sets(sets).values())
         for candidate in search.case.machine.candidates(search.case.experiments):
-            for inner in [e.fit for e in pool if candidate.kind.contains in e.names]:
-                known = [points[0] for c, points in search.start_points if c.effect == candidate.effect]
-                starts = [point.coordinates[1:] for point in known]
-                starts = starts or [np.array(x) for x in sorted({x[1:] for x in candidate.starts})[::2]]
+            for inner in [
+                explanation.fit for explanation in best if candidate.kind.contains in explanation.names
+            ]:
+                starts = [
+                    points[0].coordinates[1:]
+                    for known, points in search.start_points
+                    if known.effect == candidate.effect
+                ]
+                if not starts:
+                    further_values = sorted({coordinates[1:] for coordinates in candidate.starts})
+                    starts = [np.array(values) for values in further_values[::_EVERY_OTHER]]
                 yield cls(candidate, inner, starts)
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        inner, candidate = self.inner, self.candidate
-        k = inner.names.index(str(candidate.kind.contains))
-        first = sum(len(c.axes) for c in inner.candidates[: k + 1])
-        ends = [
-            descend(
-                search.records,
-                (*inner.candidates[:k], candidate, *inner.candidates[k + 1 :]),
-                inner.deviations,
-                np.concatenate([inner.coordinates[:first], further, inner.coordinates[first:]]),
-                inner.start,
-                nominal_jacobian=inner.jacobian[:, : inner.deviations.size],
-                columns=inner.start_columns,
-                iterations=_ITERATIONS,
+        """Add the best end; of an effect alone it is a start point, too."""
+        inner = self.inner
+        k = inner.names.index(str(self.candidate.kind.contains))
+        first = sum(len(candidate.axes) for candidate in inner.candidates[: k + 1])
+        candidates = (*inner.candidates[:k], self.candidate, *inner.candidates[k + 1 :])
+        fits = []
+        for further_values in self.starts:
+            before = inner.coordinates[:first]
+            after = inner.coordinates[first:]
+            fits.append(
+                descend(
+                    search.records,
+                    candidates,
+                    inner.deviations,
+                    np.concatenate([before, further_values, after]),
+                    inner.start,
+                    nominal_jacobian=_nominal_jacobian(inner),
+                    columns=inner.start_columns,
+                    iterations=_ITERATIONS,
+                )
             )
-            for further in self.starts
-        ]
-        best = min(ends, key=lambda end: end.loss)
+        best = min(fits, key=lambda fit: fit.loss)
         if len(best.names) == 1:
-            search.start_points.append((candidate, [point_of(best)]))
+            search.start_points.append((self.candidate, [point_of(best)]))
         search.add(best)
+
+
+def _nominal_jacobian(fit: Fit) -> Real:
+    """(N, P) derivatives of a fit by the deviations of its nominal values."""
+    return fit.jacobian[:, : fit.deviations.size]
 
 
 @dataclass(frozen=True, eq=False)
 class BesideSet(Move):
-    """The most promising effects beside a set."""
+    """The most promising effects beside a set.
+
+    Attributes
+    ----------
+    parent : Fit
+        The set.
+    most : int
+        Further effects that are descended on.
+    """
 
     parent: Fit
     most: int
 
     @property
     def what(self) -> str:
+        """The set in words."""
         return f"further effects beside {' and '.join(self.parent.names)}"
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any], count: int) -> list[BesideSet]:
-        """Sets of so many effects, from the likeliest of one fewer. Several of these while something that
-        interests is left, for what is left says little about which member of the true set has been found;
-        then those as likely as the likeliest of all sets: a small effect beside one of two that look alike
-        decides between them. What interests is unknown where nobody has stated it."""
-        pool = list(best_of_sets(search.explanations).values())
-        parents = [e for e in pool if len(e.names) == count - 1][: 3 if count == 2 else 1]
+        """Sets of so many effects, from the likeliest of one fewer.
+
+        Several of these while something that interests is left, for what is left says little about which
+        member of the true set has been found; then those as likely as the likeliest of all sets: a small
+        effect beside one of two that look alike decides between them. What interests is unknown where nobody
+        has stated it.
+        """
+        ranked = list(best_of_sets(search.explanations).values())
+        most_parents = _PARENTS_OF_PAIRS if count == 2 else _PARENTS_OF_MORE
+        parents = [explanation for explanation in ranked if len(explanation.names) == count - 1]
+        parents = parents[:most_parents]
         if search.case.machine.weighing.stated and not search.unexplained:
-            parents = [e for e in parents if e.log_evidence > pool[0].log_evidence - DECISIVE]
-        return [cls(parent.fit, FOLLOWED_EFFECTS if count == 2 else FOLLOWED_SETS) for parent in parents]
+            least = ranked[0].log_evidence - DECISIVE
+            parents = [explanation for explanation in parents if explanation.log_evidence > least]
+        most = FOLLOWED_EFFECTS if count == 2 else FOLLOWED_SETS
+        return [cls(parent.fit, most) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:
+        """Descend from the best points of the most promising effects, and add the ends."""
         parent = self.parent
-        trials = sorted(self._trials(search), key=lambda trial: trial[1].loss)
-        most_pulled = FOLLOWED_COSTLY * self.most if len(search.start_points) > _DESCENDED else len(trials)
+        points = sorted(self._best_points(search), key=lambda pair: pair[1].loss)
+        # Effects that multiply a nominal value are all tried where one is pulled far, of a long list some.
+        most_with_pulled = len(points)
+        if len(search.start_points) > _MOST_DESCENDED:
+            most_with_pulled = FOLLOWED_COSTLY * self.most
+        values_are_pulled = np.any(np.abs(parent.deviations) > EDGE)
         chosen: dict[tuple[str, float], tuple[Candidate, StartPoint]] = {}
-        for candidate, point in trials:
-            pulled = candidate.kind.multiplies is not None and np.any(np.abs(parent.deviations) > EDGE)
-            if len(chosen) < self.most or (pulled and len(chosen) < most_pulled):
+        for candidate, point in points:
+            is_pulled = candidate.kind.multiplies is not None and values_are_pulled
+            if len(chosen) < self.most or (is_pulled and len(chosen) < most_with_pulled):
                 # Beside contacts that switch, and values pulled far, the one side may look better and the
                 # other be so.
-                side = candidate.axes[0].low if parent.non_smooth or pulled else 0.0
+                side = candidate.axes[0].low if parent.non_smooth or is_pulled else 0.0
                 chosen.setdefault((candidate.effect, side), (candidate, point))
-        nominal = parent.jacobian[:, : parent.deviations.size]
+
         # What is not worth it once all else has followed is not descended on; unless it is so much worse that
         # the linearisation says nothing (of 325 in between, one ended more than 15 below).
-        ends = [
-            _from(search, parent, candidate, point, nominal)
-            for candidate, point in chosen.values()
-            if not -DECISIVE < parent.loss - point.loss < SUBSTANTIAL
+        fits = []
+        for candidate, point in chosen.values():
+            gain = parent.loss - point.loss
+            if not -DECISIVE < gain < SUBSTANTIAL:
+                fits.append(_descend_from(search, parent, candidate, point, _nominal_jacobian(parent)))
+        for rank, fit in enumerate(sorted(fits, key=lambda fit: fit.loss)):
+            search.add(search.polish(fit, rank, parent))
+
+    def _best_points(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, StartPoint]]:
+        """The best point of every candidate beside the parent, but of those that it has in some form."""
+        parent = self.parent
+        held = set()
+        for candidate in parent.candidates:
+            held |= {candidate.effect, candidate.kind.contains}
+        held -= {None}
+        listed = [
+            (candidate, points)
+            for candidate, points in search.start_points
+            if not {candidate.effect, candidate.kind.contains} & held
         ]
-        for k, end in enumerate(sorted(ends, key=lambda end: end.loss)):
-            search.add(search.polish(end, k, parent))
+        if len(search.start_points) > _MOST_DESCENDED:
 
-    def _trials(self, search: SearchLoop[Any]) -> Iterator[tuple[Candidate, StartPoint]]:
-        """The best point of every candidate beside the parent."""
-        held = {name for c in self.parent.candidates for name in (c.effect, c.kind.contains)} - {None}
-        listed = [(c, p) for c, p in search.start_points if not {c.effect, c.kind.contains} & held]
-        if len(search.start_points) > _DESCENDED:
+            def superposed_loss(pair: tuple[Candidate, list[StartPoint]]) -> float:
+                losses = [point.loss for point in superposed(search.records, parent, pair[1])]
+                # What cannot be superposed is simulated in any case.
+                return min(losses, default=-np.inf)
 
-            def left(one: tuple[Candidate, list[StartPoint]]) -> float:
-                return min((p.loss for p in superposed(search.records, self.parent, one[1])), default=-np.inf)
-
-            listed = sorted(listed, key=left)[:_SIMULATED]
+            listed = sorted(listed, key=superposed_loss)[:_MOST_SIMULATED]
         for candidate, points in listed:
             # A frequency, and a zero that no other output tells, may be any other beside another effect.
-            anew = candidate.kind.harmonic is not None or _turned(search, candidate)
-            candidate, near = search.candidate_beside(self.parent, candidate, points[:1] if anew else points)
-            if anew:
-                further = points_of(search.records, self.parent, candidate, every=2)[:FOLLOWED_SETS]
+            is_sought_anew = candidate.kind.harmonic is not None or _has_free_zero(search, candidate)
+            known = points[:1] if is_sought_anew else points
+            candidate, near = search.candidate_beside(parent, candidate, known)
+            if is_sought_anew:
+                anew = points_of(search.records, parent, candidate, every=_EVERY_OTHER)[:FOLLOWED_SETS]
                 if candidate.kind.harmonic is not None:
                     # Their losses are a linear arm's; where it is not, they may leave less than it would.
-                    further += beside(search.records, self.parent, candidate, further)
-                near += further
-            yield from ((candidate, point) for point in sorted(near, key=lambda point: point.loss)[:1])
+                    anew += beside(search.records, parent, candidate, anew)
+                near += anew
+            if near:
+                yield candidate, min(near, key=by_loss)
 
 
 @dataclass(frozen=True, eq=False)
 class InPlaceOf(Move):
-    """An effect that multiplies a nominal value, in place of that value pulled beyond belief."""
+    """An effect that multiplies a nominal value, in place of that value pulled beyond belief.
+
+    Attributes
+    ----------
+    parent : Fit
+        In which the value is pulled.
+    candidate : Candidate
+        The effect.
+    coordinates : (A,) array
+        Where it does to the machine what the value did.
+    deviations : (P,) array
+        Of the parent, the value's own back at what is stated.
+    """
 
     parent: Fit
     candidate: Candidate
@@ -249,179 +368,249 @@ class InPlaceOf(Move):
 
     @property
     def what(self) -> str:
+        """Name of the effect."""
         return self.candidate.effect
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any], parent: Fit) -> Iterator[InPlaceOf]:
-        nominal, listed = search.records.nominal, [candidate for candidate, _ in search.start_points]
+        """One for every value beyond the edge of its prior that an effect multiplies, which is listed and not
+        in the set."""
+        nominal = search.records.nominal
+        listed = [candidate for candidate, _ in search.start_points]
         factors = nominal.factors(parent.deviations)
         for k, key in enumerate(nominal.keys):
             if abs(parent.deviations[k]) < EDGE:
                 continue
-            found = in_place_of(key, factors[key], listed)
-            if found is not None and found[0].effect not in parent.names:
-                yield cls(parent, *found, np.where(np.arange(nominal.count) == k, 0.0, parent.deviations))
+            effect = in_place_of(key, factors[key], listed)
+            if effect is None:
+                continue
+            candidate, coordinates = effect
+            if candidate.effect not in parent.names:
+                is_this_value = np.arange(nominal.count) == k
+                yield cls(parent, candidate, coordinates, np.where(is_this_value, 0.0, parent.deviations))
 
     def apply(self, search: SearchLoop[Any]) -> None:
+        """Add the end of the descent from there."""
         point = StartPoint(self.parent.loss, self.coordinates, self.deviations, self.parent.start)
-        nominal = self.parent.jacobian[:, : self.deviations.size]
-        end = _from(search, self.parent, self.candidate, point, nominal)
-        search.add(search.polish(end, 0, self.parent))
+        nominal_jacobian = _nominal_jacobian(self.parent)
+        fit = _descend_from(search, self.parent, self.candidate, point, nominal_jacobian)
+        search.add(search.polish(fit, 0, self.parent))
 
 
 def in_place_of(key: str, factor: float, listed: Sequence[Candidate]) -> tuple[Candidate, Real] | None:
-    """The effect that multiplies a nominal parameter by this factor, or by the nearest one worth a name."""
+    """The effect that multiplies a nominal value, and its coordinates (A,).
+
+    Parameters
+    ----------
+    key : str
+        Of the value.
+    factor : float
+        By which it is to be multiplied; where that is outside the effect's range, the nearest one inside.
+    listed : sequence of Candidate
+        Among which the effect is sought, on the factor's side of 1.
+
+    Returns
+    -------
+    (Candidate, array) or None
+        None where no candidate multiplies the value.
+    """
     sign = 1 if factor > 1 else -1
     for candidate in listed:
         if candidate.kind.multiplies == key and candidate.sign == sign:
-            return candidate, np.clip([candidate.axes[0].coordinate(factor)], *candidate.box)
+            coordinates = np.clip([candidate.axes[0].coordinate(factor)], *candidate.box)
+            return candidate, coordinates
     return None
 
 
 @dataclass(frozen=True, eq=False)
 class InWindows(Move):
-    """Torques over the angle and what stands beside them, from where fits in windows ended."""
+    """Torques over the angle and what stands beside them, from where fits in windows ended.
+
+    Attributes
+    ----------
+    acting : sequence of Candidate
+        Effects whose torque depends on the angle.
+    """
 
     acting: Sequence[Candidate]
 
     @property
     def what(self) -> str:
+        """The move in words."""
         return "fits in windows"
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[InWindows]:
+        """One, for a flexible link with such a candidate."""
         acting = [
-            c for c, _ in search.start_points if c.kind.absolute_angle or c.kind.harmonic == "hub_angle"
+            candidate
+            for candidate, _ in search.start_points
+            if candidate.kind.absolute_angle or candidate.kind.harmonic == "hub_angle"
         ]
-        return [cls(acting)] if acting and isinstance(search.case, Case) else []
+        if acting and isinstance(search.case, Case):
+            return [cls(acting)]
+        return []
 
     def apply(self, search: SearchLoop[Any]) -> None:
+        """Fit the effects alone and in pairs in windows; add what the best lead to in free runs."""
         assert isinstance(search.case, Case)
-        base, states = search.nominal_alone.fit, search.records.state_spread.size
+        nominal_fit = search.nominal_alone.fit
         windows = search.for_case(in_windows(search.case))
         assert isinstance(windows.records, Records)
-        start, _ = fit_record_starts(windows.records, base.deviations, (), windows.records.guessed_start())
-        windows.add(base.continued(windows.records, start))
-        around = windows.nominal_alone.fit
+        guess = windows.records.guessed_start()
+        start, _ = fit_record_starts(windows.records, nominal_fit.deviations, (), guess)
+        around = windows.add(nominal_fit.continued(windows.records, start)).fit
         for candidate in self.acting:
             points = points_of(windows.records, around, candidate)
             if points and not search.skips(self.what):
-                windows.add(descended(windows, around, candidate, points, around.jacobian))
-        windows.start_points = [(c, points) for c, points in search.start_points if c.kind.harmonic != "time"]
-        best = min((e.fit for e in windows.explanations), key=lambda end: end.loss)
+                windows.add(descend_from_best(windows, around, candidate, points, around.jacobian))
+        # Every window begins a torque over time anew, so that its frequency says nothing.
+        windows.start_points = [
+            (candidate, points)
+            for candidate, points in search.start_points
+            if candidate.kind.harmonic != "time"
+        ]
+        best = min((explanation.fit for explanation in windows.explanations), key=lambda fit: fit.loss)
         if best.loss > around.loss - DECISIVE:
             return
         if not search.skips(self.what):
             BesideSet(best, FOLLOWED_SETS).apply(windows)
+
+        states = search.records.state_spread.size
         for count in (1, 2):
             of_count = [e.fit for e in windows.explanations if len(e.names) == count]
-            for end in sorted(of_count, key=lambda end: end.loss)[:FOLLOWED_COSTLY]:
-                start = FittedStart(end.start.states[:, :states], end.start.zeros)
-                search.add(refine_sizes(search.records, end.continued(search.records, start)))
+            for fit in sorted(of_count, key=lambda fit: fit.loss)[:FOLLOWED_COSTLY]:
+                # The start of the first window is that of the record.
+                start = FittedStart(fit.start.states[:, :states], fit.start.zeros)
+                search.add(refine_sizes(search.records, fit.continued(search.records, start)))
 
 
 @dataclass(frozen=True, eq=False)
 class Scan(Move):
     """A set with contacts once more from far values of all its parameters."""
 
-    end: Fit
+    fit: Fit
 
     @property
     def what(self) -> str:
+        """The move in words."""
         return "scans of sets with contacts"
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> Iterator[Scan]:
-        """The likeliest that is left, or has gained since its last."""
-        done: dict[tuple[str, ...], float] = {}
+        """The likeliest set that is left, or has gained since its last scan; a few in all."""
+        loss_at_scan: dict[tuple[str, ...], float] = {}
         for _ in range(FOLLOWED_COSTLY):
-            likeliest = (
-                e
-                for key, e in best_of_sets(search.explanations).items()
-                if e.fit.non_smooth and e.fit.loss < done.get(key, np.inf) - SUBSTANTIAL
-            )
-            this = next(likeliest, None)
-            if this is None:
+            for sorted_names, explanation in best_of_sets(search.explanations).items():
+                last_loss = loss_at_scan.get(sorted_names, np.inf)
+                if explanation.fit.non_smooth and explanation.fit.loss < last_loss - SUBSTANTIAL:
+                    break
+            else:
                 return
-            done[this.sorted_names] = this.fit.loss
-            yield cls(this.fit)
+            loss_at_scan[sorted_names] = explanation.fit.loss
+            yield cls(explanation.fit)
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        search.add(refine_sizes(search.records, scan_far_values(search.records, self.end)))
+        """Add the best that is found."""
+        search.add(refine_sizes(search.records, scan_far_values(search.records, self.fit)))
 
 
 @dataclass(frozen=True, eq=False)
 class FromContacts(Move):
     """A set with contacts once more from starts of the records that feel them."""
 
-    end: Fit
+    fit: Fit
 
     @property
     def what(self) -> str:
+        """The move in words."""
         return "starts of records in free play"
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> Iterator[FromContacts]:
-        """The likeliest sets of each size."""
-        if not search.case.machine.unknown_start.tried.size:
+        """The likeliest sets of each size; from then on starts of all records feel contacts."""
+        if search.case.machine.unknown_start.tried.size == 0:
             return
         search.starts_feel_contacts = True
-        sets = [e for e in best_of_sets(search.explanations).values() if e.fit.non_smooth]
+        best = best_of_sets(search.explanations).values()
+        with_contacts = [explanation for explanation in best if explanation.fit.non_smooth]
         for count in range(1, search.case.machine.weighing.most_effects + 1):
-            for e in [e for e in sets if len(e.names) == count][:FOLLOWED_COSTLY]:
-                yield cls(e.fit)
+            of_count = [explanation for explanation in with_contacts if len(explanation.names) == count]
+            for explanation in of_count[:FOLLOWED_COSTLY]:
+                yield cls(explanation.fit)
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        end = self.end
+        """Add the better of the fit and its descent from such starts."""
         assert isinstance(search.records, Records)
-        start, _ = fit_record_starts(search.records, end.deviations, end.effects, end.start, touching=True)
-        nominal = end.jacobian[:, : end.deviations.size]
-        again = end.continued(
-            search.records, start, nominal_jacobian=nominal, touching=True, iterations=_ITERATIONS
+        fit = self.fit
+        start, _ = fit_record_starts(search.records, fit.deviations, fit.effects, fit.start, touching=True)
+        descended = fit.continued(
+            search.records,
+            start,
+            nominal_jacobian=_nominal_jacobian(fit),
+            touching=True,
+            iterations=_ITERATIONS,
         )
-        search.add(min(end, again, key=lambda one: one.loss))
+        search.add(min(fit, descended, key=lambda fit: fit.loss))
 
 
 @dataclass(frozen=True, eq=False)
 class LookAlike(Move):
-    """A cause beyond the list in place of the effect that it looks like."""
+    """A cause beyond the list in place of the effect that it looks like.
 
-    end: Fit
+    Attributes
+    ----------
+    fit : Fit
+        With the effect.
+    kind : type of Effect
+        The cause, of `plant.effects.LOOK_ALIKES`.
+    """
+
+    fit: Fit
     kind: type[Effect]
 
     @property
     def what(self) -> str:
+        """The move in words."""
         return "causes beyond the list that look like an effect"
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> Iterator[LookAlike]:
         """Wherever that may be the answer, and alone: what one effect looks like may look like two others as
-        well."""
+        well. None but for a flexible link."""
         if not isinstance(search.case, Case):
             return
         best = best_of_sets(search.explanations)
         likeliest = list(best.values())[:FOLLOWED_EFFECTS]
         for kind in LOOK_ALIKES.values():
-            sets = [e for e in likeliest if kind.look_alike_of in e.names][:FOLLOWED_SETS]
-            alone = [e for e in best.values() if e.names == (kind.look_alike_of,) and e not in sets]
-            yield from (cls(e.fit, kind) for e in (*sets, *alone))
+            with_effect = [e for e in likeliest if kind.look_alike_of in e.names][:FOLLOWED_SETS]
+            alone = best.get((str(kind.look_alike_of),))
+            if alone is not None and alone not in with_effect:
+                with_effect.append(alone)
+            for explanation in with_effect:
+                yield cls(explanation.fit, kind)
 
     def apply(self, search: SearchLoop[Any]) -> None:
-        end, k = self.end, self.end.names.index(str(self.kind.look_alike_of))
-        rig = search.records.nominal.at(end.deviations).description
-        other = self.kind.in_place_of(end.candidates[k], end.coordinates_of(k), rig)
-        candidates = (*end.candidates[:k], other, *end.candidates[k + 1 :])
-        first = sum(len(c.axes) for c in end.candidates[:k])
-        rest = end.coordinates[:first], end.coordinates[first + len(end.candidates[k].axes) :]
-        trials = [np.concatenate([rest[0], start, rest[1]]) for start in other.starts]
-        _, d, x = best_after_following(search.records, end, candidates, trials)
-        search.add(descend(search.records, candidates, d, x, end.start))
+        """Add the end from the best of the cause's starts."""
+        fit = self.fit
+        k = fit.names.index(str(self.kind.look_alike_of))
+        replaced = fit.candidates[k]
+        rig = search.records.nominal.at(fit.deviations).description
+        look_alike = self.kind.in_place_of(replaced, fit.coordinates_of(k), rig)
+        candidates = (*fit.candidates[:k], look_alike, *fit.candidates[k + 1 :])
+        first = sum(len(candidate.axes) for candidate in fit.candidates[:k])
+        before = fit.coordinates[:first]
+        after = fit.coordinates[first + len(replaced.axes) :]
+        trials = [np.concatenate([before, coordinates, after]) for coordinates in look_alike.starts]
+        _, d, x = best_after_following(search.records, fit, candidates, trials)
+        search.add(descend(search.records, candidates, d, x, fit.start))
 
 
 def _local_minima(points: Sequence[StartPoint]) -> list[StartPoint]:
-    """Of a grid of one value, best first; of several values none is sought."""
+    """Local minima of the loss over a grid of one coordinate, best first; none of a grid of several."""
     if points[0].coordinates.size != 1:
         return []
-    line = sorted(points, key=lambda point: float(point.coordinates[0]))
-    peaks, _ = find_peaks([-np.inf, *(-point.loss for point in line), -np.inf])
-    return sorted([line[k - 1] for k in peaks], key=lambda point: point.loss)
+    along_grid = sorted(points, key=lambda point: float(point.coordinates[0]))
+    # A minimum may be at an end of the grid.
+    peaks, _ = find_peaks([-np.inf, *(-point.loss for point in along_grid), -np.inf])
+    return sorted([along_grid[peak - 1] for peak in peaks], key=by_loss)

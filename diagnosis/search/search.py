@@ -17,7 +17,13 @@ from diagnosis.fit.records import FittedStart, Records, mean_square_left
 from diagnosis.fit.starts import StartPoint, beside
 from diagnosis.fit.windows import Windows
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
-from diagnosis.search.loop import FOLLOWED_COSTLY, FOLLOWED_EFFECTS, FOLLOWED_SETS, Progress, SearchLoop
+from diagnosis.search.loop import (
+    FOLLOWED_COSTLY,
+    FOLLOWED_EFFECTS,
+    FOLLOWED_SETS,
+    Progress,
+    SearchLoop,
+)
 from diagnosis.search.moves import (
     Alone,
     BesideSet,
@@ -31,12 +37,23 @@ from diagnosis.search.moves import (
 from diagnosis.search.settled import fit_record_starts
 from plant.effects.search_space import Candidate
 
+# Iterations of the nominal machine alone: everything begins there, and its starts may be far off.
+_NOMINAL_ITERATIONS = 12
+# Largest sets that are sought whatever they gain: two effects may show only together with a third.
+_SOUGHT_IN_ANY_CASE = 3
+
 
 class Search(SearchLoop[Explanation]):
-    """All that was fitted to a case, the nominal alone first.
+    """All that was fitted to a case beside a model error.
 
-    windows : that records are seen in, each from its own start; None: as they run freely. refuted : effects
-    that validation records do not have, whatever the others say.
+    Attributes
+    ----------
+    windows : Windows or None
+        Windows that records are seen in, each from its own start; None: as they run freely.
+    refuted : set of str
+        Effects that validation records do not have, whatever the others say; a judge adds to it.
+    held_out : Records
+        Records that are only predicted, but for their starts.
     """
 
     records: Records
@@ -53,19 +70,26 @@ class Search(SearchLoop[Explanation]):
         self.refuted: set[str] = set()
         self.records = Records(case, case.estimation, windows)
         self.held_out = Records(case, case.held_out, windows)
-        self.timed_records = self.records, self.held_out
+        self.timed_records = (self.records, self.held_out)
         # Estimation records each by itself, as `prediction_residuals` asks for them.
         self._single_logs: dict[int, Records] = {}
 
     @cached_property
     def drift_free_windows(self) -> Windows | None:
-        """Windows in which no drift grows; None for a machine that forgets its inputs, or whose simulation is
-        held near the records and fits their starts itself."""
-        settles = getattr(self.case.machine, "settled", None) is not None
-        return self.windows or (None if settles else Windows.of(self.case))
+        """Windows in which no drift grows.
+
+        None for a machine that forgets its inputs, or whose simulation is held near the records and fits
+        their starts itself.
+        """
+        if self.windows is not None:
+            return self.windows
+        fits_starts_itself = getattr(self.case.machine, "settled", None) is not None
+        if fits_starts_itself:
+            return None
+        return Windows.of(self.case)
 
     def for_case(self, case: CaseOfMachine) -> Search:
-        """Of the same records in another form."""
+        """An empty search of another form of the same records, in the same windows, within the same time."""
         return Search(case, self.progress, self.deadline_s, self.windows)
 
     def run(self) -> None:
@@ -74,27 +98,34 @@ class Search(SearchLoop[Explanation]):
         Beyond three only while the likeliest leaves more of the motion than is stated not to interest, and
         the last size was worth it.
         """
-        nothing = np.zeros(self.records.nominal.count)
-        start, _ = fit_record_starts(self.records, nothing, (), self.records.guessed_start())
-        self.add(descend(self.records, (), nothing, np.zeros(0), start, iterations=12))
+        as_stated = np.zeros(self.records.nominal.count)
+        start, _ = fit_record_starts(self.records, as_stated, (), self.records.guessed_start())
+        no_coordinates = np.zeros(0)
+        self.add(descend(self.records, (), as_stated, no_coordinates, start, iterations=_NOMINAL_ITERATIONS))
+
         self.apply_moves(Alone.proposed(self), 0.05, 0.1)
         self.apply_moves(FromPoints.proposed(self), 0.15, 0.3)
         self.finish_single_effects()
         self.apply_moves(Enlarge.proposed(self, self.explanations), 0.45)
+
         for count in range(2, self.case.machine.weighing.most_effects + 1):
-            # Whether the likeliest set of so many effects is much likelier than that of one fewer.
-            largest, smaller = (
-                max((e.log_evidence for e in self.explanations if len(e.names) == n), default=-np.inf)
-                for n in (count - 1, count - 2)
-            )
-            if count > 3 and not (self.unexplained and largest > smaller + DECISIVE):
-                break
-            self.apply_moves(BesideSet.proposed(self, count), min(0.45 + 0.25 * (count - 2), 0.9), 0.1)
+            if count > _SOUGHT_IN_ANY_CASE:
+                was_worth_it = self._best_of_count(count - 1) > self._best_of_count(count - 2) + DECISIVE
+                if not (self.unexplained and was_worth_it):
+                    break
+            begin = min(0.45 + 0.25 * (count - 2), 0.9)
+            self.apply_moves(BesideSet.proposed(self, count), begin, 0.1)
+
         if self.unexplained:
             self.apply_moves(InWindows.proposed(self), 0.95)
             self.apply_moves(Scan.proposed(self), 0.97)
             self.apply_moves(FromContacts.proposed(self), 0.97)
         self.apply_moves(LookAlike.proposed(self), 0.98)
+
+    def _best_of_count(self, count: int) -> float:
+        """The largest log evidence of sets of so many effects; -inf without one."""
+        of_count = [e.log_evidence for e in self.explanations if len(e.names) == count]
+        return max(of_count, default=-np.inf)
 
     @property
     def unexplained(self) -> bool:
@@ -104,129 +135,158 @@ class Search(SearchLoop[Explanation]):
     def candidate_alone(
         self, candidate: Candidate, points: list[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
+        """See `SearchLoop.candidate_alone`; beside a model error every candidate is tried as it is."""
         return candidate, points
 
     def candidate_beside(
         self, parent: Fit, candidate: Candidate, points: Sequence[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
-        """The best and, because beside another effect any size may be right, some of the rest."""
-        rest = points[FOLLOWED_SETS:]
-        some = [*points[:FOLLOWED_SETS], *rest[:: max(1, len(rest) // FOLLOWED_SETS)]]
-        return candidate, beside(self.records, parent, candidate, some)
+        """See `SearchLoop.candidate_beside`.
 
-    def polish(self, end: Fit, rank: int, around: Fit) -> Fit:
-        alone = not around.candidates
-        if rank >= (FOLLOWED_EFFECTS if alone else FOLLOWED_COSTLY):
-            return end
-        if alone:
+        The best points and, because beside another effect any size may be right, some of the others.
+        """
+        others = points[FOLLOWED_SETS:]
+        every = max(1, len(others) // FOLLOWED_SETS)
+        simulated = [*points[:FOLLOWED_SETS], *others[::every]]
+        return candidate, beside(self.records, parent, candidate, simulated)
+
+    def polish(self, fit: Fit, rank: int, around: Fit) -> Fit:
+        """See `SearchLoop.polish`; the first few by loss are worth it."""
+        is_alone = not around.candidates
+        if rank >= (FOLLOWED_EFFECTS if is_alone else FOLLOWED_COSTLY):
+            return fit
+        if is_alone:
             # Slopes of the nominal lead to an end that need not be one by slopes of its own.
-            end = end.continued(self.records, **FINE)
-        return refine_sizes(self.records, self.restarted(end))
+            fit = fit.continued(self.records, **FINE)
+        return refine_sizes(self.records, self.restarted(fit))
 
-    def restarted(self, end: Fit) -> Fit:
-        """Descended on where starts sought with these effects leave less: the nominal's may be far off, and
-        where nobody knows a linear part no step leads from there."""
-        if self.case.machine.unknown_start.responses is not None or not end.start.states.size:
-            return end
-        start, e = fit_record_starts(self.records, end.deviations, end.effects, end.start)
-        loss, _ = loss_at(self.records, e, end.deviations, start)
-        return end if loss > end.loss - SUBSTANTIAL else end.continued(self.records, start)
+    def restarted(self, fit: Fit) -> Fit:
+        """The fit descended on where starts sought with its effects leave less.
+
+        Those of the nominal may be far off, and where nobody knows a linear part no step leads from there.
+        """
+        has_linear_part = self.case.machine.unknown_start.responses is not None
+        if has_linear_part or fit.start.states.size == 0:
+            return fit
+        start, e = fit_record_starts(self.records, fit.deviations, fit.effects, fit.start)
+        loss, _ = loss_at(self.records, e, fit.deviations, start)
+        if loss > fit.loss - SUBSTANTIAL:
+            return fit
+        return fit.continued(self.records, start)
 
     def held_out_share_of(self, explanation: Explanation, k: int) -> float:
-        """Share of the motion that the k-th effect changes of held-out records, all else as it is; of the
-        output that shows most of it."""
-        end, held = explanation.fit, self.held_out
-        rest = [effect for j, effect in enumerate(end.effects) if j != k]
-        start = self._beginning(held, end.start)
-        pairs = zip(
-            held.residuals(end.deviations, end.effects, start),
-            held.residuals(end.deviations, rest, start),
-            strict=True,
+        """Share of the motion that the k-th effect changes of held-out records, all else as it is.
+
+        An RMS over an RMS, of the output that shows most of it.
+        """
+        fit = explanation.fit
+        held_out = self.held_out
+        other_effects = [effect for j, effect in enumerate(fit.effects) if j != k]
+        start = self._start_with_zeros(held_out, fit.start)
+        with_effect = held_out.residuals(fit.deviations, fit.effects, start)
+        without_effect = held_out.residuals(fit.deviations, other_effects, start)
+        motion = held_out.levels.motion_energy.reshape(-1, self.case.noise.size).sum(axis=0)
+        changed = sum(
+            np.sum((present - absent) ** 2, axis=0)
+            for present, absent in zip(with_effect, without_effect, strict=True)
         )
-        motion = held.levels.motion_energy.reshape(-1, self.case.noise.size).sum(axis=0)
-        changed = sum(np.sum((with_it - without) ** 2, axis=0) for with_it, without in pairs)
         return float(np.sqrt(np.max(changed / motion)))
 
     def descended_to_end(self, explanation: Explanation) -> Explanation:
-        """Descended to its end."""
+        """The explanation after a fine descent from where it is, added to all others."""
         return self.add(explanation.fit.continued(self.records, **FINE))
 
-    def at_stated_values(self, of: Explanation | None = None) -> Explanation:
-        """With nominal values as stated, effects as they are: only the starts are fitted."""
-        end = (of or self.nominal_alone).fit
-        stated = np.zeros(end.deviations.size)
-        start, e = fit_record_starts(
-            self.records, stated, end.effects, self._beginning(self.records, end.start)
-        )
-        loss, prior = loss_at(self.records, e, stated, start)
-        weights = self.records.levels.weights(e)
-        moved = replace(
-            end,
-            deviations=stated,
+    def at_stated_values(self, explanation: Explanation | None = None) -> Explanation:
+        """An explanation (default: no effect) with nominal values as stated, effects as they are.
+
+        Only the starts are fitted; it is not added to the others.
+        """
+        if explanation is None:
+            explanation = self.nominal_alone
+        fit = explanation.fit
+        as_stated = np.zeros(fit.deviations.size)
+        begin = self._start_with_zeros(self.records, fit.start)
+        start, e = fit_record_starts(self.records, as_stated, fit.effects, begin)
+        loss, prior_loss = loss_at(self.records, e, as_stated, start)
+        stated_fit = replace(
+            fit,
+            deviations=as_stated,
             start=start,
             residual_coefficients=e,
-            weights=weights,
+            weights=self.records.levels.weights(e),
             loss=loss,
-            prior_loss=prior,
+            prior_loss=prior_loss,
         )
-        return self.explain(moved)
+        return self.explain(stated_fit)
 
-    def explain(self, end: Fit) -> Explanation:
-        """With what it predicts of the held-out records, their starts fitted (`settled`)."""
-        records, held = self.records, self.held_out
-        beginning = self._beginning(held, end.start)
-        touching = self.starts_feel_contacts and end.non_smooth
-        start, e = fit_record_starts(held, end.deviations, end.effects, beginning, touching=touching)
-        left, left_held_out = records.residuals_from(end.residual_coefficients), held.residuals_from(e)
-        states = 0.5 * np.sum((start.states / held.state_spread) ** 2, axis=1)
+    def explain(self, fit: Fit) -> Explanation:
+        """The fit with what it predicts of the held-out records, their starts fitted."""
+        records = self.records
+        held_out = self.held_out
+        begin = self._start_with_zeros(held_out, fit.start)
+        touching = self.starts_feel_contacts and fit.non_smooth
+        start, e = fit_record_starts(held_out, fit.deviations, fit.effects, begin, touching=touching)
+        residuals = records.residuals_from(fit.residual_coefficients)
+        held_out_residuals = held_out.residuals_from(e)
+        start_cost = 0.5 * np.sum((start.states / held_out.state_spread) ** 2, axis=1)
+        losses = np.concatenate([records.losses(fit.residual_coefficients), held_out.losses(e) + start_cost])
+        shares = [records.rms_shares(residuals), held_out.rms_shares(held_out_residuals)]
+        ratios = [
+            mean_square_left(records.energies(residuals, carried=True)),
+            mean_square_left(held_out.energies(held_out_residuals, carried=True)),
+        ]
         return Explanation(
-            end,
-            -np.concatenate([records.losses(end.residual_coefficients), held.losses(e) + states]),
-            -end.prior_loss,
-            log_occam_factor(records, end),
-            left,
-            left_held_out,
-            np.array([records.rms_shares(left), held.rms_shares(left_held_out)]),
-            np.array(
-                [
-                    mean_square_left(of.energies(e, carried=True))
-                    for of, e in ((records, left), (held, left_held_out))
-                ]
-            ),
+            fit,
+            log_likelihoods=-losses,
+            log_prior=-fit.prior_loss,
+            log_volume=log_occam_factor(records, fit),
+            residuals=residuals,
+            held_out_residuals=held_out_residuals,
+            residual_shares=np.array(shares),
+            energy_ratios=np.array(ratios),
         )
 
     def whitened_residuals(
-        self, found: Explanation, experiments: Sequence[RecordOfMachine] | None = None
+        self, explanation: Explanation, experiments: Sequence[RecordOfMachine] | None = None
     ) -> dict[str, Real]:
+        """See `SearchLoop.whitened_residuals`; what the explanation holds, nothing is simulated."""
         records = (*self.records.experiments, *self.held_out.experiments)
-        parts = zip(records, (*found.residuals, *found.held_out_residuals), strict=True)
-        left = {e.name: part / self.case.noise for e, part in parts}
-        return {e.name: left[e.name] for e in experiments or self.case.experiments}
+        residuals = (*explanation.residuals, *explanation.held_out_residuals)
+        of_all = {e.name: left / self.case.noise for e, left in zip(records, residuals, strict=True)}
+        if experiments is None:
+            experiments = self.case.experiments
+        return {e.name: of_all[e.name] for e in experiments}
 
     @cached_property
     def uninteresting_energy(self) -> float:
         """See `SearchLoop.uninteresting_energy`: the share of the motion that no fit follows either."""
         share = UNINTERESTING * self.case.machine.weighing.model_error
-        logs = (self.records, self.held_out) if len(self.case.estimation) > 1 else (self.held_out,)
-        motion = [records.levels.motion_energy.reshape(-1, self.case.noise.size) for records in logs]
+        # A single estimation record is no log that is left out.
+        compared = [self.held_out]
+        if len(self.case.estimation) > 1:
+            compared = [self.records, self.held_out]
+        motion = [records.levels.motion_energy.reshape(-1, self.case.noise.size) for records in compared]
         return share**2 * float(np.sum(np.concatenate(motion) / self.case.noise**2))
 
     def prediction_residuals(
         self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart
     ) -> Real:
-        """See `SearchLoop.predicted`; in windows what is left has no part of what starts of windows do."""
-        record = self.case.estimation[log]
+        """See `SearchLoop.prediction_residuals`.
+
+        In windows what is left has no part of what starts of windows do.
+        """
         if log not in self._single_logs:
+            record = self.case.estimation[log]
             self._single_logs[log] = Records(self.case, (record,), self.windows)
             self.timed_records = (*self.timed_records, self._single_logs[log])
         records = self._single_logs[log]
-        near = FittedStart(start.states[log : log + 1], start.zeros)
-        _, e = fit_record_starts(records, deviations, effects, near)
+        begin = FittedStart(start.states[log : log + 1], start.zeros)
+        _, e = fit_record_starts(records, deviations, effects, begin)
         return np.asarray(records.residuals_from(e)[0] / self.case.noise)
 
-    def _beginning(self, held: Records, fitted: FittedStart) -> FittedStart:
-        """Starts of records as their first samples say, sensors at the zeros that others have."""
-        start = held.guessed_start()
-        if not start.zeros.size:
+    def _start_with_zeros(self, records: Records, fitted: FittedStart) -> FittedStart:
+        """Starts of records as their first samples say, sensors at the zeros that others were fitted to."""
+        start = records.guessed_start()
+        if start.zeros.size == 0:
             return start
         return start.with_zeros(fitted.zeros, self.case.machine.unknown_start.state_per_zero)

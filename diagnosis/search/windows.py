@@ -18,64 +18,87 @@ from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.machine.machine_protocol import Real, RecordOfMachine, UnknownStart
 from plant.effects import Effect
 
-# Windows of the longest record, and samples between which a speed is read off.
-_WINDOWS, _SPEED_SAMPLES = 8, 5
-_FREE_RAD = 100.0  # sixteen turns: the prior of a state that nobody knows, nearly flat
+# Windows of the longest record: an eighth of it is too short to fall into another minimum, and eight times
+# the states of one start are still few beside its samples.
+_WINDOWS = 8
+# Samples between which the speed at the start of a window is read off: their noise divided by their time.
+_SPEED_SAMPLES = 5
+# Prior standard deviation of a hub angle that nobody knows, rad: sixteen turns, nearly flat.
+_FREE_ANGLE_RAD = 100.0
 
 
 @dataclass(frozen=True, eq=False)
 class ArmInWindows(FlexibleArm):
-    """States of all windows after each other. Neglected: delays and lags begin each window at rest,
-    disturbances and drifts as the record did."""
+    """A flexible arm whose states at the start are those of all windows after each other.
+
+    Neglected: delays and lags begin each window at rest, disturbances and drifts as the record did.
+
+    Attributes
+    ----------
+    window_samples : int
+        Samples of a window; the last one of a record may be shorter.
+    windows : int
+        Of the longest record. States of windows that a shorter record does not have do nothing.
+    """
 
     window_samples: int = 1
     windows: int = 1
 
     @property
-    def _once(self) -> FlexibleArm:
+    def _in_one_window(self) -> FlexibleArm:
+        """The arm as it runs freely."""
         return FlexibleArm(self.rig, self.outputs, self.model_error)
 
     @property
     def unknown_start(self) -> UnknownStart:
-        once = self._once.unknown_start
-        L, dt_s = self.window_samples, self.rig.sampling.dt_s
+        """States of all windows, window by window; guesses are read off the measured hub angle."""
+        of_window = self._in_one_window.unknown_start
+        n_states = of_window.state_spread.size
+        samples = self.window_samples
+        dt_s = self.rig.sampling.dt_s
 
         def guess(record: RecordOfMachine) -> Real:
             angle = record.output[:, 0]
-            found = np.zeros((self.windows, once.state_spread.size))
-            at = np.minimum(np.arange(self.windows) * L, angle.size - _SPEED_SAMPLES - 1)
-            found[:, 0] = angle[at]
-            found[1:, 1] = (angle[at + _SPEED_SAMPLES] - angle[at])[1:] / (_SPEED_SAMPLES * dt_s)
-            return found.ravel()
+            states = np.zeros((self.windows, n_states))
+            # A window beyond the end of the record takes its last angles.
+            first_rows = np.minimum(np.arange(self.windows) * samples, angle.size - _SPEED_SAMPLES - 1)
+            states[:, 0] = angle[first_rows]
+            speeds_rad_s = (angle[first_rows + _SPEED_SAMPLES] - angle[first_rows]) / (_SPEED_SAMPLES * dt_s)
+            # The record itself begins at rest.
+            states[1:, 1] = speeds_rad_s[1:]
+            return states.ravel()
 
-        def responses(effects: Sequence[Effect], samples: int) -> list[Real]:
-            whole, each = [], once.responses(effects, L) if once.responses else ()
-            for first in range(0, self.windows * L, L):
-                for response in each:
-                    placed = np.zeros((samples, response.shape[1]))
-                    placed[first : first + L] = response[: max(samples - first, 0)]
-                    whole.append(placed)
-            return whole
+        def responses(effects: Sequence[Effect], record_samples: int) -> list[Real]:
+            in_window = of_window.responses(effects, samples) if of_window.responses else ()
+            in_record = []
+            for first in range(0, self.windows * samples, samples):
+                for response in in_window:
+                    placed = np.zeros((record_samples, response.shape[1]))
+                    placed[first : first + samples] = response[: max(record_samples - first, 0)]
+                    in_record.append(placed)
+            return in_record
 
-        spread = np.where(np.isfinite(once.state_spread), once.state_spread, _FREE_RAD)
+        spread = np.where(np.isfinite(of_window.state_spread), of_window.state_spread, _FREE_ANGLE_RAD)
         return replace(
-            once,
+            of_window,
             state_spread=np.tile(spread, self.windows),
-            state_per_zero=np.tile(once.state_per_zero, (self.windows, 1)),
+            state_per_zero=np.tile(of_window.state_per_zero, (self.windows, 1)),
             guess=guess,
             responses=responses,
             tried=np.zeros((0, 0)),
         )
 
     def simulator(self, effects: Sequence[Effect]) -> Callable[..., Real]:
-        simulate, L = self._once.simulator(effects), self.window_samples
-        states = self._once.unknown_start.state_spread.size
+        """Inputs (T, 1), states of all windows (windows S,), zeros (Z,) -> outputs (T, Y) without noise."""
+        simulate = self._in_one_window.simulator(effects)
+        n_states = self._in_one_window.unknown_start.state_spread.size
+        samples = self.window_samples
 
         def outputs(inputs: Real, state: Real, zeros: Real, first_row: int = 0) -> Real:
-            runs = [
-                simulate(inputs[first : first + L], state[k * states : (k + 1) * states], zeros, first_row)
-                for k, first in enumerate(range(0, len(inputs), L))
-            ]
+            runs = []
+            for window, first in enumerate(range(0, len(inputs), samples)):
+                window_state = state[window * n_states : (window + 1) * n_states]
+                runs.append(simulate(inputs[first : first + samples], window_state, zeros, first_row))
             return np.concatenate(runs)
 
         return outputs
@@ -83,13 +106,16 @@ class ArmInWindows(FlexibleArm):
 
 @dataclass(frozen=True, eq=False)
 class CaseInWindows(Case):
-    """The case with its arm started anew in every window."""
+    """A case with its arm started anew in every window."""
 
     @property
     def machine(self) -> ArmInWindows:
-        longest = max(len(e.output) for e in self.experiments)
-        return ArmInWindows(self.rig, self.outputs, self.model_error, -(-longest // _WINDOWS), _WINDOWS)
+        """The arm with windows as long as an eighth of the longest record."""
+        longest = max(len(experiment.output) for experiment in self.experiments)
+        window_samples = -(-longest // _WINDOWS)
+        return ArmInWindows(self.rig, self.outputs, self.model_error, window_samples, _WINDOWS)
 
 
 def in_windows(case: Case) -> CaseInWindows:
+    """The case with the same records, its arm started anew in every window."""
     return CaseInWindows(case.name, case.rig, case.experiments, case.model_error)

@@ -27,7 +27,7 @@ from diagnosis.judge.carried import shares_of
 from diagnosis.judge.set_features import is_silent
 from diagnosis.judge.verdict import judged
 from diagnosis.machine.flexible_arm import FlexibleArm
-from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descended
+from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descend_from_best
 from diagnosis.search.search import Search
 from diagnosis.search.settled import best_state_step, fit_record_starts
 from diagnosis.search.windows import in_windows
@@ -486,14 +486,14 @@ def test_a_fit_alone_also_begins_at_a_local_minimum_of_its_grid(losses, begun, m
     tried: list[StartPoint] = []
     nominal = SimpleNamespace(fit=SimpleNamespace(loss=0.5))
     search = SimpleNamespace(nominal_alone=nominal)
-    monkeypatch.setattr("diagnosis.search.moves._turned", lambda search, candidate: False)
+    monkeypatch.setattr("diagnosis.search.moves._has_free_zero", lambda search, candidate: False)
     ended = SimpleNamespace(loss=0.0, converged=True)
     monkeypatch.setattr(
-        "diagnosis.search.moves._from", lambda s, a, c, point, *n: tried.append(point) or ended
+        "diagnosis.search.moves._descend_from", lambda s, a, c, point, *n: tried.append(point) or ended
     )
     for values, expected in ((1, begun), (2, [0])):
         tried.clear()
-        descended(search, None, None, points(values), None)
+        descend_from_best(search, None, None, points(values), None)
         assert [point.coordinates[0] for point in tried] == expected
 
 
@@ -619,7 +619,7 @@ def test_a_strong_ripple_is_found_from_windows(seed, amplitude_Nm, left):
     base = search.add(descend(search.records, (), nothing, np.zeros(0), start, iterations=12)).fit
     points = points_of(search.records, base, kinds["torque_ripple"])
     search.start_points = [(kinds["torque_ripple"], points)]
-    free = search.add(descended(search, base, kinds["torque_ripple"], points, base.jacobian))
+    free = search.add(descend_from_best(search, base, kinds["torque_ripple"], points, base.jacobian))
     search.apply_moves(InWindows.proposed(search), 0.9)
     best = min(search.explanations, key=lambda e: e.fit.loss)
     found = best.fit.effects[0]
