@@ -21,7 +21,8 @@ from typing import Any, TypeVar, cast
 import numpy as np
 from numba import njit
 
-from plant.machine import CUBIC, QUADRATIC, SINE, STRIBECK, Integer, Real
+from plant.force_laws import force_of_law
+from plant.machine import GRAVITY, STRIBECK, Integer, Real
 
 _F = TypeVar("_F", bound=Callable[..., object])
 
@@ -127,16 +128,12 @@ def _smooth_forces(
         while j < channel_kind.size:
             kind = channel_kind[j]
             y = position[k + j]
-            if kind == SINE:
-                force[k + j] = channel[j, 0] * np.sin(channel[j, 1] * y + channel[j, 2])
-            elif kind == CUBIC:
-                force[k + j] = -channel[j, 0] * y**3
-            elif kind == QUADRATIC:
-                force[k + j] = -channel[j, 0] * y * abs(y)
-            elif kind == STRIBECK:
+            if kind == STRIBECK:
                 slip = mode[int(channel[j, 2])]
                 # What friction has above its Coulomb level while it slips; the level itself is held.
                 force[k + j] = 0.0 if slip == 0 else -slip * channel[j, 0] * np.exp(-abs(y) / channel[j, 1])
+            elif kind != GRAVITY:
+                force[k + j] = force_of_law(kind, channel[j, 0], channel[j, 1], channel[j, 2], y)
             else:
                 # Gravity g takes 1 + M channels in a row: the root angle, then every modal deflection q. With
                 # S the static moment of the straight link, s and K those of the modes, and the angle from

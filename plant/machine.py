@@ -17,18 +17,26 @@ import numpy.typing as npt
 
 from plant.rig import Rig
 
-# Labels of the laws of smooth forces, computed in `plant.kernel`, of a position y and parameters p.
+# Labels of the laws of smooth forces of a position or speed y, with parameters p. `plant.force_laws` computes
+# those that any moving body may feel, `plant.kernel` the two that need more than y.
 # Ripple p0 sin(p1 y + p2): y the shaft angle, rad, p0 in N m.
 SINE = 0
 # Cubic spring -p0 y^3: y an angle, rad, p0 in N m/rad^3.
 CUBIC = 1
 # What dry friction has above its Coulomb level while it slips, p0 exp(-|y| / p1): y a speed, rad/s, p0 in N
-# m.
+# m. In `plant.kernel`: its direction is that of the element that slips.
 STRIBECK = 2
-# Gravity on link and tip mass: p0 in m/s^2, p1 the static moment, kg m, p2 the hub angle of hanging, rad.
+# Gravity on link and tip mass: p0 in m/s^2, p1 the static moment, kg m, p2 the hub angle of hanging, rad. In
+# `plant.kernel`: it acts on the bending of the link, too.
 GRAVITY = 3
 # Drag -p0 y |y|: y a speed, rad/s, p0 in N m s^2/rad^2.
 QUADRATIC = 4
+# Linear spring or damper -p0 y: y an angle, rad, or a speed, rad/s.
+LINEAR = 5
+# Drag that has one direction, -p0 |y|: y a speed, rad/s, p0 in N m s/rad.
+ABSOLUTE = 6
+# Weight off the axis, -p0 (sin(y + p1) - sin(p1)): y an angle, rad, zero force at y = 0, p0 in N m.
+OFF_AXIS = 7
 
 Real = npt.NDArray[np.float64]
 Integer = npt.NDArray[np.int64]
@@ -95,7 +103,7 @@ class SmoothTorque:
     """A torque (hub side of the gear) that is a smooth function of one angle, or of one speed.
 
     law : int
-        Label of the function: SINE, CUBIC or QUADRATIC above.
+        Label of the function above, of those in `plant.force_laws`.
     values : tuple of float
         Its one to three parameters p0, p1, p2; p0 is the size, and 0 is no torque.
     at : str

@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 import scipy
 
+from diagnosis.machine.body_forces import BodyForces
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.motion_effects import BodyForces, PulseResponse, with_forces
+from diagnosis.machine.motion_effects import PulseResponse, with_forces
 
 Run = Callable[[Real], Real]
 Values = Mapping[str, float]
@@ -300,18 +301,12 @@ class EffectLaw:
 
     where : "input" or "output", it changes a signal; "body", it is a force on a moving body; "model", it
         edits the description of a model; "simulation", it is told to the simulation, which knows it.
-    change : of a signal, (T,), values, dt_s, what it was before its first row -> (T,); of a body, fields of
-        `BodyForces` and their parameters, or values -> fields; of a model, model and values -> None.
+    change : of a signal, (T,), values, dt_s, what it was before its first row -> (T,); of a body, values ->
+        `BodyForces`; of a model, model and values -> None.
     """
 
     where: Where = "simulation"
     change: Any = None
-
-    def forces(self, values: Values) -> Mapping[str, float]:
-        """Fields of `BodyForces`."""
-        if isinstance(self.change, Mapping):
-            return {field: float(values[parameter]) for field, parameter in self.change.items()}
-        return {field: float(value) for field, value in self.change(values).items()}
 
 
 Place = Actuator | Sensor | Body | MeasuredBody
@@ -320,20 +315,17 @@ Acting = tuple[EffectLaw, Place, Values]
 
 def around(started: Started, acting: Sequence[Acting]) -> Run:
     """A simulation with effects around it, on each column in the order given."""
-    bodies: dict[int, tuple[AnyBody, dict[str, float]]] = {}
+    bodies: dict[int, tuple[AnyBody, BodyForces]] = {}
     drives: dict[int, tuple[Actuator, list[Acting]]] = {}
     for law, place, values in acting:
         if isinstance(place, Actuator) and place.drive is not None:
             drives.setdefault(id(place), (place, []))[1].append((law, place, values))
         elif isinstance(place, Body | MeasuredBody):
-            _, sizes = bodies.setdefault(id(place), (place, {}))
-            for name, value in law.forces(values).items():
-                # Laws of dry friction that are tried together add up, but for the speed over which one falls.
-                sizes[name] = value + (sizes.get(name, 0.0) if name != "stribeck_velocity" else 0.0)
+            _, forces = bodies.get(id(place), (place, BodyForces()))
+            bodies[id(place)] = (place, forces + law.change(values))
     inner = started
-    for body, sizes in bodies.values():
-        forces = BodyForces(**sizes)
-        known = (inner.key, Identity(body), tuple(sizes.items()))
+    for body, forces in bodies.values():
+        known = (inner.key, Identity(body), forces)
         at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
         inner = Started(body.under(inner, forces), at_rest, known, inner.start)
 

@@ -14,10 +14,11 @@ import numpy as np
 import scipy
 
 from diagnosis.machine.around import EffectLaw
+from diagnosis.machine.body_forces import BodyForces, DryFriction, DryLaw, SmoothLaw, followed
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.motion_effects import followed
 from diagnosis.machine.plant_effect import PlantEffect
 from plant.effects.search_space import EffectParameter
+from plant.machine import ABSOLUTE, CUBIC, LINEAR, OFF_AXIS, QUADRATIC
 
 Values = Mapping[str, float]
 
@@ -95,13 +96,18 @@ def _dead(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     return np.asarray(np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0))
 
 
-def _falling(values: Values) -> dict[str, float]:
-    share, level = values["coulomb_share"], values["static_force"]
-    return {"coulomb": share * level, "excess": (1 - share) * level, "stribeck_velocity": values["velocity"]}
+def _falling(values: Values) -> BodyForces:
+    """Dry friction of which a share is left at speed."""
+    share = values["coulomb_share"]
+    level = values["static_force"]
+    dry = DryFriction(coulomb=share * level, excess=(1 - share) * level, stribeck_velocity=values["velocity"])
+    return BodyForces(dry)
 
 
-def _one_way(values: Values) -> dict[str, float]:
-    return {"up" if values["force"] > 0 else "down": abs(values["force"])}
+def _one_way(values: Values) -> BodyForces:
+    """Dry friction against motion up, or of a negative size against motion down."""
+    force = values["force"]
+    return BodyForces(DryFriction(up=force) if force > 0 else DryFriction(down=-force))
 
 
 def _sized(
@@ -187,7 +193,7 @@ KINDS: dict[str, PlantEffect] = {
         _body(
             "coulomb_friction",
             (_sized("force", 1e-5, 1.0, 3e-4, 0.6, 14, "force"),),
-            law=EffectLaw("body", {"coulomb": "force"}),
+            law=EffectLaw("body", DryLaw({"coulomb": "force"})),
             dependence="continuous",
             check="raise the input slowly from rest and note where motion begins, in both directions",
         ),
@@ -218,7 +224,7 @@ KINDS: dict[str, PlantEffect] = {
                 _sized("force", 1e-5, 1.0, 3e-4, 0.6, 8, "force"),
                 _sized("gap", 1e-5, 2.0, 3e-3, 0.3, 3, "position"),
             ),
-            law=EffectLaw("body", {"coulomb": "force", "gap": "gap"}),
+            law=EffectLaw("body", DryLaw({"coulomb": "force", "gap": "gap"})),
             dependence="continuous",
             contains="coulomb_friction",
             tried="by name",
@@ -227,13 +233,13 @@ KINDS: dict[str, PlantEffect] = {
         _body(
             "viscous_friction",
             (_VISCOUS,),
-            law=EffectLaw("body", {"viscous": "coefficient"}),
+            law=EffectLaw("body", SmoothLaw(LINEAR, "speed", ("coefficient",))),
             check="move at several steady speeds and note the input: it should grow in proportion",
         ),
         _body(
             "viscous_asymmetry",
             (_VISCOUS,),
-            law=EffectLaw("body", {"asymmetry": "coefficient"}),
+            law=EffectLaw("body", SmoothLaw(ABSOLUTE, "speed", ("coefficient",))),
             signed=True,
             dependence="continuous",
             tried="by name",
@@ -242,14 +248,14 @@ KINDS: dict[str, PlantEffect] = {
         _body(
             "quadratic_drag",
             (_sized("coefficient", 1e-5, 30.0, 1e-3, 3.0, 8, "force/speed^2"),),
-            law=EffectLaw("body", {"drag": "coefficient"}),
+            law=EffectLaw("body", SmoothLaw(QUADRATIC, "speed", ("coefficient",))),
             tried="by name",
             check="move at several steady speeds: twice the speed should take four times the input",
         ),
         _body(
             "load_friction",
             (EffectParameter("share", 1e-4, 0.9, (1e-3, 0.01, 0.05, 0.15, 0.3, 0.6)),),
-            law=EffectLaw("body", {"load": "share"}),
+            law=EffectLaw("body", DryLaw({"load": "share"})),
             dependence="continuous",
             tried="by name",
             check="move slowly without and with a heavy load and compare what each takes beyond the load",
@@ -257,7 +263,7 @@ KINDS: dict[str, PlantEffect] = {
         _body(
             "spring",
             (_sized("stiffness", 1e-5, 30.0, 1e-4, 3.0, 8, "force/position"),),
-            law=EffectLaw("body", {"linear": "stiffness"}),
+            law=EffectLaw("body", SmoothLaw(LINEAR, "position", ("stiffness",))),
             check="let the machine go away from zero with the input off: it should stay where it is",
         ),
         _body(
@@ -266,14 +272,14 @@ KINDS: dict[str, PlantEffect] = {
                 _sized("torque", 1e-5, 30.0, 1e-3, 3.0, 8, "force"),
                 _ANGLE,
             ),
-            law=EffectLaw("body", {"weight": "torque", "turned": "angle_rad"}),
+            law=EffectLaw("body", SmoothLaw(OFF_AXIS, "position", ("torque", "angle_rad"))),
             tried="by name",
             check="let the machine hang free in several angles: it should stay where it is",
         ),
         _body(
             "hardening_spring",
             (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "force/position^3"),),
-            law=EffectLaw("body", {"cubic": "cubic"}),
+            law=EffectLaw("body", SmoothLaw(CUBIC, "position", ("cubic",))),
             check="push by hand at small and at large distances and look for cables and hoses",
         ),
         _sensor(

@@ -1,11 +1,11 @@
-"""Friction and springs on a body inside a simulation that knows neither: force in, motion out.
+"""Forces on a body inside a simulation that does not know them: force in, motion out.
 
-Wanted is u = command - F(x(u), v(u)) over a record, where a simulation gives x(u) and nothing else. From its
-response to a short pulse of force follows a continuous linear system; beside it the equation is solved in
-parts of a sample, dry friction exactly (a body sticks, slips, turns round inside a part), then simulated with
-the mean of that force over each sample; where the simulation is not linear, what it says beside the linear
-system is the start of the next round (Newton's method over a waveform, with one linear system for all times).
-A response that is not one of a few poles is used as it is, sample by sample.
+Wanted is u = command + F(x(u), v(u)) over a record, where F are the `BodyForces` and a simulation gives x(u)
+and nothing else. From its response to a short pulse of force follows a continuous linear system; beside it
+the equation is solved in parts of a sample, dry friction exactly (a body sticks, slips, turns round inside a
+part), then simulated with the mean of that force over each sample; where the simulation is not linear, what
+it says beside the linear system is the start of the next round (Newton's method over a waveform, with one
+linear system for all times). A response that is not one of a few poles is used as it is, sample by sample.
 
 Neglected: what is simulated beside the linear system is a cubic between samples. Outputs other than the
 body's own feel mean and moment of a force over each sample, no more. Without poles: friction acts as its mean
@@ -18,88 +18,67 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 import scipy
 from numba import njit
 
+from diagnosis.machine.body_forces import BodyForces, DryFriction, force_over_part
 from diagnosis.machine.machine_protocol import Real
 
-_ROUNDS = 12  # what needs more does not settle: a round that halves the rest leaves 2^-12
-# Of the change that the effects make: what rounds may still move, or may where they no longer get closer (an
-# integrator with a step of its own has noise).
-_CONVERGED, _SETTLED = 1e-5, 0.01
-# The same where a round costs no simulation: fits go on for a quarter longer where it is ten times as much.
+# Rounds of a simulation: what needs more does not settle, since one that halves the error leaves 2^-12 of it.
+_ROUNDS = 12
+# A round that moves the motion by less than this share of what the forces change is the last. Chosen: far
+# below what records show; ten times as much would be one simulation fewer.
+_CONVERGED = 1e-5
+# The same where rounds no longer get closer: an integrator with a step of its own has noise.
+_SETTLED = 0.01
+# The same where a round costs no simulation: with ten times as much, fits go on for a quarter longer.
 _FORETOLD = 1e-6
 # Share of the response to a pulse that, in its own sample, shows an input that acts before its row.
 _AT_ONCE = 0.02
-_FORGOTTEN = 1e-7  # of the largest response: the rest adds less than a sensor of 20 bits sees
+# Share of the largest response below which it has died out: less adds no more than a sensor of 20 bits sees.
+_FORGOTTEN = 1e-7
+# Samples after a pulse whose largest speed is that of the response: later a resonance may have grown.
+_EARLY_SAMPLES = 20
+# Share of that speed which the body must have at once, or no force is put around it.
+_MOVES_AT_ONCE = 0.1
 # Condition of the eigenvectors up to which a logarithm made with them is good to nine digits.
 _LOSES_LITTLE = 1e6
-# Orders of filters that a response may be of: the first that has all of it to the first share, else the best
-# to the second (what it misses, rounds add). Samples that they are fitted to.
-_ORDERS, _EXACT, _CLOSE = (2, 3, 4, 5, 6), 1e-9, 0.03
-_FITTED = 100  # rows, sixteen times the poles of the largest order
-# Imaginary part of a real pole; largest pole; radians of a swing in a part of a sample, and the largest
-# power of two of parts.
-_REAL, _UNSTABLE, _TURNED, _MOST_PARTS = 1e-9, 1.1, 0.1, 4
-# Of a half play, at its end.
-_NEARLY = 1 - 1e-9
-# What no filter of a response of one comes to; far below what overflows.
+# Orders of filters that a response may be of.
+_ORDERS = (2, 3, 4, 5, 6)
+# The first of them that leaves less than this share of the response is it.
+_EXACT = 1e-9
+# Else the best of them, up to this share: what it misses, rounds add.
+_CLOSE = 0.03
+# Samples that a filter is fitted to, sixteen times the poles of the largest order.
+_FITTED = 100
+# Share of the largest response that counts as much as what is smaller, when a filter is fitted.
+_SMALLEST = 1e-6
+# Imaginary part below which a pole is real.
+_REAL = 1e-9
+# Largest size of a pole: a body that falls over grows, but by less than this in a sample.
+_UNSTABLE = 1.1
+# Size that no filter of a response of at most one comes to; far below what overflows.
 _GROWS = 1e100
+# Radians of a swing in a part of a sample: the trapezoidal rule is then off by a thousandth.
+_SWING_RAD = 0.1
+# Radians of a force with a period in a part of a sample, as `plant.plan` has it: off by half a per cent.
+_PHASE_RAD = 0.25
+# Parts of a sample are powers of two up to this: smaller ones take longer and no record is sampled so
+# coarsely.
+_LARGEST_POWER = 4
 
 
 class NotFollowedError(ValueError, ArithmeticError):
     """No force can be put around a simulation: wrong as stated, in a fit a trial that ran away."""
 
 
-class BodyForces(NamedTuple):
-    """Forces on a body against its motion, SI or whatever units force and motion have.
-
-    Dry friction of size coulomb + excess exp(-|v| / stribeck_velocity), with `up` more while v > 0 and `down`
-    more while v < 0, at rest up to coulomb + excess; load times the force that is commanded, as dry friction.
-    All of that rubs behind a play of `gap`: where the body has gone through it. viscous v + asymmetry |v|
-    + drag v |v|; linear x + cubic x^3, x from zero; weight (sin(x + turned) - sin(turned)), x an angle.
-    """
-
-    coulomb: float = 0.0
-    excess: float = 0.0
-    stribeck_velocity: float = 1.0
-    up: float = 0.0
-    down: float = 0.0
-    viscous: float = 0.0
-    linear: float = 0.0
-    cubic: float = 0.0
-    asymmetry: float = 0.0
-    drag: float = 0.0
-    load: float = 0.0
-    gap: float = 0.0
-    weight: float = 0.0
-    turned: float = 0.0
-
-    def overcome(self, x: Real, v: Real, rest: Real) -> Real:
-        """Force (T,) that a known motion takes against them, and a rest (T,) without them."""
-        level = self.coulomb + self.excess * np.exp(-np.abs(v) / self.stribeck_velocity)
-        dry = np.where(v > 0, level + self.up, np.where(v < 0, -level - self.down, 0.0))
-        if self.gap > 0:
-            behind = followed(np.ascontiguousarray(x), 0.5 * self.gap, float(x[0]))
-            dry = np.where(v * (x - behind) >= _NEARLY * 0.5 * self.gap * np.abs(v), dry, 0.0)
-        unbalanced = self.weight * (np.sin(x + self.turned) - np.sin(self.turned))
-        smooth = (self.viscous + self.drag * np.abs(v)) * v + self.asymmetry * np.abs(v)
-        whole = rest + dry + smooth + self.linear * x + self.cubic * x**3 + unbalanced
-        # The commanded force is the whole one: more of it is lost where it drives than where it brakes.
-        return np.asarray(whole / (1 - self.load * np.sign(v) * np.sign(whole)) - rest)
-
-    @property
-    def smooth(self) -> bool:
-        """Whether there are some that change little within a sample."""
-        return any((self.viscous, self.linear, self.cubic, self.asymmetry, self.drag, self.weight))
-
-
 def _logarithm(matrix: Real) -> Real:
-    """Real part of the principal logarithm: by eigenvectors, ten times as fast, where that loses no more than
-    a few digits."""
+    """Real part (N, N) of the principal logarithm of a matrix (N, N).
+
+    By eigenvectors, ten times as fast, where that loses no more than a few digits.
+    """
     values, vectors = np.linalg.eig(matrix)
     if np.min(np.abs(values)) > 0 and np.linalg.cond(vectors) < _LOSES_LITTLE:
         return np.asarray(np.real(vectors * np.log(values.astype(np.complex128)) @ np.linalg.inv(vectors)))
@@ -117,6 +96,7 @@ class LinearBody:
         when it acts, a command as `early` (samples) as the steps of an integrator have it.
     rows : (2, N) position and speed of states.
     poles, numerator : (n,) each, the filter from force to what is simulated, position or speed.
+    ahead : samples before a force shows. dt_s : sampling period. of_speed : a speed is simulated.
     """
 
     generator: Real
@@ -131,69 +111,115 @@ class LinearBody:
 
     @classmethod
     def of(cls, poles: Real, head: Real, ahead: int, dt_s: float, *, of_speed: bool) -> LinearBody | None:
-        """head (ahead + n,): of the filter from force to what is simulated; None without poles."""
-        n, numerator = poles.size, head[ahead:]
+        """The body whose filter from force to what is simulated has these poles (n,), and the numerator
+        head (ahead + n,) of which the first `ahead` are zero; None without poles."""
+        n = poles.size
         if n == 0:
             return None
+        numerator = head[ahead:]
+        # One sample of the filter and of the input that it holds; its logarithm is the continuous system.
         held = np.zeros((n + 1, n + 1))
-        held[:n, 0], held[:n, n], held[n, n] = poles, numerator, 1.0
+        held[:n, 0] = poles
+        held[:n, n] = numerator
+        held[n, n] = 1.0
         held[: n - 1, 1:n] = np.eye(n - 1)
         rates = _logarithm(held)
-        own, command = rates[:n, :n], rates[:n, n]
-        at_once, later = command[0], own[0] @ command
-        early = 0.0 if of_speed or abs(at_once) > abs(later) else at_once / later
-        force = scipy.linalg.expm(-early * own) @ command
-        # Position of a speed is one more state.
-        N = n + of_speed
-        generator, rows = np.zeros((N + 2, N + 2)), np.zeros((2, N))
-        generator[:n, :n], generator[:n, N], generator[:n, N + 1] = own, command, force
+        dynamics = rates[:n, :n]
+        command = rates[:n, n]
+
+        # A position that an input moves at once has an input that acts early; a force inside does not.
+        at_once = command[0]
+        later = dynamics[0] @ command
+        acts_early = not of_speed and abs(at_once) <= abs(later)
+        early = at_once / later if acts_early else 0.0
+        force = scipy.linalg.expm(-early * dynamics) @ command
+
+        # The position that belongs to a speed is one more state.
+        n_states = n + 1 if of_speed else n
+        generator = np.zeros((n_states + 2, n_states + 2))
+        generator[:n, :n] = dynamics
+        generator[:n, n_states] = command
+        generator[:n, n_states + 1] = force
+        rows = np.zeros((2, n_states))
         if of_speed:
             generator[n, 0] = dt_s
-            rows[0, n], rows[1, 0] = 1.0, 1.0
+            rows[0, n] = 1.0
+            rows[1, 0] = 1.0
         else:
-            rows[0, 0], rows[1, :n] = 1.0, own[0] / dt_s
+            rows[0, 0] = 1.0
+            rows[1, :n] = dynamics[0] / dt_s
         return cls(generator, rows, early, poles, numerator, ahead, dt_s, of_speed)
 
     @cached_property
     def turns(self) -> tuple[float, float, float]:
         """Radians that it swings by in a sample; position and speed after a unit force over one."""
         step = scipy.linalg.expm(self.generator)
-        swing = float(np.max(np.abs(np.angle(np.linalg.eigvals(step[:-2, :-2])))))
-        moved = self.rows @ step[:-2, -1]
-        return swing, float(moved[0]), float(moved[1])
+        swing_rad = float(np.max(np.abs(np.angle(np.linalg.eigvals(step[:-2, :-2])))))
+        position, speed = self.rows @ step[:-2, -1]
+        return swing_rad, float(position), float(speed)
 
-    def parts(self, forces: BodyForces, largest: float) -> int:
-        """Of a sample, enough for the trapezoidal rule beside motion up to `largest`; powers of two, so that
-        small changes of parameters seldom change them."""
+    def parts(self, forces: BodyForces, travel: Real) -> int:
+        """Parts of a sample that are enough for the trapezoidal rule along a position (T,).
+
+        A power of two, so that small changes of parameters seldom change it.
+        """
         if not forces.smooth:
             return 1
-        swing, gx, gv = self.turns
-        stiffness = abs(forces.linear) + 3 * abs(forces.cubic) * largest**2 + abs(forces.weight)
-        turned = np.hypot(swing, np.sqrt(2 * abs(gx) * stiffness))
-        finer = max(turned, (abs(forces.viscous) + abs(forces.asymmetry)) * abs(gv), _TURNED) / _TURNED
-        return int(2 ** min(np.ceil(np.log2(finer)), _MOST_PARTS))
+        swing_rad, position_per_force, speed_per_force = self.turns
+        largest = float(np.max(np.abs(travel)))
+        stiffness = 0.0
+        damping = 0.0
+        wave_number = 0.0
+        for force in forces.smooth:
+            wave_number = max(wave_number, force.wave_number)
+            if force.of == "position":
+                stiffness += force.steepest(largest)
+            else:
+                damping += force.steepest(0.0)
+        stiffer_swing_rad = np.hypot(swing_rad, np.sqrt(2 * abs(position_per_force) * stiffness))
+        phase_rad = wave_number * float(np.max(np.abs(np.diff(travel)), initial=0.0))
+        needed = max(
+            stiffer_swing_rad / _SWING_RAD,
+            damping * abs(speed_per_force) / _SWING_RAD,
+            phase_rad / _PHASE_RAD,
+            1.0,
+        )
+        return int(2 ** min(np.ceil(np.log2(needed)), _LARGEST_POWER))
 
     def answer(
         self, simulated: Real, force: Real, command: Real, forces: BodyForces
     ) -> tuple[Real, Real, Real]:
-        """Held forces (T,) as good as those that act, the motion (T,) with these, and what a simulation of
-        the former has in its place; simulated (T,): under the force (T,) of the round before."""
-        head, own = (
-            np.concatenate([np.zeros(self.ahead), self.numerator]),
-            np.concatenate([[1.0], -self.poles]),
-        )
-        beyond = np.asarray(simulated - scipy.signal.lfilter(head, own, force))
+        """Forces as they act beside a simulated motion.
+
+        Parameters
+        ----------
+        simulated : (T,)
+            Motion under the force of the round before.
+        force : (T,)
+            That force, command and body forces.
+        command : (T,)
+            The commanded force alone.
+        forces : BodyForces
+
+        Returns
+        -------
+        (T,) held forces as good as those that act, (T,) the motion with them, and (T,) what a simulation of
+        the held forces has in its place.
+        """
+        head = np.concatenate([np.zeros(self.ahead), self.numerator])
+        denominator = np.concatenate([[1.0], -self.poles])
+        beyond = np.asarray(simulated - scipy.signal.lfilter(head, denominator, force))
         travel = np.cumsum(simulated) * self.dt_s if self.of_speed else simulated
-        parts = self.parts(forces, float(np.max(np.abs(travel))))
+        parts = self.parts(forces, travel)
         if parts not in self._steps:
             step = scipy.linalg.expm(self.generator / parts)
-            of_states, of_command, of_force = step[:-2, :-2], step[:-2, -2], step[:-2, -1]
-            self._steps[parts] = (of_states.copy(), of_command.copy(), of_force.copy())
+            self._steps[parts] = (step[:-2, :-2].copy(), step[:-2, -2].copy(), step[:-2, -1].copy())
         of_states, of_command, of_force = self._steps[parts]
+
         # Slopes of fourth order, to go through parts of samples along cubics.
         slopes = np.gradient(beyond)
         slopes[2:-2] = (8 * (beyond[3:-1] - beyond[1:-3]) - beyond[4:] + beyond[:-4]) / 12
-        held, moment, x, v = _through(
+        held, moment, position, speed = _through(
             beyond,
             slopes,
             command,
@@ -205,13 +231,16 @@ class LinearBody:
             self.ahead,
             self.of_speed,
             self.dt_s,
-            forces,
+            forces.dry,
+            forces.table,
+            forces.rounds,
         )
         # What comes early or late in a sample moves the body as a pair of forces around it does.
         moment += self.early * held
         held[1:] += 0.5 * moment[:-1]
         held[:-1] -= 0.5 * moment[1:]
-        return held, v if self.of_speed else x, beyond + scipy.signal.lfilter(head, own, command + held)
+        expected = beyond + scipy.signal.lfilter(head, denominator, command + held)
+        return held, speed if self.of_speed else position, expected
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +248,7 @@ class PulseResponse:
     """Position and speed (L,) after a unit force over one sample; `ahead` samples before speed shows it.
 
     corrections : (2,) what a force in this sample and the one before adds to central differences of position.
-    linear : the same as of a linear body, where it is one.
+    linear : the linear body with this response, where it is that of one.
     """
 
     position: Real
@@ -237,48 +266,67 @@ class PulseResponse:
         Raises NotFollowedError if the force does not move the body at once, or the motion is no number.
         """
         h = motion[1:]
-        at_once, corrections = abs(h[0]) > _AT_ONCE * abs(h[1]), np.zeros(2)
+        at_once = abs(h[0]) > _AT_ONCE * abs(h[1])
+        corrections = np.zeros(2)
         if of_speed:
-            speed, position = h, np.cumsum(h) * dt_s
-            position = position - 0.5 * dt_s * h
+            speed = h
+            # The force begins with its sample: half of the first change belongs to the position there.
+            position = np.cumsum(h) * dt_s - 0.5 * dt_s * h
         else:
-            speed, position = np.gradient(h, dt_s), h
+            position = h
+            speed = np.gradient(h, dt_s)
             speed[0] = 0.5 * h[1] / dt_s
             if not at_once:
-                speed[0], speed[1] = 0.0, (-3 * h[1] + 4 * h[2] - h[3]) / (2 * dt_s)
+                # Central differences see the pulse a sample too early; a one-sided one does not.
+                speed[0] = 0.0
+                speed[1] = (-3 * h[1] + 4 * h[2] - h[3]) / (2 * dt_s)
                 corrections = np.array([0.5 * h[1] / dt_s, 0.5 * h[2] / dt_s - speed[1]])
         ahead = 0 if at_once else 1
-        largest = np.max(np.abs(speed[:20]))
-        if not (np.all(np.isfinite(motion)) and abs(speed[ahead]) > 0.1 * largest):
+        largest = np.max(np.abs(speed[:_EARLY_SAMPLES]))
+        if not (np.all(np.isfinite(motion)) and abs(speed[ahead]) > _MOVES_AT_ONCE * largest):
             raise NotFollowedError(
                 "friction and springs need a force that moves the body at once; the simulated motion follows "
                 "the stated input later, or its steps are too coarse for a pulse of one sample"
             )
         kept = np.abs(speed) > _FORGOTTEN * largest
         kept |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
-        last = int(np.flatnonzero(kept)[-1]) + 1
-        position, speed = position[:last], speed[:last]
-        linear = LinearBody.of(
-            *_filter(speed if of_speed else position, ahead), ahead, dt_s, of_speed=of_speed
-        )
+        length = int(np.flatnonzero(kept)[-1]) + 1
+        position = position[:length]
+        speed = speed[:length]
+        poles, head = _filter(speed if of_speed else position, ahead)
+        linear = LinearBody.of(poles, head, ahead, dt_s, of_speed=of_speed)
         return cls(position, speed, corrections, ahead, dt_s, of_speed, linear)
 
     @property
     def doubt(self) -> str:
         """Why smooth forces act less exactly, "" where they do not."""
-        k, few = self.ahead, self.speed.size < self.ahead + 3
+        k = self.ahead
+        if self.speed.size < k + 3:
+            return "turns back within two samples"
         # An oscillation has fewer than six samples per period.
-        if few or (self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k]):
+        turns_back = self.speed[k + 1] < 0 if self.of_speed else self.position[k + 2] < self.position[k]
+        if turns_back:
             return "turns back within two samples"
         return "" if self.linear else f"is not one of {_ORDERS[-1]} poles or fewer"
 
     def answer(
         self, simulated: Real, force: Real, command: Real, forces: BodyForces
     ) -> tuple[Real, Real, Real]:
-        """The same as `LinearBody.answer`, the motion being that of a simulation under held forces."""
-        seen = self.motion(simulated, force)
-        held, x, v = _solve(*seen, force - command, command, self.position, self.speed, self.ahead, forces)
-        motion = v if self.of_speed else x
+        """Forces as they act beside a simulated motion, held over each sample; as of `LinearBody.answer`."""
+        position, speed = self.motion(simulated, force)
+        held, position, speed = _solve(
+            position,
+            speed,
+            force - command,
+            command,
+            self.position,
+            self.speed,
+            self.ahead,
+            forces.dry,
+            forces.table,
+            forces.rounds,
+        )
+        motion = speed if self.of_speed else position
         return held, motion, motion
 
     def motion(self, simulated: Real, force: Real) -> tuple[Real, Real]:
@@ -287,50 +335,62 @@ class PulseResponse:
             steps = 0.5 * self.dt_s * (simulated[1:] + simulated[:-1])
             return np.concatenate([[0.0], np.cumsum(steps)]), simulated
         speed = np.gradient(simulated, self.dt_s)
-        now, before = self.corrections
-        speed[1:-1] -= now * force[1:-1] + before * force[:-2]
-        speed[0] -= 2 * now * force[0]
+        by_this_sample, by_sample_before = self.corrections
+        speed[1:-1] -= by_this_sample * force[1:-1] + by_sample_before * force[:-2]
+        speed[0] -= 2 * by_this_sample * force[0]
         speed[-1] = speed[-2]
         return simulated, speed
 
 
 def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
-    """Poles (P,) and numerator (M,) of the filter of lowest order with this response (L,), from the first
-    sample that counts on, and a continuous equivalent; without poles, the response."""
+    """Filter of lowest order with a response (L,) from its sample `ahead` on that has a continuous
+    equivalent.
+
+    Returns its poles (P,) and numerator (ahead + P,); where there is none, no poles and the response.
+    """
     largest = np.max(np.abs(response))
     h = response / largest
     h[:ahead] = 0.0
-    L, pulse = h.size, np.zeros(h.size)
+    length = h.size
+    pulse = np.zeros(length)
     pulse[0] = 1.0
-    closest, found = _CLOSE, (np.zeros(0), h)
+    least_missed = _CLOSE
+    poles = np.zeros(0)
+    numerator = h
     # As close to small beginnings as to what they become.
-    counts = 1 / np.maximum(np.maximum.accumulate(np.abs(h)), 1e-6)
+    weights = 1 / np.maximum(np.maximum.accumulate(np.abs(h)), _SMALLEST)
     for order in _ORDERS:
         first = 2 * order + 4
-        if 2 * first > L:
+        if 2 * first > length:
             break
-        rows = np.unique(np.linspace(first, L - 2, _FITTED).astype(int))
+        # Poles: each value follows from those before it.
+        rows = np.unique(np.linspace(first, length - 2, _FITTED).astype(int))
         before = h[rows[:, None] - np.arange(1, order + 1)]
-        poles = np.linalg.lstsq(before * counts[rows, None], h[rows] * counts[rows], rcond=None)[0]
-        own = np.concatenate([[1.0], -poles])
-        roots = np.roots(own)
-        if np.max(np.abs(roots)) > _UNSTABLE or np.any((roots.real <= 0) & (np.abs(roots.imag) < _REAL)):
+        tried = np.linalg.lstsq(before * weights[rows, None], h[rows] * weights[rows], rcond=None)[0]
+        denominator = np.concatenate([[1.0], -tried])
+        roots = np.roots(denominator)
+        has_no_logarithm = (roots.real <= 0) & (np.abs(roots.imag) < _REAL)
+        if np.max(np.abs(roots)) > _UNSTABLE or np.any(has_no_logarithm):
             continue
+
+        # Numerator: responses of the poles alone, each a sample later than the one before.
         rows = np.concatenate([np.arange(ahead, first), rows])
-        alone = scipy.signal.lfilter([1.0], own, pulse)
+        alone = scipy.signal.lfilter([1.0], denominator, pulse)
         if not np.max(np.abs(alone)) < _GROWS:
             continue  # faster than any response that ends at one
-        delayed = np.column_stack(
-            [np.concatenate([np.zeros(j), alone[: L - j]]) for j in range(ahead, ahead + order)]
-        )
-        head = np.linalg.lstsq(delayed[rows] * counts[rows, None], h[rows] * counts[rows], rcond=None)[0]
+        delays = range(ahead, ahead + order)
+        delayed = np.column_stack([np.concatenate([np.zeros(j), alone[: length - j]]) for j in delays])
+        head = np.linalg.lstsq(delayed[rows] * weights[rows, None], h[rows] * weights[rows], rcond=None)[0]
+
         # What it lacks at the very end is what a response lacks that has been cut there.
-        missed = np.max((np.abs(delayed @ head - h) * counts)[ahead:-1])
-        if missed < closest:
-            closest, found = missed, (poles, np.concatenate([np.zeros(ahead), head]))
-        if closest < _EXACT:
+        missed = np.max((np.abs(delayed @ head - h) * weights)[ahead:-1])
+        if missed < least_missed:
+            least_missed = missed
+            poles = tried
+            numerator = np.concatenate([np.zeros(ahead), head])
+        if least_missed < _EXACT:
             break
-    return found[0], found[1] * largest
+    return poles, numerator * largest
 
 
 def with_forces(
@@ -343,33 +403,55 @@ def with_forces(
     *,
     alone: bool,
 ) -> tuple[Real, float]:
-    """Outputs (T, Y) with the forces acting, and what the last round still moved, over what they change.
+    """Outputs of a simulation with forces on its body.
 
-    simulate : force (T,) -> outputs (T, Y), motion (T,). command : force (T,) without the forces; free : what
-    it gives. placed : outputs with another motion in them; alone : whether there are no others.
+    Parameters
+    ----------
+    simulate : force (T,) -> outputs (T, Y), motion (T,)
+    free : outputs (T, Y), motion (T,)
+        Under the command alone.
+    command : (T,)
+        Force without the body forces.
+    response : PulseResponse
+        Of the motion.
+    forces : BodyForces
+    placed : outputs (T, Y), motion (T,) -> outputs (T, Y)
+        With another motion in them.
+    alone : bool
+        The motion is the only output.
+
+    Returns
+    -------
+    Outputs (T, Y), and what the last round still moved over what the forces change; inf where the motion is
+    no number.
     """
-    body, held = response.linear or response, np.zeros(command.size)
-    outputs, now = free
-    before, error = np.inf, np.inf
+    body = response.linear or response
+    held = np.zeros(command.size)
+    outputs, simulated = free
+    error_before = np.inf
+    error = np.inf
     for _ in range(_ROUNDS):
-        if not np.all(np.isfinite(now)):
+        if not np.all(np.isfinite(simulated)):
             return outputs, np.inf
-        held, motion, expected = body.answer(now, command + held, command, forces)
+        held, motion, expected = body.answer(simulated, command + held, command, forces)
         if not np.all(np.isfinite(motion)):
             return outputs, np.inf
-        if alone and before < np.inf and error / before * error < _FORETOLD:
+        if alone and error_before < np.inf and error / error_before * error < _FORETOLD:
             # As much closer again, what the next simulation would say is known.
-            return placed(outputs, motion), error / before * error
-        before = error
-        outputs, now = simulate(command + held)
-        error = _rms(now - expected) / max(_rms(motion - free[1]), 1e-300)
-        if error < (_FORETOLD if alone else _CONVERGED) or 0.5 * before < error < _SETTLED:
+            return placed(outputs, motion), error / error_before * error
+        error_before = error
+        outputs, simulated = simulate(command + held)
+        error = _rms(simulated - expected) / max(_rms(motion - free[1]), np.finfo(float).tiny)
+        enough = _FORETOLD if alone else _CONVERGED
+        gets_no_closer = 0.5 * error_before < error < _SETTLED
+        if error < enough or gets_no_closer:
             break
-    return placed(outputs, now + motion - expected), error
+    return placed(outputs, simulated + motion - expected), error
 
 
 def _rms(x: Real) -> float:
-    with np.errstate(over="ignore", invalid="ignore"):  # of a trial that runs away
+    """Root mean square of (T,); inf of a trial that runs away."""
+    with np.errstate(over="ignore", invalid="ignore"):
         return float(np.sqrt(x @ x / x.size))
 
 
@@ -379,124 +461,61 @@ def _solve(
     speed: Real,
     held: Real,
     command: Real,
-    hx: Real,
-    hv: Real,
+    position_response: Real,
+    speed_response: Real,
     ahead: int,
-    forces: BodyForces,
+    dry: DryFriction,
+    table: Real,
+    rounds: int,
 ) -> tuple[Real, Real, Real]:
-    """Forces (T,), positions and speeds (T,) with them, from those under the forces `held`."""
-    T = position.size
-    f, x, v = held.copy(), position.copy(), speed.copy()
-    change = np.zeros(T)
-    gx, gv, at, half = hx[ahead], hv[ahead], 0.0, 0.5 * forces.gap
-    for k in range(T - ahead):
+    """Body forces, positions and speeds (T,) with them, sample by sample.
+
+    position, speed : (T,) under the forces `held` (T,) beside the command (T,). position_response,
+    speed_response : (L,) to a unit force, shown `ahead` samples later. dry, table, rounds : of `BodyForces`.
+    """
+    samples = position.size
+    force = held.copy()
+    x = position.copy()
+    v = speed.copy()
+    change = np.zeros(samples)
+    position_per_force = position_response[ahead]
+    speed_per_force = speed_response[ahead]
+    half_gap = 0.5 * dry.gap
+    follower = 0.0
+    for k in range(samples - ahead):
         n = k + ahead
-        dx, dv = 0.0, 0.0
-        for j in range(max(0, n - hv.size + 1), k):
-            dx += hx[n - j] * change[j]
-            dv += hv[n - j] * change[j]
-        ax, av = position[n] + dx - gx * held[k], speed[n] + dv - gv * held[k]
-        x0, v0 = (x[n - 1], v[n - 1]) if n > 0 else (ax, av)
-        at = x0 if k == 0 else at
-        f[k], x[n], v[n] = _acted(ax, av, x0, v0, gx, gv, command[k], at, forces)
-        at = min(max(at, x[n] - half), x[n] + half)
-        change[k] = f[k] - held[k]
-    return f, x, v
-
-
-@njit(cache=True)
-def _acted(
-    ax: float,
-    av: float,
-    x0: float,
-    v0: float,
-    gx: float,
-    gv: float,
-    command: float,
-    at: float,
-    forces: BodyForces,
-) -> tuple[float, float, float]:
-    """Mean force over a sample or a part of one, position and speed at its end.
-
-    ax, av : there without the forces; x0, v0 : at its start; gx, gv : what a unit force adds; at : where what
-    rubs behind the play stands.
-    """
-    coulomb, excess, falls, up, down, viscous, linear, cubic, asymmetry, drag, load, gap, weight, turned = (
-        forces
-    )
-    coulomb += load * abs(command)
-    rubs_up, rubs_down = _beyond(x0, ax, at, 0.5 * gap), _beyond(-x0, -ax, -at, 0.5 * gap)
-    f, x1, end, level = 0.0, x0, v0, coulomb
-    for _ in range(2 if excess > 0 or cubic > 0 or asymmetry != 0 or drag > 0 or weight != 0 else 1):
-        # Smooth forces by the trapezoidal rule, those not linear by their tangents at the end.
-        stiffness = linear + 3 * cubic * x1 * x1 + weight * np.cos(x1 + turned)
-        middle = 0.5 * (v0 + end)
-        slope = viscous + asymmetry * np.sign(middle) + drag * abs(middle)
-        divisor = 1 + 0.5 * (slope * gv + stiffness * gx)
-        smooth = -0.5 * (slope * (v0 + av) + linear * x0 + stiffness * ax)
-        smooth += cubic * (x1**3 - 0.5 * x0**3)
-        if weight != 0:
-            sines = np.sin(x0 + turned) + np.sin(x1 + turned) - 2 * np.sin(turned)
-            smooth -= 0.5 * weight * (sines - np.cos(x1 + turned) * x1)
-        a, g = av + gv * smooth / divisor, gv / divisor
-        if excess > 0:
-            level = coulomb + excess * np.exp(-0.5 * (abs(v0) + abs(end)) / falls)
-        held = (excess + coulomb - level) * max(rubs_up, rubs_down)
-        end, dry = _dry(v0, a, g, (level + up) * rubs_up, (level + down) * rubs_down, held)
-        f = (smooth + dry) / divisor
-        x1 = ax + gx * f
-    return f, x1, end
-
-
-@njit(cache=True)
-def _beyond(x0: float, ax: float, at: float, half: float) -> float:
-    """Share of the way from x0 to ax on which a body has taken what rubs along, upwards."""
-    if half <= 0.0:
-        return 1.0
-    if ax <= x0:
-        return 1.0 if x0 >= at + half else 0.0
-    return min(max((ax - at - half) / (ax - x0), 0.0), 1.0)
-
-
-@njit(cache=True)
-def followed(signal: Real, half: float, at: float) -> Real:
-    """(T,) what follows a signal (T,) at a distance of `half`, from the middle."""
-    found = np.empty_like(signal)
-    for k in range(signal.size):
-        at = min(max(at, signal[k] - half), signal[k] + half)
-        found[k] = at
-    return found
-
-
-@njit(cache=True)
-def _dry(v0: float, a: float, g: float, up: float, down: float, at_rest: float) -> tuple[float, float]:
-    """Speed at the end of a sample and mean dry friction in it.
-
-    v0: speed at its start. a: at its end without friction; g: per force. up, down: levels against motion up
-    and down; at_rest: how much more is held at rest.
-    """
-    if v0 < 0:
-        end, f = _slowed(-v0, -a, g, down, up, at_rest)
-        return -end, -f
-    if v0 > 0:
-        return _slowed(v0, a, g, up, down, at_rest)
-    if a > g * (up + at_rest):
-        return a - g * up, -up
-    if a < -g * (down + at_rest):
-        return a + g * down, down
-    return 0.0, -a / g
-
-
-@njit(cache=True)
-def _slowed(v0: float, a: float, g: float, up: float, down: float, at_rest: float) -> tuple[float, float]:
-    end = a - g * up
-    if end >= 0:
-        return end, -up
-    pulled = a - v0
-    if pulled >= -g * (down + at_rest):
-        return 0.0, -a / g
-    share = v0 / (g * up - pulled)
-    return (1 - share) * (pulled + g * down), (1 - share) * down - share * up
+        # What the forces of earlier samples, otherwise than held, change here.
+        dx = 0.0
+        dv = 0.0
+        for j in range(max(0, n - speed_response.size + 1), k):
+            dx += position_response[n - j] * change[j]
+            dv += speed_response[n - j] * change[j]
+        free_position = position[n] + dx - position_per_force * held[k]
+        free_speed = speed[n] + dv - speed_per_force * held[k]
+        if n > 0:
+            start_position = x[n - 1]
+            start_speed = v[n - 1]
+        else:
+            start_position = free_position
+            start_speed = free_speed
+        if k == 0:
+            follower = start_position
+        force[k], x[n], v[n] = force_over_part(
+            free_position,
+            free_speed,
+            start_position,
+            start_speed,
+            position_per_force,
+            speed_per_force,
+            command[k],
+            follower,
+            dry,
+            table,
+            rounds,
+        )
+        follower = min(max(follower, x[n] - half_gap), x[n] + half_gap)
+        change[k] = force[k] - held[k]
+    return force, x, v
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
@@ -512,52 +531,93 @@ def _through(
     ahead: int,
     of_speed: bool,
     dt_s: float,
-    forces: BodyForces,
+    dry: DryFriction,
+    table: Real,
+    rounds: int,
 ) -> tuple[Real, Real, Real, Real]:
-    """Means and moments of the forces in every sample (T,), positions and speeds (T,); beyond, slopes (T,):
-    position or speed beside the response to forces, and by how much it changes per sample."""
-    T, N = command.size, pushed.size
-    mean, moment, x, v = np.zeros(T), np.zeros(T), np.zeros(T), np.zeros(T)
-    state, moved = np.zeros(N), np.zeros(N)
-    of_x, of_v = rows[0], rows[1]
-    gx, gv = 0.0, 0.0
-    for i in range(N):
-        gx += of_x[i] * pushed[i]
-        gv += of_v[i] * pushed[i]
-    travelled, half = 0.0, 0.5 * forces.gap
-    x0, v0 = (0.0, beyond[0]) if of_speed else (beyond[0], slopes[0] / dt_s)
-    at = x0
+    """Means and moments of the body forces in every sample (T,), positions and speeds (T,) with them.
+
+    beyond, slopes : (T,) position or speed beside the response to forces, and by how much it changes per
+    sample. command : (T,). step (N, N), commanded (N,), pushed (N,) : what states, command and force make of
+    the states over a part of a sample. rows : (2, N) of `LinearBody`. dry, table, rounds : of `BodyForces`.
+    """
+    samples = command.size
+    n_states = pushed.size
+    mean = np.zeros(samples)
+    moment = np.zeros(samples)
+    x = np.zeros(samples)
+    v = np.zeros(samples)
+    state = np.zeros(n_states)
+    moved = np.zeros(n_states)
+    position_row = rows[0]
+    speed_row = rows[1]
+    position_per_force = 0.0
+    speed_per_force = 0.0
+    for i in range(n_states):
+        position_per_force += position_row[i] * pushed[i]
+        speed_per_force += speed_row[i] * pushed[i]
+    travelled = 0.0
+    half_gap = 0.5 * dry.gap
+    if of_speed:
+        last_position = 0.0
+        last_speed = beyond[0]
+    else:
+        last_position = beyond[0]
+        last_speed = slopes[0] / dt_s
+    follower = last_position
     if ahead == 1:
-        x[0], v[0] = x0, v0
-    for k in range(T - ahead):
+        x[0] = last_position
+        v[0] = last_speed
+    for k in range(samples - ahead):
         # A cubic from sample to sample; before the first nothing is known to move.
         n = k + ahead
-        start, end_value = beyond[max(n - 1, 0)], beyond[n]
-        rise, last = (slopes[n - 1], slopes[n]) if n > 0 else (0.0, 0.0)
-        bend = 3 * (end_value - start) - 2 * rise - last
-        twist = rise + last - 2 * (end_value - start)
+        start = beyond[max(n - 1, 0)]
+        end = beyond[n]
+        rise = 0.0
+        end_rise = 0.0
+        if n > 0:
+            rise = slopes[n - 1]
+            end_rise = slopes[n]
+        bend = 3 * (end - start) - 2 * rise - end_rise
+        twist = rise + end_rise - 2 * (end - start)
         for part in range(parts):
             t = (part + 1) / parts
             value = start + t * (rise + t * (bend + t * twist))
             if of_speed:
                 way = t * (start + t * (rise / 2 + t * (bend / 3 + t * twist / 4)))
-                ax, av = travelled + dt_s * way, value
+                free_position = travelled + dt_s * way
+                free_speed = value
             else:
-                ax, av = value, (rise + t * (2 * bend + 3 * t * twist)) / dt_s
-            for i in range(N):
+                free_position = value
+                free_speed = (rise + t * (2 * bend + 3 * t * twist)) / dt_s
+            for i in range(n_states):
                 moved[i] = commanded[i] * command[k]
-                for j in range(N):
+                for j in range(n_states):
                     moved[i] += step[i, j] * state[j]
-                ax += of_x[i] * moved[i]
-                av += of_v[i] * moved[i]
-            f, x1, end = _acted(ax, av, x0, v0, gx, gv, command[k], at, forces)
-            at = min(max(at, x1 - half), x1 + half)
-            for i in range(N):
-                state[i] = moved[i] + pushed[i] * f
-            mean[k] += f / parts
-            moment[k] += f * ((part + 0.5) / parts - 0.5) / parts
-            x0, v0 = x1, end
+                free_position += position_row[i] * moved[i]
+                free_speed += speed_row[i] * moved[i]
+            force, position, speed = force_over_part(
+                free_position,
+                free_speed,
+                last_position,
+                last_speed,
+                position_per_force,
+                speed_per_force,
+                command[k],
+                follower,
+                dry,
+                table,
+                rounds,
+            )
+            follower = min(max(follower, position - half_gap), position + half_gap)
+            for i in range(n_states):
+                state[i] = moved[i] + pushed[i] * force
+            mean[k] += force / parts
+            moment[k] += force * ((part + 0.5) / parts - 0.5) / parts
+            last_position = position
+            last_speed = speed
         if of_speed and n > 0:
             travelled += dt_s * (start + rise / 2 + bend / 3 + twist / 4)
-        x[n], v[n] = x0, v0
+        x[n] = last_position
+        v[n] = last_speed
     return mean, moment, x, v

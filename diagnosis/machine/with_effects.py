@@ -16,7 +16,6 @@ import scipy
 from diagnosis.machine.around import Actuator, Body, MeasuredBody, Place, Sensor, Where
 from diagnosis.machine.listed_effects import KINDS, Magnitudes
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.motion_effects import BodyForces
 from diagnosis.machine.own_plant import Plant, PlantExperiment
 
 _MISSING = {
@@ -142,7 +141,7 @@ def with_effects(
         kind.name
         for kind in chosen
         if kind.law.where == "body"
-        and BodyForces(**kind.law.forces({one.name: one.high for one in kind.parameters})).smooth
+        and kind.law.change({one.name: one.high for one in kind.parameters}).smooth
     ]
     if smooth and isinstance(body, Body) and body.doubt:
         warnings.warn(

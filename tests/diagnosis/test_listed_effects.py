@@ -12,9 +12,11 @@ from scipy.signal import lfilter, lsim
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.around import Actuator, Body, EffectLaw, MeasuredBody
+from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothForce, SmoothLaw
 from diagnosis.machine.listed_effects import KINDS
-from diagnosis.machine.motion_effects import BodyForces, LinearBody, PulseResponse
+from diagnosis.machine.motion_effects import LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
+from plant.machine import ABSOLUTE, QUADRATIC
 from tests.diagnosis.machines import rubbing
 
 DT_S = 0.01
@@ -283,7 +285,8 @@ def test_friction_one_way_in_the_direction_of_the_force():
 def test_friction_by_direction_and_by_the_square_of_speed(name, values, more, motion, monkeypatch):
     size = EffectParameter("c", 1e-5, 30.0, unit="force/speed^2", spread=(1e-3, 3.0, 8))
     # All that an effect nobody has heard of takes is a row.
-    monkeypatch.setitem(KINDS, "wind", PlantEffect("wind", (size,), law=EffectLaw("body", {"drag": "c"})))
+    law = EffectLaw("body", SmoothLaw(QUADRATIC, "speed", ("c",)))
+    monkeypatch.setitem(KINDS, "wind", PlantEffect("wind", (size,), law=law))
     force, simulation = _force(DT_S), _Counted("on a spring", DT_S)
     truth = rubbing(_acceleration("on a spring", more), force, DT_S, lambda v: 1e-12)
     assert _misses(truth, name, values, simulation, force, motion) < 2e-3
@@ -337,7 +340,7 @@ def test_friction_behind_a_play_and_a_mass_off_the_axis(motion, name, values, in
 
 def test_friction_behind_a_play_that_a_known_motion_takes():
     x = np.array([0.0, 0.03, 0.1, 0.09, 0.04, 0.0])
-    forces = BodyForces(coulomb=2.0, gap=0.1)
+    forces = BodyForces(DryFriction(coulomb=2.0, gap=0.1))
     taken = forces.overcome(x, np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0]), np.zeros(6))
     # Half the play from the middle, the whole one where it turns round.
     np.testing.assert_allclose(taken, [0.0, 0.0, 2.0, 0.0, 0.0, -2.0])
@@ -346,16 +349,19 @@ def test_friction_behind_a_play_that_a_known_motion_takes():
 def test_every_listed_force_is_felt_in_a_known_motion():
     x = 3 * np.sin(DT_S * np.arange(300))
     for kind in (kind for kind in KINDS.values() if kind.law.where == "body"):
-        forces = BodyForces(**kind.law.forces({one.name: one.high for one in kind.parameters}))
+        forces = kind.law.change({one.name: one.high for one in kind.parameters})
         assert np.any(forces.overcome(x, np.gradient(x), np.ones_like(x))), kind.name
 
 
 def test_forces_that_a_known_motion_takes():
     x, v, rest = np.array([0.3, -0.2, 0.1]), np.array([2.0, -1.0, 0.5]), np.array([4.0, -3.0, -2.0])
-    forces = BodyForces(asymmetry=0.3, drag=0.2)
+    asymmetry, drag = (
+        SmoothForce(law, "speed", (size,)) for law, size in ((ABSOLUTE, 0.3), (QUADRATIC, 0.2))
+    )
+    forces = BodyForces(smooth=(asymmetry, drag))
     np.testing.assert_allclose(forces.overcome(x, v, rest), 0.3 * np.abs(v) + 0.2 * v * np.abs(v))
     # Of 5 that drive a fifth is lost on the way to 4; braking, friction helps: of 2 only 2/1.2 are needed.
-    lost = BodyForces(load=0.2).overcome(x, v, rest)
+    lost = BodyForces(DryFriction(load=0.2)).overcome(x, v, rest)
     np.testing.assert_allclose(rest + lost, [5.0, -3.75, -2.0 / 1.2])
 
 
