@@ -125,3 +125,42 @@ def wrong_values(tolerances: Mapping[str, float]) -> tuple[PlantEffect, ...]:
         for key, tolerance in tolerances.items()
         if tolerance < _KNOWS_NOTHING
     )
+
+
+def name_with_unit(parameter: EffectParameter, units: Mapping[str, str]) -> str:
+    """Name of a parameter with the unit of its quantity behind it, as names of parameters have it.
+
+    Parameters
+    ----------
+    parameter : EffectParameter
+        In numbers (`EffectParameter.at`), so that its quantity is known.
+    units : mapping
+        Magnitude (force, position, speed, input, output, reading) -> unit as names have it: "N", "m_s". The
+        unit of a speed is that of the position over s.
+
+    Returns
+    -------
+    str
+        "coefficient" of force/speed with N and m as "coefficient_Ns_m", "rate_per_s" of input/duration_s as
+        "rate_N_s"; the name itself where a unit is not known, or it ends with one already.
+    """
+    size, *per = parameter.quantity.split("/")
+    if parameter.quantity in ("", "dt_s") or not units.get(size):
+        return parameter.name
+    above = units[size]
+    below = ""
+    for part in per:
+        magnitude, _, exponent = part.partition("^")
+        if magnitude == "duration_s":
+            below += "_s"
+            continue
+        # A speed below is a time above.
+        if magnitude == "speed":
+            above += f"s{exponent}"
+        length = units.get("position", "")
+        if not length:
+            return parameter.name
+        below += f"_{length}{exponent}"
+    name = f"{parameter.name.removesuffix('_per_s')}_{above}{below}"
+    # A rate of a speed is per second squared.
+    return name.replace("_s_s", "_s2")

@@ -295,6 +295,7 @@ class EffectParameter:
     spread : (first, last, count) or None. In place of starts: so many from first to last, in equal ratios.
     most : str. Name of a magnitude that `high` does not go beyond, a multiple of the unit as well.
     step : float or None. See `Axis`; None: by how outputs depend on the effect.
+    quantity : str. The unit of a parameter that `at` has put in numbers, for words: "force/speed^2".
     """
 
     name: str
@@ -306,6 +307,7 @@ class EffectParameter:
     spread: tuple[float, float, int] | None = None
     most: str = ""
     step: float | None = None
+    quantity: str = ""
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low < self.high):
@@ -332,7 +334,7 @@ class EffectParameter:
         high = self.high
         if self.most:
             high = min(high, getattr(magnitudes, self.most))
-        return replace(self, high=high, unit="", most="").times(unit)
+        return replace(self, high=high, unit="", most="", quantity=self.unit).times(unit)
 
     def times(self, magnitude: float) -> EffectParameter:
         """This parameter with its range and starts multiplied by a magnitude; a spread becomes starts."""

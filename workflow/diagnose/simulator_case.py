@@ -22,7 +22,7 @@ from diagnosis.machine.around import Actuator, Body, Sensor
 from diagnosis.machine.listed_effects import KINDS as LISTED
 from diagnosis.machine.machine_protocol import Real, check_count
 from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantCase, PlantExperiment, place_of
-from diagnosis.machine.plant_effect import PlantEffect
+from diagnosis.machine.plant_effect import PlantEffect, name_with_unit
 from diagnosis.machine.with_effects import with_effects
 from ident.data.record import Record
 from ident.data.record_files import read_table
@@ -118,43 +118,35 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
     )
 
 
-# Units of listed effects' parameters: of a force F and a motion x, or of the signal S that they change.
-_SIZES = {
-    **dict.fromkeys(("force", "static_force", "torque"), "{F}"),
-    "velocity": "{x}_s",
-    "coefficient": "{F}s_{x}",
-    "stiffness": "{F}_{x}",
-    "cubic": "{F}_{x}3",
-    **dict.fromkeys(("offset", "width", "limit", "gap"), "{S}"),
-    "rate_per_s": "{S}_s",
-}
-
-
 def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dict[str, str]:
-    """Parameter -> the same with its unit."""
-    on, names = effect.place, plant.output_names
-    units: dict[str, str] = {}
+    """Parameter -> its name with its unit, of those whose unit is that of an input or an output.
+
+    inputs : names of the commands, whose units they end with.
+    """
+    place = effect.place
+    outputs = plant.output_names
 
     def unit(name: str) -> str:
         found = unit_of(name) or plant.units.get(name, "")
         return found.replace(" ", "").replace("²", "2").replace("/", "_")
 
+    units: dict[str, str] = {}
     if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
-        units["S"] = unit(effect.name.removesuffix(".sensor_offset"))
-    elif isinstance(on, Body):
-        units["F"], units["S"] = unit(inputs[on.force or 0]), unit((*names, "")[int(on.motion)])
-        units["x"] = units["S"] = units["S"].removesuffix("_s") if on.motion_is == "speed" else units["S"]
-    elif isinstance(on, Sensor) or (isinstance(on, Actuator) and on.drive is None):
-        units["S"] = unit((names if isinstance(on, Sensor) else inputs)[int(on.column)])
-    found = {}
-    for parameter in (one.name for one in effect.parameters):
-        size = "{F}s2_{x}2" if effect.name.endswith("quadratic_drag") else _SIZES.get(parameter, "")
-        if size and all(units.get(key) for key in re.findall(r"{(\w)}", size)):
-            # A rate of a speed is per second squared.
-            found[parameter] = f"{parameter.removesuffix('_per_s')}_{size.format(**units)}".replace(
-                "_s_s", "_s2"
-            )
-    return found
+        units["output"] = unit(effect.name.removesuffix(".sensor_offset"))
+    elif isinstance(place, Body):
+        motion = int(place.motion)
+        # A motion that nobody measures has no name.
+        moved = unit(outputs[motion]) if motion < len(outputs) else ""
+        position = moved.removesuffix("_s") if place.motion_is == "speed" else moved
+        units["force"] = unit(inputs[place.force or 0])
+        units["position"] = position
+        units["speed"] = f"{position}_s" if position else ""
+    elif isinstance(place, Sensor):
+        units["output"] = units["reading"] = unit(outputs[int(place.column)])
+    elif isinstance(place, Actuator) and place.drive is None:
+        units["input"] = unit(inputs[int(place.column)])
+    names = {parameter.name: name_with_unit(parameter, units) for parameter in effect.parameters}
+    return {name: with_unit for name, with_unit in names.items() if with_unit != name}
 
 
 def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diagnosis:
