@@ -27,6 +27,7 @@ import numpy as np
 from diagnosis.machine.force_places import ForcedSimulation, ForcePlace
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import DEAD_ZONE, STRIBECK
+from diagnosis.machine.mujoco_forces import FORCE_NAMES
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_quantities import Quantities
 from diagnosis.machine.mujoco_simulation import MujocoSimulation
@@ -34,7 +35,7 @@ from diagnosis.machine.own_plant import Plant, PlantExperiment
 from diagnosis.machine.plant_effect import Change, PlantEffect
 
 # Last parts of numbers in a file that MuJoCo does not act on.
-_IGNORED = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}")
+_IGNORED = (".gain", ".offset", f".{DEAD_ZONE}", f".{STRIBECK}", *(f".{name}" for name in FORCE_NAMES))
 # Relative standard deviations where the file has no <numeric name="tolerance.NAME">, by a name's last part.
 TOLERANCES = {
     "mass": 0.03,
@@ -44,6 +45,7 @@ TOLERANCES = {
     "armature": 0.1,
     "stiffness": 0.05,
     "drag": 0.2,
+    "hardening_spring": 0.05,
     "gain": 0.02,
     "kp": 0.02,
     "kv": 0.02,

@@ -39,6 +39,7 @@ from diagnosis.machine.mujoco_edits import (
     put_spring,
     put_stribeck,
 )
+from diagnosis.machine.mujoco_forces import forces_of_joint
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.mujoco_simulation import start_filters
 from diagnosis.machine.own_plant import PlantExperiment
@@ -88,7 +89,10 @@ _OF_JOINT: tuple[tuple[str, str, int, str, str, float, Dependence], ...] = (
     ("drag", "damping", 1, "coefficient_{F}s2_{x}2", "force/speed^2", 10.0, "smooth"),
     ("armature", "armature", 0, "inertia_{m}", "inertia", 10.0, "smooth"),
     ("stiffness", "stiffness", 0, "stiffness_{F}_{x}", "force/position", 10.0, "smooth"),
+    ("hardening_spring", "stiffness", 2, "cubic_{F}_{x}3", "force/position^3", 1e3, "smooth"),
 )
+# Of these a model that has none is seldom missing one.
+_BY_NAME = ("drag", "hardening_spring")
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +128,7 @@ class Quantities:
             value = float(np.ravel(getattr(joint, key))[k])
             put: Callable[..., None] = partial(put_at_joint, name, key, k)
             sized = _size(size.format(F=F, x=x, m=m), unit, (1e-4, most)).at(magnitudes)
-            tried = "by name" if what == "drag" and value == 0 else "always"
+            tried = "by name" if what in _BY_NAME and value == 0 else "always"
             yield of(f"{name}.{what}", value, put, sized, dependence=dependence, tried=tried)
         if self.model.spec.numeric(f"{name}.{STRIBECK}") is None:
             level = _size(f"level_{F}", force)
@@ -138,6 +142,7 @@ class Quantities:
                 contains=None if joint.frictionloss else f"{name}.frictionloss",
                 tried="by name",
             )
+        yield from forces_of_joint(self.model.spec, joint, magnitudes, F, x)
         motor, load = joint.armature, inertia - joint.armature
         if not motor > 0:
             return

@@ -21,10 +21,10 @@ from diagnosis.machine.mujoco_edits import (
     DEAD_ZONE,
     ELASTIC,
     PLAIN,
-    STRIBECK,
     put_component,
     put_gain,
 )
+from diagnosis.machine.mujoco_forces import JointForces, sensed_under
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.own_plant import PlantExperiment
 from diagnosis.machine.plant_effect import PlantEffect
@@ -372,28 +372,13 @@ def _wind(model: Any, data: Any, command: Real) -> None:
 
 
 def _sensed(model: Any, data: Any, control: Real) -> Real:
-    """(N, U) commands of steps -> (N, S) what sensors read at their beginning.
-
-    Friction that falls with speed is held over a step.
-    """
+    """(N, U) commands of steps -> (N, S) what sensors read at their beginning."""
+    joints = JointForces.of_model(model)
+    if joints:
+        return sensed_under(joints, model, data, control)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    falling = [
-        (model.joint(k).dofadr[0], *_number(model, f"{model.joint(k).name}.{STRIBECK}", 0.0, 1.0))
-        for k in range(model.njnt)
-    ]
-    dofs, excess, velocity = np.array([one for one in falling if one[1] != 0]).reshape(-1, 3).T
-    if not dofs.size:
-        return np.asarray(rollout.rollout(model, data, state[None], control[None])[1][0])
-    dofs, level = dofs.astype(int), np.array(model.dof_frictionloss)
-    found = np.zeros((len(control), model.nsensordata))
-    for k, command in enumerate(control):
-        model.dof_frictionloss[dofs] = level[dofs] + excess * np.exp(-np.abs(data.qvel[dofs]) / velocity)
-        data.ctrl[:] = command
-        mujoco.mj_step(model, data)
-        found[k] = data.sensordata
-    model.dof_frictionloss[:] = level
-    return found
+    return np.asarray(rollout.rollout(model, data, state[None], control[None])[1][0])
 
 
 def _rms(signals: Real) -> Real:

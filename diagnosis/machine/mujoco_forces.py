@@ -1,0 +1,143 @@
+"""Forces on a joint of a MuJoCo model that MJCF has no word for.
+
+Their rows are those of any simulation (`diagnosis.machine.listed_effects`): each one with a smooth law is a
+quantity of every joint, tried by name. It stands in a model as <numeric name="JOINT.EFFECT" data="...">,
+values in the order of the row's parameters, is read from there, and acts as an applied force that is held
+over a step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from diagnosis.machine.around import EffectLaw
+from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothLaw, smooth_force
+from diagnosis.machine.listed_effects import KINDS, Magnitudes
+from diagnosis.machine.machine_protocol import Real
+from diagnosis.machine.mujoco_edits import STRIBECK, put_number
+from diagnosis.machine.plant_effect import PlantEffect, name_with_unit
+from plant.machine import OFF_AXIS
+
+# Effects that are numbers of a joint in MJCF: damping, damping[1], stiffness, stiffness[2].
+_IN_MJCF = ("viscous_friction", "quadratic_drag", "spring", "hardening_spring")
+# Names of the effects that are not, last parts of the names of numbers that MuJoCo does not act on.
+FORCE_NAMES = tuple(
+    kind.name
+    for kind in KINDS.values()
+    if isinstance(kind.law.change, SmoothLaw) and kind.name not in _IN_MJCF
+)
+
+
+def forces_of_joint(
+    spec: Any, joint: Any, magnitudes: Magnitudes, force_unit: str, position_unit: str
+) -> Iterator[PlantEffect]:
+    """Effects that may be missing at a hinge or slide, of those in `FORCE_NAMES`.
+
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        One that the model states already is none: it acts.
+    joint : mujoco.MjsJoint
+    magnitudes : Magnitudes
+        Force, position and speed of the joint in its records, for ranges.
+    force_unit, position_unit : str
+        "Nm" and "rad", or "N" and "m"; names of parameters end with them.
+    """
+    units = {"force": force_unit, "position": position_unit, "speed": f"{position_unit}_s"}
+    for name in FORCE_NAMES:
+        kind = KINDS[name].at(magnitudes)
+        # A weight turns about an axis.
+        if kind.law.change.law == OFF_AXIS and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
+            continue
+        number = f"{joint.name}.{name}"
+        if spec.numeric(number) is not None:
+            continue
+        yield replace(
+            kind,
+            name=number,
+            parameters=tuple(replace(p, name=name_with_unit(p, units)) for p in kind.parameters),
+            group="joint",
+            law=EffectLaw("model", partial(put_number, number)),
+            tried="by name",
+        )
+
+
+@dataclass(frozen=True)
+class JointForces:
+    """Forces at one degree of freedom of a compiled model that MuJoCo does not act on itself.
+
+    dof, position : places of the joint in qvel and in qpos. forces : those that act.
+    """
+
+    dof: int
+    position: int
+    forces: BodyForces
+
+    @classmethod
+    def of_model(cls, model: Any) -> tuple[JointForces, ...]:
+        """Those of every joint that has any, of the numbers in a compiled model (MjModel)."""
+        found = []
+        for k in range(model.njnt):
+            joint = model.joint(k)
+            forces = BodyForces()
+            falling = _number(model, f"{joint.name}.{STRIBECK}")
+            if falling is not None and falling[0] != 0:
+                dry = DryFriction(excess=float(falling[0]), stribeck_velocity=float(falling[1]))
+                forces = forces + BodyForces(dry)
+            for name in FORCE_NAMES:
+                values = _number(model, f"{joint.name}.{name}")
+                if values is None:
+                    continue
+                names = (parameter.name for parameter in KINDS[name].parameters)
+                forces = forces + KINDS[name].law.change(dict(zip(names, values, strict=True)))
+            if forces != BodyForces():
+                found.append(cls(int(joint.dofadr[0]), int(joint.qposadr[0]), forces))
+        return tuple(found)
+
+
+def sensed_under(joints: tuple[JointForces, ...], model: Any, data: Any, control: Real) -> Real:
+    """What sensors read at the beginning of every step, under forces that are held over a step.
+
+    Parameters
+    ----------
+    joints : tuple of JointForces
+    model, data : MjModel, MjData
+        As the record begins. The model is as before when this returns.
+    control : (N, U)
+        Commands of the steps.
+
+    Returns
+    -------
+    (N, S)
+    """
+    level = np.array(model.dof_frictionloss)
+    falling = [joint for joint in joints if joint.forces.dry.excess != 0]
+    smooth = [(joint.dof, joint.position, joint.forces.table) for joint in joints if joint.forces.smooth]
+    falling_dofs = np.array([joint.dof for joint in falling], dtype=int)
+    excess = np.array([joint.forces.dry.excess for joint in falling])
+    velocity = np.array([joint.forces.dry.stribeck_velocity for joint in falling])
+    readings = np.zeros((len(control), model.nsensordata))
+    for k, command in enumerate(control):
+        if falling:
+            falls = np.exp(-np.abs(data.qvel[falling_dofs]) / velocity)
+            model.dof_frictionloss[falling_dofs] = level[falling_dofs] + excess * falls
+        for dof, position, table in smooth:
+            data.qfrc_applied[dof] = smooth_force(table, data.qpos[position], data.qvel[dof])
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        readings[k] = data.sensordata
+    model.dof_frictionloss[:] = level
+    data.qfrc_applied[:] = 0.0
+    return readings
+
+
+def _number(model: Any, name: str) -> Real | None:
+    """Values of a <numeric> of a compiled model; None where it has none of that name."""
+    k = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name)
+    return None if k < 0 else np.asarray(model.numeric(k).data)
