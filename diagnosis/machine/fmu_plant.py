@@ -102,6 +102,11 @@ class Fmu:
         return {name: value for name, value in started.items() if value != 0.0}
 
     @property
+    def tolerances(self) -> dict[str, float]:
+        """None: an FMU states no tolerances."""
+        return {}
+
+    @property
     def effects(self) -> tuple[PlantEffect, ...]:
         return tuple(
             PlantEffect(name, (EffectParameter(name, _NOTHING * float(v.max), float(v.max)),))

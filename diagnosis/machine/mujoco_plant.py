@@ -188,10 +188,10 @@ class MujocoArm(MujocoModel):
             for name, one in there.items()
             if one.tried == "always" or any(fnmatchcase(name, pattern) for pattern in named)
         }
-        stated = {name: one.stated for name, one in every.items() if one.stated != 0.0}
-        usual = {name: TOLERANCES.get(name.rpartition(".")[2], _ELSE) for name in stated}
-        tolerances = {name: self.number(f"tolerance.{name}", usual[name]) for name in stated}
         simulation = MujocoSimulation(self, every, noise)
+        stated = simulation.parameters
+        usual = {name: TOLERANCES.get(name.rpartition(".")[2], _ELSE) for name in stated}
+        tolerances = {**usual, **simulation.tolerances}
         share = model_error * simulation.commanded(stated, experiments)
         records = experiments[:_LOOKED_AT]
         as_stated = [simulation(stated, {}, e.input) for e in records]
@@ -212,7 +212,7 @@ class MujocoArm(MujocoModel):
         for one in self.spec.actuators:
             needs[f"{one.name}.gain"] = "an actuator whose gain is fixed, affine or a muscle's"
             needs[f"{one.name}.lag"] = "an actuator without dynamics or with those of a filter"
-        missing = [one for one in every.values() if one.stated == 0.0]
+        missing = simulation.effects
         shown = {name for name, value in stated.items() if seen({name: _WRONG * value}, {})}
         unstable = set[str]()
         for one in missing:

@@ -61,6 +61,38 @@ class MujocoSimulation:
     _paths: dict[Any, tuple[Real, Real]] = field(default_factory=dict, repr=False)
     _starts: dict[Any, _Start] = field(default_factory=dict, repr=False)
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Name -> value that the model has, of what may be wrong."""
+        return {name: one.stated for name, one in self.quantities.items() if one.stated != 0.0}
+
+    @property
+    def tolerances(self) -> dict[str, float]:
+        """Parameter -> relative standard deviation, of those for which the file has a number."""
+        stated = {one.name: float(one.data[0]) for one in self.arm.spec.numerics}
+        names = {name: f"tolerance.{name}" for name in self.parameters}
+        return {name: stated[number] for name, number in names.items() if number in stated}
+
+    @property
+    def effects(self) -> tuple[PlantEffect, ...]:
+        """Quantities that the model has none of."""
+        return tuple(one for one in self.quantities.values() if one.stated == 0.0)
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """(U,) names of the actuators; in its inputs the outputs as measured follow them."""
+        return self.arm.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """(Y,) names of sensors and joints."""
+        return self.arm.outputs
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Output -> unit."""
+        return self.arm.units
+
     def edited(self, values: Mapping[str, Any], of: Any = None) -> Any:
         """The model (MjSpec) with these values; of: as a whole, else what moves of it."""
         spec = (of or self.arm.moving).copy()

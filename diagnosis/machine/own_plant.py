@@ -70,11 +70,19 @@ class SimulationError(ValueError):
 
 
 def place_of(error: BaseException, file: str = "") -> str:
-    """The last line of a user's file on the way to an error, as " (FILE, line N)". file : that file;
-    by default the one that is called first from where the error is caught."""
+    """The last line of a user's file on the way to an error, as " (FILE, line N)"; "" where there is none.
+
+    file : that file; by default the one that is called first, beside those of this package.
+    """
     frames = traceback.extract_tb(error.__traceback__)[1:]
-    own = [one for one in frames if one.filename == (file or frames[0].filename)]
-    return f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
+    package = str(Path(__file__).parent)
+    called = [frame for frame in frames if not frame.filename.startswith(package)]
+    if not called:
+        return ""
+    of_file = [frame for frame in called if frame.filename == (file or called[0].filename)]
+    if not of_file:
+        return ""
+    return f" ({Path(of_file[-1].filename).name}, line {of_file[-1].lineno})"
 
 
 def _is_number(value: object) -> bool:
