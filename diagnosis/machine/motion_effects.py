@@ -61,10 +61,9 @@ _REAL = 1e-9
 _UNSTABLE = 1.1
 # Size that no filter of a response of at most one comes to; far below what overflows.
 _GROWS = 1e100
-# Radians of a swing in a part of a sample: the trapezoidal rule is then off by a thousandth.
+# Radians of a swing, or of a force with a period, in a part of a sample: the trapezoidal rule is then off by
+# a thousandth.
 _SWING_RAD = 0.1
-# Radians of a force with a period in a part of a sample, as `plant.plan` has it: off by half a per cent.
-_PHASE_RAD = 0.25
 # Parts of a sample are powers of two up to this: smaller ones take longer and no record is sampled so
 # coarsely.
 _LARGEST_POWER = 4
@@ -181,7 +180,7 @@ class LinearBody:
         needed = max(
             stiffer_swing_rad / _SWING_RAD,
             damping * abs(speed_per_force) / _SWING_RAD,
-            phase_rad / _PHASE_RAD,
+            phase_rad / _SWING_RAD,
             1.0,
         )
         return int(2 ** min(np.ceil(np.log2(needed)), _LARGEST_POWER))

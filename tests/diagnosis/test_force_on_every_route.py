@@ -1,0 +1,141 @@
+"""A force on a body is one row, and acts by its equation on every route.
+
+Around a simulation (an FMU is one as any other), in a measured motion, on a joint of a MuJoCo model and,
+by its law, on a rig.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from diagnosis import Body, Change, MeasuredBody, Plant, PlantExperiment, with_effects
+from diagnosis.machine.body_forces import SmoothLaw
+from diagnosis.machine.listed_effects import KINDS
+from plant.effects import Effect
+from plant.machine import SmoothTorque
+from plant.presets import paper_link
+from plant.simulation import Simulator
+
+DT_S, INERTIA = 0.01, 0.17
+# Row -> values of its parameters, and the force against positive motion at a position and a speed.
+FORCES = {
+    "viscous_friction": ({"coefficient": 0.1}, lambda x, v: 0.1 * v),
+    "viscous_asymmetry": ({"coefficient": 0.05}, lambda x, v: 0.05 * np.abs(v)),
+    "quadratic_drag": ({"coefficient": 0.05}, lambda x, v: 0.05 * v * np.abs(v)),
+    "spring": ({"stiffness": 0.8}, lambda x, v: 0.8 * x),
+    "hardening_spring": ({"cubic": 0.5}, lambda x, v: 0.5 * x**3),
+    "eccentric_mass": ({"torque": 0.4, "angle_rad": 0.7}, lambda x, v: 0.4 * (np.sin(x + 0.7) - np.sin(0.7))),
+}
+# What MJCF itself has is called as there.
+IN_MJCF = {"viscous_friction": "damping", "quadratic_drag": "drag", "spring": "stiffness"}
+ROD = f"""<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 0"/><worldbody><body>
+<joint name="hinge" axis="0 0 1"/><inertial pos="0 0 0" mass="1" diaginertia="{INERTIA} {INERTIA} {INERTIA}"/>
+</body></worldbody><actuator><motor name="motor" joint="hinge"/></actuator></mujoco>"""
+
+
+def moved(command, force):
+    """Angle and speed (T, 2) of a rod from rest under held commands (T,), by Runge-Kutta steps."""
+    state, motion, h = np.zeros(2), np.zeros((command.size, 2)), DT_S / 4
+    for k, u in enumerate(command):
+        motion[k] = state
+        for _ in range(4):
+
+            def rates(s, u=u):
+                return np.array([s[1], (u - force(s[0], s[1])) / INERTIA])
+
+            a = rates(state)
+            b = rates(state + h / 2 * a)
+            c = rates(state + h / 2 * b)
+            d = rates(state + h * c)
+            state = state + h / 6 * (a + 2 * b + 2 * c + d)
+    return motion
+
+
+COMMAND = np.random.default_rng(2).uniform(-1, 1, 15).repeat(20)
+FREE = moved(COMMAND, lambda x, v: 0.0)
+
+
+def test_every_row_with_a_smooth_law_has_its_equation_here():
+    assert {name for name, kind in KINDS.items() if isinstance(kind.law.change, SmoothLaw)} == {*FORCES}
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_around_a_simulation_that_does_not_know_it(name):
+    """Its own position: measured up to 1e-5 of what it changes. Another output feels no more of a force than
+    its mean and moment over a sample."""
+    values, force = FORCES[name]
+    truth = moved(COMMAND, force)
+    record = PlantExperiment("a", "estimation", COMMAND[:, None], truth)
+    plant = Plant(
+        lambda p, e, u: moved(u[:, 0], lambda x, v: 0.0), {}, {}, ("x_rad", "v_rad_s"), np.full(2, 1e-4)
+    )
+    plant = with_effects(plant, [name], [record], dt_s=DT_S, body=Body("x_rad"))
+    found = plant.simulated([Change(name, values)])(COMMAND[:, None])
+    missed = np.linalg.norm(found - truth, axis=0) / np.linalg.norm(FREE - truth, axis=0)
+    assert np.all(missed < [1e-4, 1e-3])
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_in_the_force_that_a_measured_motion_takes(name):
+    values, force = FORCES[name]
+    motion = moved(COMMAND, force)
+    rest = INERTIA * np.gradient(motion[:, 1], DT_S)
+    record = PlantExperiment("a", "estimation", motion, rest)
+    plant = Plant(
+        lambda p, e, u: INERTIA * np.gradient(u[:, 1:], DT_S, axis=0), {}, {}, ("torque_Nm",), np.ones(1)
+    )
+    plant = with_effects(plant, [name], [record], dt_s=DT_S, body=MeasuredBody(0, 1))
+    taken = plant.simulated([Change(name, values)])(motion)[:, 0] - rest
+    moving = ~plant.body.resting(motion)
+    assert np.count_nonzero(moving) > 200
+    np.testing.assert_allclose(taken[moving], force(*motion[moving].T), rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_on_a_joint_of_a_mujoco_model(name):
+    """Held over steps of a fifth of a sample. Measured up to 1.3e-3 of what it changes."""
+    mujoco = pytest.importorskip("mujoco")
+    from diagnosis.machine.mujoco_plant import MujocoArm
+
+    values, force = FORCES[name]
+    truth = moved(COMMAND, force)[:, :1]
+    log = np.column_stack([COMMAND, truth])
+    record = PlantExperiment("a", "estimation", log, truth)
+    arm = MujocoArm(mujoco.MjSpec.from_string(ROD), ("hinge",), DT_S)
+    called = f"hinge.{IN_MJCF.get(name, name)}"
+    plant = arm.plant([record], np.array([1e-4]), named=[called])
+    change = Change(called, values)
+    # The repaired text says it, too.
+    text = arm.repaired(plant, plant, [change])
+    again = MujocoArm(mujoco.MjSpec.from_string(text), ("hinge",), DT_S)
+    read_back = again.plant([record], np.array([1e-4]))
+    free = plant.simulator([])(log)
+    for found in (plant.simulator([change])(log), read_back.simulator([])(log)):
+        assert np.linalg.norm(found - truth) < 4e-3 * np.linalg.norm(free - truth)
+
+
+@pytest.mark.parametrize("name", FORCES)
+def test_on_the_hub_of_a_rig(name):
+    """As the same torque on the hub, held over samples, does. Measured up to 8e-4 of what it changes."""
+    values, force = FORCES[name]
+    law = KINDS[name].law.change
+
+    class ByRow(Effect):
+        id = "by_row"
+        words = "a row"
+
+        def modify(self, machine):
+            torque = SmoothTorque(law.law, tuple(values[p] for p in law.parameters), "motor", _OF[law.of])
+            return replace(machine, joint=replace(machine.joint, torques=(torque,)))
+
+    rig, voltage = paper_link(), 2 * COMMAND
+    angle = Simulator(rig, [ByRow()]).measured(["hub_angle_rad"], voltage)[:, 0]
+    free = Simulator(rig).measured(["hub_angle_rad"], voltage)[:, 0]
+    middle, speed = 0.5 * (angle[1:] + angle[:-1]), np.diff(angle) / rig.sampling.dt_s
+    torque = np.append(-force(middle, speed), 0.0)
+    pushed = Simulator(rig).measured(["hub_angle_rad"], voltage, hub_torque_Nm=torque)[:, 0]
+    assert np.linalg.norm(pushed - angle) < 3e-3 * np.linalg.norm(free - angle)
+
+
+_OF = {"position": "angle", "speed": "speed"}
