@@ -7,7 +7,7 @@ records' magnitudes, as in `plant.effects`, where effects of the same name are t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -18,7 +18,7 @@ from diagnosis.machine.body_forces import BodyForces, DryFriction, DryLaw, Smoot
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.plant_effect import PlantEffect
 from plant.effects.search_space import EffectParameter
-from plant.machine import ABSOLUTE, CUBIC, LINEAR, OFF_AXIS, QUADRATIC
+from plant.machine import ABSOLUTE, CUBIC, LINEAR, OFF_AXIS, QUADRATIC, SINE
 
 Values = Mapping[str, float]
 
@@ -122,6 +122,12 @@ _LAG = _sized("time_constant_s", 2e-3, 200.0, 0.02, 40.0, 10, "dt_s")
 _GAIN = EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7))
 _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
 _VISCOUS = _sized("coefficient", 1e-5, 30.0, 1e-4, 3.0, 8, "force/speed")
+# Of an angle in radians a wave number is cycles per turn. From a sixth of a period to the largest position
+# on, since less is a spring. Starts are a quarter of a period apart there, up to forty radians: more take
+# longer.
+_WAVES = EffectParameter(
+    "wave_number", 1.0, 200.0, tuple(1.6 * k for k in range(1, 25)), "linear", unit="/position"
+)
 _ANGLE = EffectParameter("angle_rad", -np.pi, np.pi, (-2.4, -0.8, 0.8, 2.4), "linear")
 
 _actuator = partial(PlantEffect, group="actuator")
@@ -281,6 +287,17 @@ KINDS: dict[str, PlantEffect] = {
             (_sized("cubic", 1e-7, 1e3, 1e-5, 10.0, 12, "force/position^3"),),
             law=EffectLaw("body", SmoothLaw(CUBIC, "position", ("cubic",))),
             check="push by hand at small and at large distances and look for cables and hoses",
+        ),
+        _body(
+            "cogging",
+            (
+                _sized("amplitude", 1e-5, 1.0, 0.05, 0.05, 1, "force"),
+                _WAVES,
+                replace(_ANGLE, name="phase_rad", scale="angle"),
+            ),
+            law=EffectLaw("body", SmoothLaw(SINE, "position", ("amplitude", "wave_number", "phase_rad"))),
+            tried="by name",
+            check="turn the axis slowly by hand with the drive off and feel for places where it sticks",
         ),
         _sensor(
             "backlash",

@@ -25,6 +25,10 @@ FORCES = {
     "quadratic_drag": ({"coefficient": 0.05}, lambda x, v: 0.05 * v * np.abs(v)),
     "spring": ({"stiffness": 0.8}, lambda x, v: 0.8 * x),
     "hardening_spring": ({"cubic": 0.5}, lambda x, v: 0.5 * x**3),
+    "cogging": (
+        {"amplitude": 0.3, "wave_number": 7.0, "phase_rad": 0.4},
+        lambda x, v: -0.3 * np.sin(7 * x + 0.4),
+    ),
     "eccentric_mass": ({"torque": 0.4, "angle_rad": 0.7}, lambda x, v: 0.4 * (np.sin(x + 0.7) - np.sin(0.7))),
 }
 # What MJCF itself has is called as there.
