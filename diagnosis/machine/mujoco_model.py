@@ -6,25 +6,44 @@ import re
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import mujoco
 import numpy as np
 
 from diagnosis.machine.mujoco_edits import LAGS, put_compiled
 
-_LONGEST_MODEL = 2**26  # bytes
+# Longest model file that is searched for the files it names; chosen, a hundred times any model of a robot.
+# Longer ones are left to MuJoCo unsearched.
+_LONGEST_MODEL_BYTES = 2**26
+# Endings of files that may name other files: MuJoCo reads each of them as XML, those without an ending too.
+_MODEL_ENDINGS = (".xml", ".mjcf", ".urdf", "")
+# What an XML file says of files and of the folders they are in: attribute, value.
+_FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
+# Sampling periods over the model's time step may miss a whole number by this much: rounding of decimals
+# (0.01 / 0.002 is 5.000000000000001) must not make one step more.
+_WHOLE_STEPS = 1e-6
+# Largest command of a servo on a joint without a range, rad: a whole turn each way. Chosen; the joint of a
+# robot that turns further has its cables wound up.
+_WHOLE_TURN_RAD = 2 * np.pi
+
 _SENSORS = mujoco.mjtSensor
-# Units of sensors whose object says nothing more; of those of a joint or tendon, along a line or about it.
+# Units of sensors whose object says nothing more.
 _SENSOR_UNITS = {
-    **dict.fromkeys((_SENSORS.mjSENS_ACCELEROMETER, _SENSORS.mjSENS_FRAMELINACC), "m/s²"),
-    **dict.fromkeys((_SENSORS.mjSENS_GYRO, _SENSORS.mjSENS_FRAMEANGVEL), "rad/s"),
-    **dict.fromkeys((_SENSORS.mjSENS_VELOCIMETER, _SENSORS.mjSENS_FRAMELINVEL), "m/s"),
-    **dict.fromkeys((_SENSORS.mjSENS_FRAMEPOS, _SENSORS.mjSENS_TENDONPOS), "m"),
-    **dict.fromkeys((_SENSORS.mjSENS_FORCE, _SENSORS.mjSENS_TOUCH), "N"),
+    _SENSORS.mjSENS_ACCELEROMETER: "m/s²",
+    _SENSORS.mjSENS_FRAMELINACC: "m/s²",
+    _SENSORS.mjSENS_GYRO: "rad/s",
+    _SENSORS.mjSENS_FRAMEANGVEL: "rad/s",
+    _SENSORS.mjSENS_VELOCIMETER: "m/s",
+    _SENSORS.mjSENS_FRAMELINVEL: "m/s",
+    _SENSORS.mjSENS_FRAMEPOS: "m",
+    _SENSORS.mjSENS_TENDONPOS: "m",
     _SENSORS.mjSENS_TENDONVEL: "m/s",
+    _SENSORS.mjSENS_FORCE: "N",
+    _SENSORS.mjSENS_TOUCH: "N",
     _SENSORS.mjSENS_TORQUE: "N m",
 }
+# Units of sensors of a joint: where it turns (a hinge), where it slides.
 _JOINT_UNITS = {
     _SENSORS.mjSENS_JOINTPOS: ("rad", "m"),
     _SENSORS.mjSENS_JOINTVEL: ("rad/s", "m/s"),
@@ -33,44 +52,72 @@ _JOINT_UNITS = {
 }
 
 
+class TrackedJoint(NamedTuple):
+    """A joint whose position is an output.
+
+    column : of that output. name : of the joint. inertia : what its motor feels of the stated model in its
+    zero position [kg m^2 of a hinge, kg of a slide].
+    """
+
+    column: int
+    name: str
+    inertia: float
+
+
 def names(path: str) -> dict[str, list[str]]:
-    """Kind -> names of what an MJCF file has of it: "actuator", "sensor", "joint" (but those that a sensor of
-    their name reads, as in a repaired file)."""
+    """Names of what an MJCF file has, by kind: "actuator", "sensor", "joint".
+
+    A joint that a sensor of its own name reads is listed as a sensor only: a repaired file has one for every
+    measured joint. Raises ValueError like `read`.
+    """
     spec = read(path)
-    every = {"actuator": spec.actuators, "sensor": spec.sensors, "joint": spec.joints}
-    found = {kind: [one.name for one in every[kind] if one.name] for kind in every}
-    angles = [one for one in spec.sensors if one.type == _SENSORS.mjSENS_JOINTPOS]
-    read_by = {one.name for one in angles if one.name == one.objname}
-    return {**found, "joint": [name for name in found["joint"] if name not in read_by]}
-
-
-_FILES = re.compile(rb"""\b(file|(?:mesh|texture|asset)dir)\s*=\s*["']([^"'<]+)""")
+    sensors_of_their_joint = set()
+    for sensor in spec.sensors:
+        if sensor.type == _SENSORS.mjSENS_JOINTPOS and sensor.name == sensor.objname:
+            sensors_of_their_joint.add(sensor.name)
+    joints = [joint.name for joint in spec.joints if joint.name]
+    return {
+        "actuator": [actuator.name for actuator in spec.actuators if actuator.name],
+        "sensor": [sensor.name for sensor in spec.sensors if sensor.name],
+        "joint": [name for name in joints if name not in sensors_of_their_joint],
+    }
 
 
 def _refuse_pipes(model: Path) -> None:
-    """Whatever a model names is a file, as far as it is there: MuJoCo would wait for a pipe without an end.
+    """Raises ValueError where a model, or what it names, is there and is no file.
 
-    Included models, as MuJoCo does, from the folder of the first.
+    MuJoCo would wait for a pipe without an end. Files are looked for as MuJoCo does: those of an included
+    model in the folder of the first.
     """
-    todo, seen = [model], set[Path]()
-    while todo:
-        path = todo.pop()
+    unread = [model]
+    seen = set[Path]()
+    while unread:
+        path = unread.pop()
         if path in seen or not path.exists():
             continue
         seen.add(path)
         if not path.is_file():
             raise ValueError(f"{path.name} is no file, but a folder, pipe or device")
-        if path.suffix.lower() not in (".xml", ".mjcf", ".urdf", "") or path.stat().st_size > _LONGEST_MODEL:
+        if path.suffix.lower() not in _MODEL_ENDINGS or path.stat().st_size > _LONGEST_MODEL_BYTES:
             continue
-        named = [(key, value.decode("utf-8", "replace")) for key, value in _FILES.findall(path.read_bytes())]
-        folders = ["", *(value for key, value in named if key != b"file")]
-        files = [value for key, value in named if key == b"file"]
-        todo += [model.parent / folder / name for folder in folders for name in files if "\0" not in name]
+        folders = [""]
+        files = []
+        for key, value in _FILES.findall(path.read_bytes()):
+            text = value.decode("utf-8", "replace")
+            if key != b"file":
+                folders.append(text)
+            elif "\0" not in text:
+                files.append(text)
+        unread += [model.parent / folder / name for folder in folders for name in files]
 
 
 def read(path: str) -> Any:
+    """The model of a file as a `mujoco.MjSpec`.
+
+    Raises ValueError, one line, where it is no file or MuJoCo does not read it. MuJoCo's warnings are turned
+    off for the whole process: it would write those of every trial that runs away to the terminal and a file.
+    """
     _refuse_pipes(Path(path))
-    # Else a trial that runs away is told on the terminal and in a file.
     mujoco.set_mju_user_warning(lambda text: None)
     try:
         return mujoco.MjSpec.from_file(path)
@@ -82,10 +129,24 @@ def read(path: str) -> Any:
 class MujocoModel:
     """A model with its actuators as inputs and some of its sensors, or joints, as outputs.
 
-    spec : mujoco.MjSpec. outputs : (Y,) names of sensors of one number or of joints, "joint NAME" where
-    both have the name.
-    dt_s : sampling period of the records; the model takes the fewest equal steps no longer than its own.
-    tracking_rad_s : how fast the simulation is drawn to the measured joints; 0 is a free run.
+    Parameters
+    ----------
+    spec : mujoco.MjSpec
+        Changed in place: names for parts that have none, a time step that divides dt_s, a sensor for every
+        output that is a joint, and as numbers what the compiler derives (`put_compiled`).
+    outputs : (Y,) names
+        Of sensors of one number or of joints; "joint NAME" is the joint where a sensor has its name too.
+    dt_s : float
+        Sampling period of the records. The model takes the fewest equal steps no longer than its own.
+    tracking_rad_s : float
+        How fast the simulation is drawn to the measured joints, as the natural frequency of a critically
+        damped spring; 0 is a free run.
+
+    Raises
+    ------
+    ValueError
+        One line: no actuator, an output that is not there or has several numbers, a joint on a body that
+        flies, or a model that does not compile.
     """
 
     spec: Any
@@ -95,126 +156,154 @@ class MujocoModel:
 
     @classmethod
     def from_file(cls, path: str, **settings: Any) -> Self:
-        """Raises ValueError, one line: a file that MuJoCo does not read, an output that is not there."""
+        """The model of an MJCF file; settings are `outputs`, `dt_s`, `tracking_rad_s`. Raises ValueError, one
+        line, where MuJoCo does not read it and where the class does."""
         return cls(read(path), **settings)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "outputs", tuple(self.outputs))
         spec = self.spec
-        spec.option.timestep = self.dt_s / max(int(np.ceil(self.dt_s / spec.option.timestep - 1e-6)), 1)
-        every = {"body": spec.bodies, "joint": spec.joints, "actuator": spec.actuators}
-        for what in every:
-            for k, one in enumerate(every[what]):
-                one.name = one.name or f"{what}{k}"
+        steps = int(np.ceil(self.dt_s / spec.option.timestep - _WHOLE_STEPS))
+        spec.option.timestep = self.dt_s / max(steps, 1)
+        for kind, parts in (("body", spec.bodies), ("joint", spec.joints), ("actuator", spec.actuators)):
+            for k, part in enumerate(parts):
+                part.name = part.name or f"{kind}{k}"
         if not spec.actuators:
             raise ValueError("the model has no actuator")
+
         for name in self.outputs:
             if spec.sensor(name) is None:
-                joint = name if spec.joint(name) is not None else name.removeprefix("joint ")
-                if spec.joint(joint) is None:
-                    there = [one.name for one in (*spec.joints, *spec.sensors) if one.name]
-                    raise ValueError(f"no joint or sensor is called {name!r}; there are {', '.join(there)}")
-                spec.add_sensor(
-                    name=name,
-                    type=mujoco.mjtSensor.mjSENS_JOINTPOS,
-                    objtype=mujoco.mjtObj.mjOBJ_JOINT,
-                    objname=joint,
-                )
+                self._add_sensor(name)
         model = spec.compile()
         for name in self.outputs:
             refuse_free_base(spec, model, name)
-            if model.sensor(name).dim[0] != 1:
-                raise ValueError(f"sensor {name} has {model.sensor(name).dim[0]} numbers, expected one")
+            size = model.sensor(name).dim[0]
+            if size != 1:
+                raise ValueError(f"sensor {name} has {size} numbers, expected one")
         put_compiled(spec, model)
+
+    def _add_sensor(self, output: str) -> None:
+        """Add a sensor of the position of a joint, called as the output. Raises ValueError: no such joint."""
+        joint = output
+        if self.spec.joint(joint) is None:
+            joint = output.removeprefix("joint ")
+        if self.spec.joint(joint) is None:
+            there = [part.name for part in (*self.spec.joints, *self.spec.sensors) if part.name]
+            raise ValueError(f"no joint or sensor is called {output!r}; there are {', '.join(there)}")
+        self.spec.add_sensor(
+            name=output,
+            type=_SENSORS.mjSENS_JOINTPOS,
+            objtype=mujoco.mjtObj.mjOBJ_JOINT,
+            objname=joint,
+        )
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """(U,) names of the actuators, in the model's order."""
-        return tuple(one.name for one in self.spec.actuators)
+        return tuple(actuator.name for actuator in self.spec.actuators)
 
     @cached_property
     def nominal(self) -> Any:
-        """The compiled model."""
+        """The model as stated, compiled (`mujoco.MjModel`)."""
         return self.spec.compile()
 
     @cached_property
     def moving(self) -> Any:
-        """The model (MjSpec) without meshes that touch nothing: their inertia stands in their bodies, and
-        every compilation would read them again."""
+        """The model (`mujoco.MjSpec`) without meshes that touch nothing.
+
+        Their inertia stands in their bodies already, and every compilation would read them again.
+        """
         spec = self.spec.copy()
         for geom in list(spec.geoms):
-            if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not (geom.contype or geom.conaffinity):
+            touches = geom.contype or geom.conaffinity
+            if geom.type == mujoco.mjtGeom.mjGEOM_MESH and not touches:
                 spec.delete(geom)
         used = {geom.meshname for geom in spec.geoms}
-        for mesh in [mesh for mesh in spec.meshes if mesh.name not in used]:
-            spec.delete(mesh)
+        for mesh in list(spec.meshes):
+            if mesh.name not in used:
+                spec.delete(mesh)
         return spec
 
     @cached_property
-    def tracked(self) -> tuple[tuple[int, str, float], ...]:
-        """Outputs that are angles or positions of joints: column, joint, inertia [kg m2 or kg]."""
-        found = []
-        for k, name in enumerate(self.outputs):
+    def tracked(self) -> tuple[TrackedJoint, ...]:
+        """(J,) joints whose position is an output, in the order of the outputs."""
+        joints = []
+        for column, name in enumerate(self.outputs):
             sensor = self.spec.sensor(name)
-            if sensor.type == mujoco.mjtSensor.mjSENS_JOINTPOS:
-                dof = self.nominal.joint(sensor.objname).dofadr[0]
-                found.append((k, sensor.objname, float(self.nominal.dof_M0[dof])))
-        return tuple(found)
+            if sensor.type == _SENSORS.mjSENS_JOINTPOS:
+                degree_of_freedom = self.nominal.joint(sensor.objname).dofadr[0]
+                inertia = float(self.nominal.dof_M0[degree_of_freedom])
+                joints.append(TrackedJoint(column, sensor.objname, inertia))
+        return tuple(joints)
 
     @property
     def measured_joints(self) -> set[str]:
-        """Names of the joints whose position or speed is an output."""
-        read_by = [self.spec.sensor(name) for name in self.outputs]
-        return {one.objname for one in read_by if one.type in _JOINT_UNITS}
+        """Names of the joints of which some quantity (position, speed, force) is an output."""
+        sensors = [self.spec.sensor(name) for name in self.outputs]
+        return {sensor.objname for sensor in sensors if sensor.type in _JOINT_UNITS}
 
     @property
     def units(self) -> dict[str, str]:
         """Output -> unit, of sensors that say what they measure."""
-        found = {}
+        units = {}
         for name in self.outputs:
             sensor = self.spec.sensor(name)
             if sensor.type in _JOINT_UNITS:
+                of_hinge, of_slide = _JOINT_UNITS[sensor.type]
                 slides = self.spec.joint(sensor.objname).type == mujoco.mjtJoint.mjJNT_SLIDE
-                found[name] = _JOINT_UNITS[sensor.type][slides]
+                units[name] = of_slide if slides else of_hinge
             elif sensor.type in _SENSOR_UNITS:
-                found[name] = _SENSOR_UNITS[sensor.type]
-        return found
+                units[name] = _SENSOR_UNITS[sensor.type]
+        return units
 
     @cached_property
     def filtered(self) -> tuple[int, ...]:
-        """Actuators with a state that follows the command."""
-        return tuple(u for u, one in enumerate(self.spec.actuators) if one.dyntype in LAGS[1:])
+        """Places among the inputs of actuators with a state that follows the command with a lag."""
+        return tuple(u for u, actuator in enumerate(self.spec.actuators) if actuator.dyntype in LAGS[1:])
 
     @property
     def reaches(self) -> dict[str, tuple[float, str]]:
-        """Command of a servo, or measured joint -> largest position in the range of the joint, and its unit.
-        A servo turns a joint without a range no more than once round."""
-        servos = {
-            one.name: one.target for one in self.spec.actuators if one.biasprm[1] == -one.gainprm[0] != 0
-        }
-        read = {self.outputs[k]: joint for k, joint, _ in self.tracked}
-        without = {joint: 2 * np.pi if joint in servos.values() else np.inf for joint in read.values()}
-        units = {joint: self.units[name] for name, joint in read.items()}
-        return {
-            name: (float(np.max(np.abs(self.nominal.joint(joint).range))) or without[joint], units[joint])
-            for name, joint in {**servos, **read}.items()
-            if joint in units
-        }
+        """Command of a servo, or output of a measured joint -> its largest size, and its unit.
+
+        That is the end of the joint's range. Of a joint without one it is infinite, but for a joint that a
+        servo turns: that goes no more than once round.
+        """
+        # A servo's force is kp (command - position): its bias by the position is the gain with a minus.
+        joint_of_servo = {}
+        for actuator in self.spec.actuators:
+            if actuator.biasprm[1] == -actuator.gainprm[0] != 0:
+                joint_of_servo[actuator.name] = actuator.target
+        joint_of_output = {self.outputs[joint.column]: joint.name for joint in self.tracked}
+        units = {joint: self.units[output] for output, joint in joint_of_output.items()}
+        reaches = {}
+        for name, joint in {**joint_of_servo, **joint_of_output}.items():
+            if joint not in units:
+                continue
+            end = float(np.max(np.abs(self.nominal.joint(joint).range)))
+            if not end:
+                end = _WHOLE_TURN_RAD if joint in joint_of_servo.values() else np.inf
+            reaches[name] = (end, units[joint])
+        return reaches
 
     def number(self, name: str, without: float) -> float:
-        """A <numeric> of the file."""
-        one = self.spec.numeric(name)
-        return without if one is None else float(one.data[0])
+        """First value of a <numeric> of the file; `without` where the file has none of this name."""
+        numeric = self.spec.numeric(name)
+        if numeric is None:
+            return without
+        return float(numeric.data[0])
 
 
 def refuse_free_base(spec: Any, model: Any, output: str) -> None:
-    """Raises ValueError where a joint hangs on a body that flies, of which nobody logs where it is."""
+    """Raises ValueError where a joint hangs on a body that flies, of which nobody logs where it is.
+
+    spec : mujoco.MjSpec; model : the same compiled; output : name of a sensor. Sensors of no joint pass.
+    """
     sensor = spec.sensor(output)
     if sensor.objtype != mujoco.mjtObj.mjOBJ_JOINT:
         return
     root = model.body_rootid[model.joint(sensor.objname).bodyid[0]]
-    first = model.body_jntadr[root]
-    if first >= 0 and spec.joints[first].type == mujoco.mjtJoint.mjJNT_FREE:
+    first_joint = model.body_jntadr[root]
+    if first_joint >= 0 and spec.joints[first_joint].type == mujoco.mjtJoint.mjJNT_FREE:
         name = model.body(root).name
         raise ValueError(
             f"the base {name!r} moves freely, and no log says where it is: take its <freejoint/> out if it "
