@@ -88,7 +88,7 @@ class MujocoArm(MujocoModel):
         """Half the largest speed over the travel [rad/s], and enough to hold every joint against gravity."""
         model, data = self.nominal, mujoco.MjData(self.nominal)
         mujoco.mj_forward(model, data)
-        fastest, sizes = 0.0, Quantities(self, experiments).sizes
+        fastest, sizes = 0.0, Quantities(self, experiments).motions
         for _, name, inertia in self.tracked:
             joint = model.joint(name)
             _, travel, speed = sizes[name]

@@ -472,8 +472,8 @@ def test_a_value_that_the_compiler_or_a_class_gives_is_nominal_and_can_be_change
 
 
 def test_a_row_of_the_table_of_joints_is_an_effect_of_each(monkeypatch):
-    row = ("margin", "margin", 0, "margin_{x}", "position", 1.0, "smooth")
-    monkeypatch.setattr(mujoco_quantities, "_OF_JOINT", (*mujoco_quantities._OF_JOINT, row))
+    row = mujoco_quantities.JointNumber("margin", "margin", 0, "margin_{x}", "position", 1.0, "smooth")
+    monkeypatch.setattr(mujoco_quantities, "_JOINT_NUMBERS", (*mujoco_quantities._JOINT_NUMBERS, row))
     model, effect = edited(rod(), "hinge.margin", 0.3)
     assert model.jnt_margin[0] == 0.3
     assert [(p.name, p.high > p.low > 0) for p in effect.parameters] == [("margin_rad", True)]
@@ -575,7 +575,7 @@ def test_a_payload_is_tried_at_a_site_or_the_far_end_of_a_last_link(inertial, at
 def test_the_force_on_a_joint_is_what_its_actuators_do_whatever_lies_between(drive):
     motor, tendon = drive
     arm, _ = link(PLAIN, motor=f"{motor}</actuator>{tendon}<actuator>")
-    found = mujoco_quantities.Quantities(arm, MEASURED).sizes["hinge"][0]
+    found = mujoco_quantities.Quantities(arm, MEASURED).motions["hinge"].force
     assert found == pytest.approx(4 * np.max(np.abs(steps())), rel=1e-9)
 
 
