@@ -239,9 +239,7 @@ class MujocoArm(MujocoModel):
                 **dict.fromkeys(unstable, "smaller steps of the model (timestep)"),
             },
             settled=simulation.settled,
-            untracked=MujocoSimulation(
-                replace(self, tracking_rad_s=0.0), every, noise, False, _starts=simulation._starts
-            ),
+            untracked=MujocoSimulation(replace(self, tracking_rad_s=0.0), every, noise, settles=False),
             units=self.units,
             forced=ForcedSimulation(places, simulation.forced) if (places := self.force_places) else None,
             input_names=self.inputs,

@@ -217,9 +217,10 @@ class MujocoSimulation:
         for name, sizes in effects.items():
             values[name] = tuple(sizes.values())
         compiled = self._compiled_with(values)
-        start = self._start(inputs)
         if not self.settles:
-            return self._run(compiled, inputs, start.guess)
+            guess, _ = self._guess(inputs)
+            return self._run(compiled, inputs, guess)
+        start = self._start(inputs)
         outputs = self._run(compiled, inputs, start.state)
         if not np.all(np.isfinite(outputs)):
             return outputs
@@ -456,7 +457,8 @@ class MujocoSimulation:
     def began(self, model: Any, inputs: Real) -> Any:
         """mujoco.MjData of a compiled model as a record (T, U + Y) begins: as its first samples say."""
         data = mujoco.MjData(model)
-        self._put(model, data, self._start(inputs).guess, inputs[0, : len(self.arm.inputs)])
+        guess, _ = self._guess(inputs)
+        self._put(model, data, guess, inputs[0, : len(self.arm.inputs)])
         return data
 
     def _readings(self, model: Any) -> tuple[Real, Real]:
@@ -493,20 +495,18 @@ class MujocoSimulation:
             slope = spline(np.clip(begins_s + met.speed * step_s, 0.0, end_s), 1)
             return np.asarray(path), np.asarray(slope)
 
-        return _remembered(self._paths, (measured.tobytes(), delay_s), compute, _KEPT_RECORDS)
+        # An edit may change the integrator (`put_backlash`).
+        met_by = (measured.tobytes(), step_s, delay_s, integrator)
+        return _remembered(self._paths, met_by, compute, _KEPT_RECORDS)
 
     def _start(self, inputs: Real) -> RecordStart:
         """The start of a record (T, U + Y), out of memory if there."""
         return _remembered(self._starts, inputs.tobytes(), lambda: self._fitted_start(inputs), _KEPT_RECORDS)
 
-    def _fitted_start(self, inputs: Real) -> RecordStart:
-        """The start of a record: as its first samples say, moved once by what the stated model leaves.
-
-        The move is not made where it asks for more than a joint at rest and its spread leave open: then the
-        model is wrong about something else.
-        """
+    def _guess(self, inputs: Real) -> tuple[Real, Real]:
+        """The start (S,) of a record (T, U + Y) as its first samples tell it, and what that may be off by
+        (S,), see `RecordStart`."""
         arm = self.arm
-        n_inputs = len(arm.inputs)
         # Integrators but for Runge-Kutta keep the speed of the middle of the step before.
         step_s = arm.nominal.opt.timestep
         early_s = 0.5 * step_s
@@ -516,14 +516,22 @@ class MujocoSimulation:
         speeds = []
         for joint in arm.tracked:
             k = joint.column
-            position, speed = _from_first_samples(inputs[:, n_inputs + k], arm.dt_s, self.noise[k], early_s)
+            measured = inputs[:, len(arm.inputs) + k]
+            position, speed = _from_first_samples(measured, arm.dt_s, self.noise[k], early_s)
             positions.append(position)
             speeds.append(speed)
         filters = [StartGuess(inputs[0, u], _spread_of_command(inputs[:, u])) for u in arm.filtered]
         states = np.array([*positions, *speeds, *filters]).reshape(-1, 2)
-        guess = states[:, 0]
-        spread = states[:, 1]
+        return states[:, 0], states[:, 1]
 
+    def _fitted_start(self, inputs: Real) -> RecordStart:
+        """The start of a record: as its first samples say, moved once by what the stated model leaves.
+
+        The move is not made where it asks for more than joints at rest and their spread leave open: then the
+        model is wrong about something else.
+        """
+        n_inputs = len(self.arm.inputs)
+        guess, spread = self._guess(inputs)
         compiled = self._compiled_with({})
         outputs = self._run(compiled, inputs, guess)
         slopes = np.zeros((guess.size, *outputs.shape))
@@ -533,7 +541,8 @@ class MujocoSimulation:
             slopes[k] = (self._run(compiled, inputs, moved) - outputs) / spread[k]
         start = RecordStart(guess, guess, spread, slopes, self.noise)
         move = start.shift(inputs[:, n_inputs:] - outputs)
-        rests = all(speed.value == 0 for speed in speeds)
+        n_joints = len(self.arm.tracked)
+        rests = not np.any(guess[n_joints : 2 * n_joints])
         if rests and np.any(np.abs(move) > spread):
             return start
         return replace(start, state=guess + move)

@@ -144,6 +144,56 @@ def test_a_lag_is_tried_whatever_integrates_it(integrator):
     assert np.std(least - stated) < 0.075 * np.std(whole - stated)
 
 
+@pytest.mark.parametrize("simulated_before", ["as stated", "by a free run", "after a hundred records"])
+@pytest.mark.parametrize("name", ["hinge.backlash", "hinge.sensor_delay", "rod.payload"])
+def test_a_simulation_depends_on_its_arguments_alone(simulated_before, name):
+    """And not on what was simulated before with the same plant, on this record or on others."""
+    servo = ROD.replace('<motor name="motor"', '<position name="motor" kp="80" kv="5.5"')
+    arm = arm_of(servo.replace("0.001", "0.005", 1), tracking_rad_s=9.0)
+    plant, _ = plant_of(arm, 0.5 * steps(), turned(steps(), 0.05))
+    torque = steps(3)
+    angle = turned(torque, 2 * INERTIA)
+    other = np.column_stack([torque, angle])[30:]
+    (effect,) = (effect for effect in arm.quantities(MEASURED).values() if effect.name == name)
+    size = {effect.parameters[0].name: 0.02}
+
+    def simulated(simulation):
+        return simulation(plant.parameters, {name: size}, other)
+
+    def fresh():
+        return replace(plant.simulation, _models={}, _paths={}, _starts={})
+
+    expected = simulated(fresh())
+    again = fresh()
+    if simulated_before == "as stated":
+        again(plant.parameters, {}, other)
+    elif simulated_before == "by a free run":
+        plant.untracked(plant.parameters, {}, other)
+        again = plant.simulation
+    else:
+        simulated(again)
+        for shift in range(100):
+            again(plant.parameters, {}, other[:40] + 1e-3 * shift)
+    assert np.std(expected - again(plant.parameters, {}, other)) > 1e-5
+    np.testing.assert_array_equal(simulated(again), expected)
+
+
+def test_an_integrator_that_an_edit_changes_meets_the_path_in_its_own_way():
+    """Behind a stiff servo the backlash changes Euler's integrator, which holds the speed of the step before,
+    for one that solves for that of the next."""
+    servo = ROD.replace('<motor name="motor"', '<position name="motor" kp="80" kv="5.5"')
+    arm = arm_of(servo.replace("0.001", "0.005", 1), tracking_rad_s=9.0)
+    simulation = plant_of(arm, 0.5 * steps(), turned(steps(), 0.05))[0].simulation
+    time_s = DT_S * np.arange(50)
+    slopes = []
+    for values in ({}, {"hinge.backlash": 0.02}):
+        option = simulation.edited(values).option
+        _, slope = simulation._path(time_s**2, option.timestep, 0.0, int(option.integrator))
+        slopes.append(slope[10])
+    begin_s = 10 * 0.005
+    np.testing.assert_allclose(slopes, [2 * (begin_s - 0.0025), 2 * (begin_s + 0.0025)], rtol=1e-9)
+
+
 def as_begun(plant):
     """Without a fit of what was before the first row: the commands were as in that."""
     return replace(plant, simulation=replace(plant.simulation, settles=False))
