@@ -17,16 +17,36 @@ from diagnosis.machine.motion_effects import PulseResponse, with_forces
 Run = Callable[[Real], Real]
 Values = Mapping[str, float]
 
-# Rounds of a simulation around a drive, and what the last may still move, over what the effects add there.
-_ROUNDS, _CLOSE = 8, 1e-4
-# Steps to a fixed point beside a linear loop, how many of them each next one is mixed of, and when it stands.
-_STEPS, _MIXED, _STANDS = 200, 8, 1e-9
+# Simulations around a drive: of a linear loop the first is enough, of others each is closer.
+_ROUNDS = 8
+# Share of what the effects add there that the last may still move. Chosen.
+_CLOSE = 1e-4
+# Steps to a fixed point beside a linear loop; a tight loop takes some tens.
+_STEPS = 200
+# Steps that each next one is mixed of: more repeat each other.
+_MIXED = 8
+# Share of the fixed point below which a step is none.
+_STANDS = 1e-9
+# Singular values below this share of the largest are not inverted when steps are mixed.
+_MIXING_RANK = 1e-12
 # A force that the simulation does not follow to this share of what it changes was not found.
 _MISSED = 0.05
 # Share of the largest early motion after a pulse that is one.
 _SHOWS = 0.05
+# Samples after a pulse in which the motion begins.
+_EARLY_SAMPLES = 5
+# Share of a signal's deviations that a pulse on it has: small beside what bends, large beside rounding.
+_SMALL_PULSE = 1e-3
+# Smallest deviations that such a pulse is a share of, of a signal that stands.
+_LEAST_DEVIATION = 1e-9
 # Simulations that are kept of each kind: those of one set of parameters, beside sixteen records at most.
 _KEPT = 16
+# Share of the longest way one way on which bearings and gears give way before a body slides.
+_SHORT_WAY = 5e-3
+# Deviations of a speed's noise from which on its sign is sure.
+_SURE_SIGN = 4
+# Share of the usual speed that is more than noise.
+_SLOW = 0.1
 
 
 @dataclass(frozen=True)
@@ -94,8 +114,12 @@ class Body:
     _doubts: set[str] = field(default_factory=set, init=False, repr=False)
 
     def under(self, started: Started, forces: BodyForces) -> Run:
-        """The simulation with forces on the body; not a number where none were found that it follows."""
-        run, force_at, motion_at = started.run, int(self.force or 0), int(self.motion)
+        """The simulation with forces on the body.
+
+        Its outputs are not a number throughout where no forces were found that the simulation follows.
+        """
+        force_at = int(self.force or 0)
+        motion_at = int(self.motion)
 
         def simulated(inputs: Real) -> Real:
             # The response to a pulse is taken with the other inputs held at their first row.
@@ -106,24 +130,26 @@ class Body:
                 lambda: self._response(started.at_rest, others, len(inputs)),
             )
 
-            def under(force: Real) -> tuple[Real, Real]:
-                moved = inputs.copy()
-                moved[:, force_at] = force
-                found = run(moved)
-                return found, sign * found[:, motion_at]
+            def simulate(force: Real) -> tuple[Real, Real]:
+                pushed = inputs.copy()
+                pushed[:, force_at] = force
+                outputs = started.run(pushed)
+                return outputs, sign * outputs[:, motion_at]
 
             command = inputs[:, force_at]
             free = self._runs_without.value(
-                (started.key, started.start, inputs.shape, inputs.tobytes()), lambda: under(command)
+                (started.key, started.start, inputs.shape, inputs.tobytes()), lambda: simulate(command)
             )
 
-            def placed(outputs: Real, motion: Real) -> Real:
-                found = outputs.copy()
-                found[:, motion_at] = sign * motion
-                return found
+            def with_motion(outputs: Real, motion: Real) -> Real:
+                changed = outputs.copy()
+                changed[:, motion_at] = sign * motion
+                return changed
 
-            alone = free[0].shape[1] == 1
-            outputs, missed = with_forces(under, free, command, response, forces, placed, alone=alone)
+            is_only_output = free[0].shape[1] == 1
+            outputs, missed = with_forces(
+                simulate, free, command, response, forces, with_motion, alone=is_only_output
+            )
             return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
 
         return simulated
@@ -146,9 +172,10 @@ class Body:
         pushed = still.copy()
         pushed[1, force_at] = pulse
         moved = (run(pushed) - run(still))[:, motion_at] / pulse
-        first = np.abs(moved[:5])
-        # The first that shows: at few samples per period the largest is on the way back.
-        sign = float(np.sign(moved[np.argmax(first > _SHOWS * np.max(first))]))
+        # The first that shows says the sign: at few samples per period the largest is on the way back.
+        early = np.abs(moved[:_EARLY_SAMPLES])
+        shows = early > _SHOWS * np.max(early)
+        sign = float(np.sign(moved[np.argmax(shows)]))
         response = PulseResponse.of(sign * moved, self.dt_s, of_speed=self.motion_is == "speed")
         self._doubts.add(response.doubt)
         return response, sign
@@ -170,29 +197,38 @@ class MeasuredBody:
     short: float = 0.0
 
     def of(self, force: int, inputs: Sequence[Real]) -> MeasuredBody:
-        """Of inputs (T, U) of all records. Noise of the speed, white or not, is what it has on short ways."""
+        """The body with its limits of rest, from inputs (T, U) of all records.
+
+        force : column of the outputs. Noise of the speed, white or not, is what it has on short ways.
+        """
         ways = np.concatenate([_ways(u[:, self.speed]) for u in inputs])
-        every = np.concatenate(inputs)[:, self.speed]
-        # Before a body slides, bearings and gears give way by thousandths of its longest way.
-        short = 5e-3 * float(np.max(ways))
-        rests = every[ways <= short]
-        # Of four deviations of the noise a sign is sure; a tenth of the usual speed is more than noise.
-        slow = min(4 * _norm(rests) / max(rests.size, 1) ** 0.5, 0.1 * _norm(every) / every.size**0.5)
+        speeds = np.concatenate(inputs)[:, self.speed]
+        short = _SHORT_WAY * float(np.max(ways))
+        is_short = ways <= short
+        at_rest = speeds[is_short]
+        noise = _norm(at_rest) / max(at_rest.size, 1) ** 0.5
+        usual_speed = _norm(speeds) / speeds.size**0.5
+        slow = min(_SURE_SIGN * noise, _SLOW * usual_speed)
         return replace(self, force=force, slow=slow, short=short)
 
     def under(self, started: Started, forces: BodyForces) -> Run:
+        """The simulation whose output of force has in it what the motion takes because of these forces."""
+
         def simulated(inputs: Real) -> Real:
-            found = np.array(started.run(inputs))
+            outputs = np.array(started.run(inputs))
             speed = np.where(self.resting(inputs), 0.0, inputs[:, self.speed])
-            found[:, self.force] += forces.overcome(inputs[:, self.position], speed, found[:, self.force])
-            return found
+            without = outputs[:, self.force]
+            outputs[:, self.force] += forces.overcome(inputs[:, self.position], speed, without)
+            return outputs
 
         return simulated
 
     def resting(self, inputs: Real) -> npt.NDArray[np.bool_]:
         """(T,) rows in which the body may be at rest, and those beside: it stops or starts between them."""
-        v = inputs[:, self.speed]
-        still = np.pad((np.abs(v) <= self.slow) | (_ways(v) <= self.short), 1)
+        speed = inputs[:, self.speed]
+        is_slow = np.abs(speed) <= self.slow
+        is_short = _ways(speed) <= self.short
+        still = np.pad(is_slow | is_short, 1)
         return np.asarray(still[:-2] | still[1:-1] | still[2:])
 
 
@@ -236,63 +272,82 @@ class Actuator:
     _responses: Remembered = field(default_factory=Remembered, init=False, repr=False)
 
     def under(self, started: Started, acting: Sequence[Acting], run: Run) -> Run:
-        """The simulation with effects on the signal, in the order given; not a number where no fixed point
-        was found."""
+        """A simulation (run) with effects on the signal of a drive, in the order given.
 
-        signal = int(self.drive or 0)
+        started : that simulation from its start and from rest. Its outputs are not a number throughout where
+        no fixed point was found.
+        """
+        signal_at = int(self.drive or 0)
 
-        def changed(command: Real) -> Real:
-            now = command
+        def added_by_effects(command: Real) -> Real:
+            changed = command
             for law, _, values in acting:
-                now = law.change(now, values, self.dt_s, 0.0 if self.at_rest_before else float(now[0]))
-            return np.asarray(now - command)
+                before = 0.0 if self.at_rest_before else float(changed[0])
+                changed = law.change(changed, values, self.dt_s, before)
+            return np.asarray(changed - command)
 
         def simulated(inputs: Real) -> Real:
-            def with_added(extra: Real) -> tuple[Real, Real]:
+            def simulate(added: Real) -> tuple[Real, Real]:
                 moved = np.array(inputs)
-                moved[:, self.column] += extra
-                found = run(moved)
-                return found, found[:, signal]
+                moved[:, self.column] += added
+                outputs = run(moved)
+                return outputs, outputs[:, signal_at]
 
             # The loop need not be linear: its response is that beside these inputs.
             response = self._responses.value(
                 (started.key, inputs.shape, inputs.tobytes()),
                 lambda: self._response(started.at_rest, inputs),
             )
-            extra = np.zeros(len(inputs))
-            found, command = with_added(extra)
+            added = np.zeros(len(inputs))
+            outputs, command = simulate(added)
             for _ in range(_ROUNDS):
-                alone = command - scipy.signal.fftconvolve(response, extra)[: extra.size]
-                extra, expected = _fixed(changed, alone, response, extra)
-                found, command = with_added(extra)
-                missed, size = _norm(command - expected), _norm(extra)
+                # What the linear loop would have commanded without, then the fixed point beside that.
+                without = command - scipy.signal.fftconvolve(response, added)[: added.size]
+                added, expected = _fixed(added_by_effects, without, response, added)
+                outputs, command = simulate(added)
+                missed = _norm(command - expected)
+                size = _norm(added)
                 if not missed > _CLOSE * size:
-                    return found
-            return found if missed < _MISSED * size else np.full_like(found, np.nan)
+                    return outputs
+            return outputs if missed < _MISSED * size else np.full_like(outputs, np.nan)
 
         return simulated
 
     def _response(self, run: Run, inputs: Real) -> Real:
-        """(T,) of the signal to one that is added over the first sample, small beside what moves it."""
-        signal, free = int(self.drive or 0), run(inputs)
-        small, pushed = 1e-3 * max(float(np.std(free[:, signal])), 1e-9), np.array(inputs)
-        pushed[0, self.column] += small
-        return np.asarray((run(pushed) - free)[:, signal] / small)
+        """(T,) change of the signal by a unit that is added over the first sample, small beside what moves
+        it."""
+        signal_at = int(self.drive or 0)
+        free = run(inputs)
+        deviation = max(float(np.std(free[:, signal_at])), _LEAST_DEVIATION)
+        pulse = _SMALL_PULSE * deviation
+        pushed = np.array(inputs)
+        pushed[0, self.column] += pulse
+        return np.asarray((run(pushed) - free)[:, signal_at] / pulse)
 
 
-def _fixed(changed: Callable[[Real], Real], alone: Real, response: Real, start: Real) -> tuple[Real, Real]:
-    """x (T,) = changed(alone + response * x), and that command; Anderson's mixing of the last steps."""
-    points, steps, x = list[Real](), list[Real](), start
+def _fixed(
+    added_by_effects: Callable[[Real], Real], without: Real, response: Real, start: Real
+) -> tuple[Real, Real]:
+    """What effects add to the command of a linear loop, and that command.
+
+    Solves x = added_by_effects(without + response * x) for x (T,) from a start (T,), by Anderson's mixing of
+    the last steps. without, response : (T,) command without effects, and of the loop to a unit that is added.
+    """
+    points = list[Real]()
+    steps = list[Real]()
+    x = start
     for _ in range(_STEPS):
-        step = changed(alone + scipy.signal.fftconvolve(response, x)[: x.size]) - x
+        step = added_by_effects(without + scipy.signal.fftconvolve(response, x)[: x.size]) - x
         if not _norm(step) > _STANDS * _norm(x):
             break
-        points, steps = [*points, x][-_MIXED:], [*steps, step][-_MIXED:]
+        points = [*points, x][-_MIXED:]
+        steps = [*steps, step][-_MIXED:]
         x = x + step
         if len(steps) > 1:
-            moves, turns = np.diff(points, axis=0).T, np.diff(steps, axis=0).T
-            x = x - (moves + turns) @ np.linalg.lstsq(turns, step, rcond=1e-12)[0]
-    return x, np.asarray(alone + scipy.signal.fftconvolve(response, x)[: x.size])
+            moves = np.diff(points, axis=0).T
+            changes = np.diff(steps, axis=0).T
+            x = x - (moves + changes) @ np.linalg.lstsq(changes, step, rcond=_MIXING_RANK)[0]
+    return x, np.asarray(without + scipy.signal.fftconvolve(response, x)[: x.size])
 
 
 @dataclass(frozen=True)
@@ -314,21 +369,24 @@ Acting = tuple[EffectLaw, Place, Values]
 
 
 def around(started: Started, acting: Sequence[Acting]) -> Run:
-    """A simulation with effects around it, on each column in the order given."""
+    """Inputs (T, U) -> outputs (T, Y) of a simulation with effects around it, on each column in the order
+    given."""
     bodies: dict[int, tuple[AnyBody, BodyForces]] = {}
     drives: dict[int, tuple[Actuator, list[Acting]]] = {}
     for law, place, values in acting:
         if isinstance(place, Actuator) and place.drive is not None:
-            drives.setdefault(id(place), (place, []))[1].append((law, place, values))
+            _, on_drive = drives.setdefault(id(place), (place, []))
+            on_drive.append((law, place, values))
         elif isinstance(place, Body | MeasuredBody):
             _, forces = bodies.get(id(place), (place, BodyForces()))
             bodies[id(place)] = (place, forces + law.change(values))
+
+    # From the inside out: forces on bodies, then loops around them.
     inner = started
     for body, forces in bodies.values():
-        known = (inner.key, Identity(body), forces)
+        key = (inner.key, Identity(body), forces)
         at_rest = body.under(replace(inner, run=inner.at_rest, start=None), forces)
-        inner = Started(body.under(inner, forces), at_rest, known, inner.start)
-
+        inner = Started(body.under(inner, forces), at_rest, key, inner.start)
     for drive, effects in drives.values():
         laws = tuple((Identity(law), *values.items()) for law, _, values in effects)
         run = drive.under(inner, effects, inner.run)
@@ -342,15 +400,20 @@ def around(started: Started, acting: Sequence[Acting]) -> Run:
 
 
 def _norm(x: Real) -> float:
+    """Euclidean length of (T,)."""
     return float(np.linalg.norm(x))
 
 
 def _changed(signals: Real, acting: Sequence[Acting], kind: type[Actuator] | type[Sensor]) -> Real:
-    found = signals
+    """Signals (T, N) with the effects at places of a kind, but those inside a loop; the same array without
+    any."""
+    changed = signals
     for law, place, values in acting:
-        if isinstance(place, kind) and getattr(place, "drive", None) is None:
-            found = np.array(signals, dtype=np.float64) if found is signals else found
-            k = int(place.column)
-            before = 0.0 if place.at_rest_before else float(found[0, k])
-            found[:, k] = law.change(found[:, k], values, place.dt_s, before)
-    return found
+        if not isinstance(place, kind) or getattr(place, "drive", None) is not None:
+            continue
+        if changed is signals:
+            changed = np.array(signals, dtype=np.float64)
+        k = int(place.column)
+        before = 0.0 if place.at_rest_before else float(changed[0, k])
+        changed[:, k] = law.change(changed[:, k], values, place.dt_s, before)
+    return changed
