@@ -39,13 +39,18 @@ from ident.data.arrays import lock
 from ident.data.units import written_unit
 from plant.effects.search_space import Candidate
 
-# Parameters, effects, inputs (T, U) and, where a start is unknown, its states -> outputs (T, Y).
+# Parameters, effects, inputs (T, U) and, where a start is unknown, its states -> outputs (T, Y). What says
+# its names as well is a `diagnosis.machine.simulation.Simulation`.
 Simulate = Callable[..., Real]
 
-# Of a machine of which nothing else is known; searched as long as something of interest is left.
+# Effects that are looked for together, as long as something of interest is left. Chosen: a machine of which
+# nothing else is known may lack more than one at each of its parts.
 _MOST_EFFECTS = 5
-# What a good model of a real machine may miss of its motion, where nobody has stated it.
+# Share of its motion that a good model of a real machine may miss, where nobody has stated it. Chosen:
+# doubled, effects that carry a tenth of the motion are no longer named.
 _USUAL_MODEL_ERROR = 0.05
+# Largest relative tolerance of a value: beyond it, nothing is stated.
+_LARGEST_TOLERANCE = 10
 # Advice beside an error of a trial's values; with those stated it is an error of the program.
 OF_TRIAL = "; of values it cannot take, return nan"
 # In noise deviations: beyond any record, and its square is still a number.
@@ -86,6 +91,7 @@ def place_of(error: BaseException, file: str = "") -> str:
 
 
 def _is_number(value: object) -> bool:
+    """Whether a value is a finite number, of Python or NumPy."""
     return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value))
 
 
@@ -162,7 +168,7 @@ class Plant:
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
-            if not _is_number(tolerance) or not 0 < tolerance <= 10:
+            if not _is_number(tolerance) or not 0 < tolerance <= _LARGEST_TOLERANCE:
                 raise ValueError(
                     f"plant: tolerance of {key} must be between 0 and 10 (a share of the value); "
                     f"got {tolerance!r}"
@@ -192,13 +198,15 @@ class Plant:
 
     @cached_property
     def weighing(self) -> Weighing:
-        stated = self.model_error is not None
+        """How its residuals are weighed, beside the usual model error where none is stated."""
+        is_stated = self.model_error is not None
         model_error = _USUAL_MODEL_ERROR if self.model_error is None else float(self.model_error)
         listed = tuple(kind.id for kind in self.missing)
-        return Weighing(listed, model_error, _MOST_EFFECTS, stated)
+        return Weighing(listed, model_error, _MOST_EFFECTS, is_stated)
 
     @property
     def description(self) -> Plant:
+        """The plant itself: with the values and effects of a repair it is the repaired machine."""
         return self
 
     @property
@@ -212,13 +220,13 @@ class Plant:
         return self.parameters[key]
 
     def scaled(self, factors: Mapping[str, float]) -> Plant:
-        """The same plant with these parameters multiplied."""
+        """The plant with its parameters multiplied by these factors (name -> factor)."""
         moved = {key: value * factors.get(key, 1.0) for key, value in self.parameters.items()}
         return replace(self, parameters=moved)
 
     @property
     def unknown_start(self) -> UnknownStart:
-        """Of the states that are named as such, beside a model error."""
+        """Unknown starts of the states that are named as such, where there is a model error; else none."""
         spread = np.array([*self.start.values()] if self.weighing.model_error > 0 else [])
         return replace(
             KNOWN_START,
@@ -230,7 +238,7 @@ class Plant:
         )
 
     def torque_response(self, samples: int) -> None:
-        return None
+        """None: nobody says where a torque would act."""
 
     def force_places(self, inputs: int) -> tuple[ForcePlace, ...]:
         """(F,) places of the simulation's own; else every one of its input columns; none where the motion is
@@ -251,9 +259,9 @@ class Plant:
             with np.errstate(all="ignore"):  # forces may drive it away
                 if self.forced is not None:
                     return self.forced.simulate(self.parameters, inputs, forces)
-                moved = np.array(inputs, dtype=np.float64)
-                moved[:, : forces.shape[1]] += forces
-                return self.simulated(())(moved)
+                pushed = np.array(inputs, dtype=np.float64)
+                pushed[:, : forces.shape[1]] += forces
+                return self.simulated(())(pushed)
         except (*_NUMERICAL, SimulationError):
             return np.full((len(inputs), self.noise.size), np.nan)
 
@@ -267,89 +275,121 @@ class Plant:
 
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
-        far, at_rest = RUNAWAY * self.noise, self.simulated(effects)
+        runaway = RUNAWAY * self.noise
+        at_rest = self.simulated(effects)
 
         def outputs(inputs: Real, states: Real | None = None, zeros: Real | None = None) -> Real:
             run = self.simulated(effects, states) if self.start and states is not None else at_rest
             try:
                 with np.errstate(all="ignore"):  # of a trial that runs away
-                    found = run(inputs)
-                    if self.settled is not None and np.all(np.isfinite(found)):
-                        found = self.settled(inputs, found)
+                    simulated = run(inputs)
+                    if self.settled is not None and np.all(np.isfinite(simulated)):
+                        simulated = self.settled(inputs, simulated)
             except _NUMERICAL:
-                found = np.full((len(inputs), far.size), np.nan)
-            return np.clip(np.where(np.isnan(found), far, found), -far, far)
+                simulated = np.full((len(inputs), runaway.size), np.nan)
+            return np.clip(np.where(np.isnan(simulated), runaway, simulated), -runaway, runaway)
 
         return outputs
 
     def replayed(self, effects: Sequence[Change]) -> Callable[..., Real]:
-        """As `simulator`, from the recorded start on under the commands alone."""
+        """Inputs (T, U) -> outputs (T, Y), from the recorded start on under the commands alone: nothing holds
+        the simulation near its record, and no start is fitted."""
         return replace(self, simulation=self.untracked or self.simulation, settled=None).simulator(effects)
 
     def simulated(self, effects: Sequence[Change], states: Real | None = None) -> Callable[[Real], Real]:
         """Inputs (T, U) -> outputs (T, Y) as the simulation gives them, listed effects around it.
 
-        Raises ValueError, one line: a shape that does not fit, an error of the simulation that is not
-        numerical (those it raises as they are).
+        Parameters
+        ----------
+        effects : sequence of Change
+            Those that act: of the simulation itself, around it, and values that are wrong.
+        states : (S,) or None
+            States at the start that are named in `start`; None: zeros.
+
+        Raises
+        ------
+        SimulationError
+            One line: a shape that does not fit, an error of the simulation that is not numerical (those it
+            raises as they are).
         """
-        wrong = {kind.id: str(kind.multiplies) for kind in wrong_values(self.tolerances)}
-        ratios = {wrong[e.id]: e.values["ratio"] for e in effects if e.id in wrong}
+        # A wrong value is another parameter.
+        multiplied = {kind.id: str(kind.multiplies) for kind in wrong_values(self.tolerances)}
+        ratios = {multiplied[e.id]: e.values["ratio"] for e in effects if e.id in multiplied}
         if ratios:
-            return self.scaled(ratios).simulated([e for e in effects if e.id not in wrong], states)
-        begun = (0.0,) * len(self.start) if states is None else tuple(float(v) for v in states)
+            further = [e for e in effects if e.id not in multiplied]
+            return self.scaled(ratios).simulated(further, states)
+
+        # What acts around the simulation, and what it is told.
         inside = {effect.id: effect.values for effect in effects}
-        acting = [
-            (kind.law, kind.place, inside.pop(kind.name))
-            for kind in self.effects
-            if kind.place is not None and kind.name in inside
-        ]
-        known = (
+        acting = []
+        for kind in self.effects:
+            if kind.place is not None and kind.name in inside:
+                acting.append((kind.law, kind.place, inside.pop(kind.name)))
+        key = (
             Identity(self.simulation),
             tuple(self.parameters.items()),
             tuple((name, tuple(values.items())) for name, values in inside.items()),
         )
+        at_rest = (0.0,) * len(self.start)
+        start = at_rest if states is None else tuple(float(value) for value in states)
 
-        def simulation_itself(begun: tuple[float, ...], inputs: Real) -> Real:
-            start = (dict(zip(self.start, begun, strict=True)),) if self.start else ()
+        def run_from(start: tuple[float, ...], inputs: Real) -> Real:
+            begins = (dict(zip(self.start, start, strict=True)),) if self.start else ()
             try:
-                given = self.simulation(self.parameters, inside, inputs, *start)
-                if np.iscomplexobj(given):
+                outputs = self.simulation(self.parameters, inside, inputs, *begins)
+                if np.iscomplexobj(outputs):
                     raise ValueError("complex outputs")
-                found = np.asarray(given, dtype=np.float64)
+                outputs = np.asarray(outputs, dtype=np.float64)
             except _NUMERICAL:
                 raise
             except (Exception, SystemExit) as error:
                 reason = " ".join(f"ended with {type(error).__name__}: {error}".split()) + place_of(error)
                 message = f"{self._at(effects)} the simulation {reason}{OF_TRIAL}"
                 raise SimulationError(message, reason, self.parameters, effects) from error
-            asked = (len(inputs), self.noise.size)
-            if found.shape == asked[:1] and asked[1] == 1:
-                found = found[:, None]
-            if found.ndim != 2 or len(found) != len(inputs) or found.shape[1] < self.noise.size:
-                turned = "; transpose it" if found.shape == asked[::-1] else ""
-                reason = f"must give outputs {asked}; got {found.shape}{turned}"
-                message = f"{self._at(effects)} the simulation {reason}"
-                raise SimulationError(message, reason, self.parameters, effects)
-            return found
+            return self._checked(outputs, len(inputs), effects)
 
-        run, at_rest = (partial(simulation_itself, b) for b in (begun, (0.0,) * len(self.start)))
-        wrapped = around(Started(run, at_rest, known, begun), acting)
+        started = Started(partial(run_from, start), partial(run_from, at_rest), key, start)
+        wrapped = around(started, acting)
         return lambda inputs: wrapped(inputs)[:, : self.noise.size]
 
+    def _checked(self, outputs: Real, samples: int, effects: Sequence[Change]) -> Real:
+        """Outputs (T, Y or more), of one output (T,) too. Raises SimulationError for another shape."""
+        expected = (samples, self.noise.size)
+        if outputs.shape == (samples,) and self.noise.size == 1:
+            return outputs[:, None]
+        if outputs.ndim != 2 or len(outputs) != samples or outputs.shape[1] < self.noise.size:
+            turned = "; transpose it" if outputs.shape == expected[::-1] else ""
+            reason = f"must give outputs {expected}; got {outputs.shape}{turned}"
+            message = f"{self._at(effects)} the simulation {reason}"
+            raise SimulationError(message, reason, self.parameters, effects)
+        return outputs
+
     def _at(self, effects: Sequence[Change]) -> str:
+        """Where an error arose: "plant: with mass 2 and friction {...}"."""
         values = ", ".join(f"{key} {value:.6g}" for key, value in self.parameters.items())
         added = " and ".join(f"{effect.id} {dict(effect.values)}" for effect in effects)
         return f"plant: with {values}" + (f" and {added}" if added else "")
 
     def candidates(self, experiments: Sequence[RecordOfMachine]) -> tuple[Candidate, ...]:
+        """Search spaces of everything that may be named, whatever the records: ranges are stated."""
         return tuple(candidate for kind in self.missing for candidate in kind.candidates())
 
 
 @dataclass(frozen=True, eq=False)
 class PlantExperiment:
-    """One record of a plant: input (T, U), output (T, Y) as measured, a single one as (T,) too; held-out
-    records fit no parameter. missing : rows whose outputs say nothing. first_row : of the log that the record
-    is a part of. beside : name -> (T,) signals of the log that the simulation does not use, as a load."""
+    """One record of a plant.
+
+    name : str
+    role : "estimation" or "validation" (kept as "held_out")
+        Validation records fit no parameter.
+    input : (T, U), of a single one (T,) too.
+    output : (T, Y) as measured, of a single one (T,) too.
+    missing : rows whose outputs say nothing.
+    first_row : of the log that the record is a part of.
+    beside : name -> (T,) signals of the log that the simulation does not use, as a load.
+
+    Raises ValueError, one line: shapes that do not fit, a value that is not finite, too few samples.
+    """
 
     name: str
     role: Role
@@ -398,15 +438,16 @@ class PlantCase(RecordedCase[PlantExperiment]):
         for e in self.experiments:
             where = f"case {self.name}, experiment {e.name}"
             try:
-                found, again = run(e.input), run(e.input)
+                first = run(e.input)
+                second = run(e.input)
             except ValueError as error:
                 raise ValueError(f"{where}: {str(error).removesuffix(OF_TRIAL)}") from error
             except _NUMERICAL as error:
                 raise ValueError(f"{where}: the simulation as stated ended with {error!r}") from error
-            if not np.all(np.isfinite(found)):
+            if not np.all(np.isfinite(first)):
                 raise ValueError(f"{where}: the simulation as stated does not give finite outputs")
-            if not np.array_equal(found, again):
-                differ = float(np.max(np.abs(found - again)))
+            if not np.array_equal(first, second):
+                differ = float(np.max(np.abs(first - second)))
                 raise ValueError(
                     f"{where}: two simulations as stated differ by up to {differ:.3g}; is something random?"
                 )
@@ -420,17 +461,9 @@ class PlantCase(RecordedCase[PlantExperiment]):
         """
         plant = self.plant
         if error.changes:
-            failing = next((c for c in error.changes if self._fails(c)), error.changes[-1]).id
+            failing = next((change for change in error.changes if self._fails(change)), error.changes[-1]).id
         else:
-            moved = {
-                key: abs(np.log(max(error.parameters[key] / plant.parameters[key], np.finfo(float).tiny)))
-                / tolerance
-                for key, tolerance in plant.tolerances.items()
-                if error.parameters[key] != plant.parameters[key]
-            }
-            if not moved:
-                raise error
-            failing = f"wrong_{max(moved, key=lambda key: moved[key])}"
+            failing = f"wrong_{self._most_moved(error)}"
 
         # A value that is not judged stays as it is stated.
         multiplied = {kind.id: str(kind.multiplies) for kind in wrong_values(plant.tolerances)}
@@ -445,8 +478,20 @@ class PlantCase(RecordedCase[PlantExperiment]):
         reduced = replace(
             plant, effects=effects, tolerances=tolerances, inactive={**plant.inactive, failing: needs}
         )
-        said = f"{failing} is left out, the simulation fails with it: it {error.reason}"
-        return replace(self, plant=reduced), said
+        sentence = f"{failing} is left out, the simulation fails with it: it {error.reason}"
+        return replace(self, plant=reduced), sentence
+
+    def _most_moved(self, error: SimulationError) -> str:
+        """The stated value that was moved by most of its tolerances; raises the error where none was."""
+        plant = self.plant
+        tolerances_off = {}
+        for key, tolerance in plant.tolerances.items():
+            if error.parameters[key] != plant.parameters[key]:
+                ratio = max(error.parameters[key] / plant.parameters[key], np.finfo(float).tiny)
+                tolerances_off[key] = abs(np.log(ratio)) / tolerance
+        if not tolerances_off:
+            raise error
+        return max(tolerances_off, key=lambda key: tolerances_off[key])
 
     def _fails(self, change: Change) -> bool:
         """Whether the simulation as stated fails in some record with this effect alone."""
@@ -460,26 +505,31 @@ class PlantCase(RecordedCase[PlantExperiment]):
 
     @property
     def machine(self) -> Plant:
+        """The plant, which answers what fits and evidence ask (`SimulatedMachine`)."""
         return self.plant
 
     @property
     def outputs(self) -> tuple[str, ...]:
+        """(Y,) names of the outputs."""
         return self.plant.output_names
 
     @property
     def units(self) -> Mapping[str, str]:
+        """Output -> unit, of outputs whose names do not end with it."""
         return self.plant.units
 
     def with_noise(self, noise: Real) -> PlantCase:
-        """The same with other noise of the outputs (Y,)."""
+        """The case with other noise standard deviations of the outputs (Y,)."""
         return replace(self, plant=replace(self.plant, noise=noise))
 
     @property
     def model_error(self) -> float:
+        """Share of the motion that the simulation may miss, stated or usual."""
         return self.plant.weighing.model_error
 
     @property
     def dt_s(self) -> float:
+        """Sampling period, s; nan where nobody stated it."""
         return self.plant.dt_s
 
     @property

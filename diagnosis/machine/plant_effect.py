@@ -22,7 +22,10 @@ Tried = Literal["always", "with several outputs", "by name"]
 
 @dataclass(frozen=True)
 class Change:
-    """An effect with values, as a fit hands it to the simulation."""
+    """An effect with values, as a fit hands it to the simulation.
+
+    id : name of the effect. values : parameter -> value, the size first.
+    """
 
     as_listed: ClassVar[bool] = True
 
@@ -30,9 +33,11 @@ class Change:
     values: Mapping[str, float]
 
     def parameters(self) -> dict[str, float]:
+        """Parameter -> value."""
         return dict(self.values)
 
     def to_dict(self) -> dict[str, Any]:
+        """{"name": id, parameter: value, ...}, as files have it."""
         return {"name": self.id, **self.values}
 
 
@@ -89,10 +94,11 @@ class PlantEffect:
             )
 
     def at(self, magnitudes: object) -> PlantEffect:
-        """The same with ranges in units of their own (`EffectParameter.at`)."""
+        """The effect with its ranges in numbers: multiples of magnitudes (`EffectParameter.at`)."""
         return replace(self, parameters=tuple(p.at(magnitudes) for p in self.parameters))
 
     def candidates(self) -> tuple[Candidate, ...]:
+        """Search spaces of the effect: one, of both signs or sides of a ratio two."""
         if self.multiplies:
             # At its end a ratio wants to go on: the value is not the cause, or nowhere near.
             return tuple(
@@ -109,17 +115,21 @@ class PlantEffect:
 
     @property
     def id(self) -> str:
+        """Its name, as `plant.effects.search_space.EffectKind` calls it."""
         return self.name
 
 
-# A stated value may be wrong by this factor.
+# Largest factor that a stated value is looked for to be wrong by: who is wrong by more has another machine.
 _LARGEST_RATIO = 10.0
-# From this tolerance on (1: nothing is known) no value is wrong.
+# Relative tolerance from which on nothing is known of a value, and so it is not wrong.
 _KNOWS_NOTHING = 1.0
 
 
 def wrong_values(tolerances: Mapping[str, float]) -> tuple[PlantEffect, ...]:
-    """Stated values that may be wrong by several of their tolerances: findings, no matter of tolerances."""
+    """Effects "wrong_NAME", a ratio, of stated values that may be wrong by several of their tolerances.
+
+    tolerances : name -> relative standard deviation; a value of which nothing is known has no such effect.
+    """
     return tuple(
         PlantEffect(f"wrong_{key}", (EffectParameter("ratio", tolerance, _LARGEST_RATIO),), multiplies=key)
         for key, tolerance in tolerances.items()

@@ -235,8 +235,8 @@ def _refuse_sensors(experiment: Experiment) -> None:
         # A fine sensor hardly ever repeats a value; not so of an arm that rests, read by a coarse encoder.
         at_an_end = np.isin(y[1:], (np.max(y), np.min(y)))
         repeats = np.count_nonzero(~has_moved & ~at_an_end)
-        is_fine = repeats < _REPEATED * len(y)
-        is_fine = is_fine and np.unique(y).size > len(y) / 4
+        seldom_repeats = repeats < _REPEATED * len(y)
+        is_fine = seldom_repeats and np.unique(y).size > len(y) / 4
         is_stretch = lengths >= (2 if is_fine else _CLIPPED_ROWS)
         is_limited = is_stretch if is_fine else is_abrupt & is_stretch
         is_limited[-1] = False  # What does not come back may as well be dead.
@@ -283,7 +283,7 @@ def _fault(case: Case, matches: Sequence[_Match], least: float) -> str:
         )
 
     ratios = {name: match.ratio for name, match in followed.items()}
-    far = {name: ratio for name, ratio in ratios.items() if not LESS < ratio < FARTHER}
+    far: dict[str, float] = {name: ratio for name, ratio in ratios.items() if not LESS < ratio < FARTHER}
     hub = ratios.get("hub_angle_rad")
     tip = ratios.get("tip_acceleration_m_s2")
     # Both follow from one speed, whatever made it: the motor does not matter.
