@@ -1,7 +1,9 @@
 """Effects that any machine may have, by name: what they do to an input, an output or the force on a body.
 
-Sizes are in the units of the input (force, offset, ...) and of the output; ranges are multiples of the
-records' magnitudes, as in `plant.effects`, where effects of the same name are those of a flexible link.
+One row of `KINDS` serves every route on which its law applies: a Python simulation, an FMU, a measured
+motion, and, of smooth forces, joints of a MuJoCo model. To add one, see CONTRIBUTING.md. Sizes are in the
+units of the input (force, offset, ...) and of the output; ranges are multiples of the records' magnitudes, as
+in `plant.effects`, where effects of the same name are those of a flexible link.
 """
 
 from __future__ import annotations
@@ -20,16 +22,21 @@ from diagnosis.machine.plant_effect import PlantEffect
 from plant.effects.search_space import EffectParameter
 from plant.machine import ABSOLUTE, CUBIC, LINEAR, OFF_AXIS, QUADRATIC, SINE
 
+# Parameter -> value of an effect.
 Values = Mapping[str, float]
 
-# Of a delay in all a record: what comes later shows in too little of it.
+# Share of the longest record that a delay has at most: what comes later shows in too little of it.
 _LATEST = 0.2
 
 
 @dataclass(frozen=True)
 class Magnitudes:
-    """What ranges are multiples of: the records' largest input, force, position, speed, output about its mean
-    and reading of it about zero, their sampling and the longest."""
+    """What ranges are multiples of, in units of the signals.
+
+    input : largest command. force, position, speed : of the body, largest ones. inertia : of a joint.
+    output : largest output about its mean. reading : largest output about zero. dt_s : sampling period.
+    duration_s : of the longest record.
+    """
 
     input: float = 1.0
     force: float = 1.0
@@ -43,11 +50,15 @@ class Magnitudes:
 
     @property
     def latest(self) -> float:
-        """Of a delay, in samples."""
+        """Largest delay, in samples."""
         return _LATEST * self.duration_s / self.dt_s
 
 
+# Laws of a signal: signal (T,), values, sampling period [s] and the signal before its first row -> (T,).
+
+
 def _delayed(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A held signal that comes later, as its mean over each sample."""
     late = values["delay_s"] / dt_s
     whole = int(late)
     part = late - whole
@@ -73,26 +84,32 @@ def _lagged_sensor(signal: Real, values: Values, dt_s: float, before: float) -> 
 
 
 def _drifting(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal with a straight line from zero added."""
     return np.asarray(signal + values["rate_per_s"] * dt_s * np.arange(signal.size))
 
 
 def _clipped(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal between two limits of one size."""
     return np.clip(signal, -values["limit"], values["limit"])
 
 
 def _scaled(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal times one and a relative error."""
     return np.asarray((1 + values["relative_error"]) * signal)
 
 
 def _shifted(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal with a constant added."""
     return np.asarray(signal + values["offset"])
 
 
 def _with_play(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """What follows a signal with a play."""
     return np.asarray(followed(np.ascontiguousarray(signal), 0.5 * values["gap"], before))
 
 
 def _dead(signal: Real, values: Values, dt_s: float, before: float) -> Real:
+    """A signal less a zone about zero in which nothing follows."""
     return np.asarray(np.sign(signal) * np.maximum(np.abs(signal) - values["width"], 0.0))
 
 
@@ -113,10 +130,16 @@ def _one_way(values: Values) -> BodyForces:
 def _sized(
     name: str, low: float, high: float, first: float, last: float, count: int, unit: str, most: str = ""
 ) -> EffectParameter:
-    """A range and starts, in multiples of a magnitude."""
+    """A parameter from low to high with `count` starts from first to last in equal ratios.
+
+    All are multiples of the unit, a magnitude or several ("force/speed"); most : magnitude that high does not
+    go beyond.
+    """
     return EffectParameter(name, low, high, unit=unit, spread=(first, last, count), most=most)
 
 
+# Ranges go from what no record shows to what stops a machine; starts are so close that a descent from one
+# reaches the next: a factor of two and less where outputs jump or level off, of three to five elsewhere.
 _DELAY = _sized("delay_s", 2e-4, 100.0, 0.04, 30.0, 14, "dt_s", most="latest")
 _LAG = _sized("time_constant_s", 2e-3, 200.0, 0.02, 40.0, 10, "dt_s")
 _GAIN = EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7))

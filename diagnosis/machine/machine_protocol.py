@@ -1,7 +1,8 @@
 """What the diagnosis asks of a machine and its records; a flexible link is one of many that can answer.
 
 `diagnosis.machine.flexible_arm.FlexibleArm` answers for a rig, `diagnosis.machine.own_plant.Plant` for a
-simulation somebody brings. Fits, evidence and `diagnose` know no other machine.
+simulation somebody brings: a Python function, an FMU, a MuJoCo model, the force that a measured motion takes
+(`diagnosis.machine.simulation.Simulation`). Fits, evidence and `diagnose` know no other machine.
 """
 
 from __future__ import annotations
@@ -21,9 +22,12 @@ Real = npt.NDArray[np.float64]
 Role = Literal["estimation", "held_out"]
 Record = TypeVar("Record", bound="RecordOfMachine")
 
-_NAMED = 6  # records of a role that a case lists when it is printed
-FEWEST_SAMPLES = 20  # fewer tell no more than a handful of parameters
-# A search simulates every record some thousand times: more records than this take hours, however short.
+# Records of a role that a case names when it is printed: one line of a terminal.
+_NAMED = 6
+# Samples of a record at least: fewer tell no more than a handful of parameters.
+FEWEST_SAMPLES = 20
+# Records of a case at most. A search simulates every record some thousand times: more records than this take
+# hours, however short.
 MOST_RECORDS = 500
 
 
@@ -50,7 +54,8 @@ class UnknownStart:
     """What nobody knows about the start of a record and the zeros of its sensors.
 
     state_spread : (S,) prior standard deviations of the states at the start; infinite: free.
-    zero_spread : (Z,) the same of zeros, which all records share. zero_outputs : (Z, Y) outputs per zero.
+    zero_spread : (Z,) prior standard deviations of zeros of sensors, which all records share.
+    zero_outputs : (Z, Y) outputs per zero.
     state_per_zero : (S, Z) what a zero moves of a start that was read off the measurement.
     guess : record -> (S,) start as its first samples say.
     responses : effects, samples -> S arrays (T, Y): outputs per unit of a state, of the linear part; None
@@ -84,13 +89,14 @@ class SimulatedMachine(Protocol):
 
     @property
     def tolerances(self) -> Mapping[str, float]:
-        """Parameter -> relative standard deviation of its nominal parameter."""
+        """Parameter -> relative standard deviation of its stated value."""
 
     def scaled(self, factors: Mapping[str, float]) -> SimulatedMachine:
-        """The same with these parameters multiplied."""
+        """The machine with its parameters multiplied by these factors (parameter -> factor)."""
 
     @property
-    def output_names(self) -> Sequence[str]: ...
+    def output_names(self) -> Sequence[str]:
+        """(Y,) names of the outputs."""
 
     @property
     def input_names(self) -> Sequence[str]:
@@ -101,14 +107,16 @@ class SimulatedMachine(Protocol):
         """(Y,) noise standard deviations in the outputs' units."""
 
     @property
-    def weighing(self) -> Weighing: ...
+    def weighing(self) -> Weighing:
+        """How its residuals are weighed."""
 
     @property
     def description(self) -> Any:
         """What a user gets back as the repaired machine."""
 
     @property
-    def unknown_start(self) -> UnknownStart: ...
+    def unknown_start(self) -> UnknownStart:
+        """What nobody knows about the start of its records."""
 
     def simulator(self, effects: Sequence[Any]) -> Callable[..., Real]:
         """Inputs (T, U) -> outputs (T, Y) without noise; effects as its own candidates make them.
@@ -138,14 +146,16 @@ class RecordOfMachine(Protocol):
     """One experiment."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Of which a case has no second one."""
 
     @property
-    def role(self) -> Role: ...
+    def role(self) -> Role:
+        """Held-out records fit no parameter."""
 
     @property
     def input(self) -> Real:
-        """(T, U)"""
+        """(T, U) held from each row to the next."""
 
     @property
     def output(self) -> Real:
@@ -173,15 +183,17 @@ class RecordedCase(ABC, Generic[Record]):
                 raise ValueError(f"case {self.name}: no experiment has the role {role}")
 
     def __repr__(self) -> str:
-        said = [
+        """A line on the machine and one for each role, with the first records by name."""
+        lines = [
             f"{type(self).__name__} '{self.name}': {len(self.experiments)} records of "
             f"{', '.join(self.machine.output_names)}, {len(self.machine.weighing.listed)} candidate effects"
         ]
         for role, records in {"estimation": self.estimation, "validation": self.held_out}.items():
-            names = [f"{e.name} ({len(e.output)} samples)" for e in records]
-            more = [f"{len(names) - _NAMED} more"] if len(names) > _NAMED else []
-            said.append(f"  {role}: {', '.join(names[:_NAMED] + more)}")
-        return "\n".join(said)
+            names = [f"{e.name} ({len(e.output)} samples)" for e in records[:_NAMED]]
+            if len(records) > _NAMED:
+                names.append(f"{len(records) - _NAMED} more")
+            lines.append(f"  {role}: {', '.join(names)}")
+        return "\n".join(lines)
 
     @property
     @abstractmethod
@@ -205,10 +217,12 @@ class RecordedCase(ABC, Generic[Record]):
 
     @property
     def estimation(self) -> tuple[Record, ...]:
+        """Records that parameters are fitted to."""
         return tuple(e for e in self.experiments if e.role == "estimation")
 
     @property
     def held_out(self) -> tuple[Record, ...]:
+        """Records that fit no parameter, for validation."""
         return tuple(e for e in self.experiments if e.role == "held_out")
 
 
@@ -216,7 +230,7 @@ CaseOfMachine = RecordedCase[Any]
 
 
 def check_count(records: int, where: str) -> None:
-    """Raises ValueError, one line: more records than a search can simulate."""
+    """Raises ValueError, one line that begins with `where`: more records than a search can simulate."""
     if records > MOST_RECORDS:
         raise ValueError(
             f"{where}: {records} records, at most {MOST_RECORDS}; give the longest, or those that differ most"
@@ -224,20 +238,37 @@ def check_count(records: int, where: str) -> None:
 
 
 def check_record(record: RecordOfMachine, output_names: Sequence[str] = ()) -> None:
-    """Raises ValueError, one line: shapes that do not fit, too few samples, a value that is not finite, or an
-    output with a name that never moves."""
-    u, y, what = record.input, record.output, f"experiment {record.name}"
-    if u.ndim != 2 or y.ndim != 2 or len(u) != len(y) or (output_names and y.shape[1] != len(output_names)):
-        outputs = len(output_names) or "Y"
-        raise ValueError(f"{what}: needs input (T, U) and output (T, {outputs}); got {u.shape} and {y.shape}")
+    """Refuses a record that cannot be used; the role "validation" becomes "held_out".
+
+    Parameters
+    ----------
+    record : RecordOfMachine
+    output_names : (Y,) sequence of str
+        Of outputs that must move; without any, only shapes are checked.
+
+    Raises
+    ------
+    ValueError
+        One line: shapes that do not fit, a role that is none, a value that is not finite, too few samples, or
+        an output with a name that never moves.
+    """
+    u = record.input
+    y = record.output
+    where = f"experiment {record.name}"
+    has_shapes = u.ndim == 2 and y.ndim == 2 and len(u) == len(y)
+    if not has_shapes or (output_names and y.shape[1] != len(output_names)):
+        n_outputs = len(output_names) or "Y"
+        raise ValueError(
+            f"{where}: needs input (T, U) and output (T, {n_outputs}); got {u.shape} and {y.shape}"
+        )
     if str(record.role) == "validation":
         object.__setattr__(record, "role", "held_out")
     if record.role not in ("estimation", "held_out"):
-        raise ValueError(f"{what}: role must be estimation or validation; got {record.role!r}")
+        raise ValueError(f"{where}: role must be estimation or validation; got {record.role!r}")
     if not (np.all(np.isfinite(u)) and np.all(np.isfinite(y))):
-        raise ValueError(f"{what}: a value is not finite")
+        raise ValueError(f"{where}: a value is not finite")
     if len(u) < FEWEST_SAMPLES:
-        raise ValueError(f"{what}: {len(u)} samples, needs at least {FEWEST_SAMPLES}")
+        raise ValueError(f"{where}: {len(u)} samples, needs at least {FEWEST_SAMPLES}")
     for column, output in zip(y.T, output_names, strict=False):
         if np.ptp(column) == 0:
-            raise ValueError(f"{what}: {output} is {column[0]:.6g} throughout: is the sensor dead?")
+            raise ValueError(f"{where}: {output} is {column[0]:.6g} throughout: is the sensor dead?")

@@ -32,9 +32,15 @@ _STARTS_IN_BOUNDS = 6
 
 @dataclass(frozen=True, eq=False)
 class SimulatorCase:
-    """See `workflow.diagnose.case_files.LoadedCase`. repaired: diagnosis, folder -> MJCF to write there, None
-    of other simulators. inputs: names of the commands. model_error: as stated.
-    units: effect -> its parameters with units. doubts: sentences on what the logs leave open."""
+    """A case with what pages and files need beside it; for a rig see
+    `workflow.diagnose.case_files.LoadedCase`.
+
+    case : PlantCase. rig_file : name of the model's file. input_sha256 : of settings, model and logs.
+    repaired : diagnosis, folder -> text of the repaired MJCF model to write there; None of other simulators.
+    descriptions : of records, none here. inputs : names of the commands. model_error : as stated.
+    units : effect -> parameter -> its name with a unit. suspected : none here.
+    doubts : sentences on what the logs leave open.
+    """
 
     case: PlantCase
     rig_file: str
@@ -103,8 +109,8 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
     outputs = plant.output_names
 
     def unit(name: str) -> str:
-        found = unit_of(name) or plant.units.get(name, "")
-        return found.replace(" ", "").replace("²", "2").replace("/", "_")
+        stated = unit_of(name) or plant.units.get(name, "")
+        return stated.replace(" ", "").replace("²", "2").replace("/", "_")
 
     units: dict[str, str] = {}
     if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
@@ -126,47 +132,52 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
 
 
 def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diagnosis:
-    """Sizes of the effects under names with units; the repair keeps the names that the simulation takes."""
+    """A diagnosis with sizes of its effects under names with units; the repair keeps those that the
+    simulation takes.
 
-    def named(effect: NamedEffect) -> NamedEffect:
-        of = units.get(effect.name, {})
+    units : effect -> parameter -> its name with a unit.
+    """
 
-        def said(values: Mapping[str, Any]) -> dict[str, Any]:
-            return {of.get(key, key): value for key, value in values.items()}
+    def renamed(effect: NamedEffect) -> NamedEffect:
+        names = units.get(effect.name, {})
+
+        def with_names(values: Mapping[str, Any]) -> dict[str, Any]:
+            return {names.get(key, key): value for key, value in values.items()}
 
         return replace(
             effect,
-            parameters=said(effect.parameters),
-            intervals=said(effect.intervals),
-            remarks=said(effect.remarks),
+            parameters=with_names(effect.parameters),
+            intervals=with_names(effect.intervals),
+            remarks=with_names(effect.remarks),
         )
 
-    return replace(found, effects=tuple(map(named, found.effects)))
+    return replace(found, effects=tuple(renamed(effect) for effect in found.effects))
 
 
 def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
-    """With the candidates that a case file leaves, each within its bounds; all else is as stated.
+    """The plant with the candidates that a case file leaves, each within its bounds; all else is as stated.
 
     A pattern names an effect or a stated value, which is also called "wrong_NAME"; it is called only so where
-    an effect has its name.
+    an effect has its name. Raises ValueError, one line: a pattern that matches nothing, bounds of no effect.
     """
     values = plant.value_candidates
-    there = [*(effect.name for effect in plant.effects), *values]
-    called = {name: {name} for name in there}
+    candidates = [*(effect.name for effect in plant.effects), *values]
+    called = {name: {name} for name in candidates}
     for name, parameter in values.items():
         called[name].add(f"wrong_{parameter}")
     for key in ("candidates", "exclude"):
         for pattern in getattr(settings, key):
             if not any(fnmatch.filter(names, pattern) for names in called.values()):
                 raise ValueError(
-                    f"{key}: {pattern!r} matches nothing that shows in the logs; there are {listing(there)}"
+                    f"{key}: {pattern!r} matches nothing that shows in the logs; there are "
+                    f"{listing(candidates)}"
                 )
 
-    def taken(candidate: str) -> bool:
-        def within(patterns: Sequence[str]) -> bool:
-            return any(fnmatch.filter(called[candidate], pattern) for pattern in patterns)
+    def matches(candidate: str, patterns: Sequence[str]) -> bool:
+        return any(fnmatch.filter(called[candidate], pattern) for pattern in patterns)
 
-        return within(settings.candidates) and not within(settings.exclude)
+    def taken(candidate: str) -> bool:
+        return matches(candidate, settings.candidates) and not matches(candidate, settings.exclude)
 
     effects = {effect.name: effect for effect in plant.effects if taken(effect.name)}
     for name, (low, high) in settings.bounds.items():

@@ -90,10 +90,12 @@ class SimulationModel:
 
     @property
     def inputs(self) -> tuple[str, ...]:
+        """Names of the simulation's inputs."""
         return self.simulation.inputs
 
     @property
     def outputs(self) -> tuple[str, ...]:
+        """Names of the simulation's outputs."""
         return self.simulation.outputs
 
     def plant(self, experiments: Sequence[PlantExperiment], noise: Real) -> Plant:
@@ -149,6 +151,7 @@ class MjcfModel:
         return arm.plant(experiments, noise, model_error=self.settings.model_error, named=named)
 
     def repaired(self, plant: Plant, found: Diagnosis, folder: Path) -> str:
+        """MJCF with the repair of a diagnosis; its validation records are keyframes."""
         return self.arm.repaired(plant, found.rig, found.repair, found.case.held_out, folder)
 
     def _refuse_other_reach(self, experiments: Sequence[PlantExperiment]) -> None:
@@ -218,6 +221,7 @@ def _open_mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings
     _refuse_ambiguous(kinds, table, settings)
 
     def label(kind: str, name: str) -> str:
+        """The name, with its kind in front where other parts have it, too."""
         return f"{kind} {name}" if len(kinds.get(name, ())) > 1 else name
 
     # What the logs measure: columns of sensors and joints, but those that never change.
