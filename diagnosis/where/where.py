@@ -3,6 +3,8 @@
 Everything is read from whitened residuals (measured - model) / noise of every experiment, whichever model
 made them: as given, with refitted parameters, or repaired. Beside a model error, noise and what a good
 model may miss of the motion stand together in the place of the noise.
+
+`where` is of a flexible link, whose sensors and motions have names; `where_in_records` of any machine.
 """
 
 from __future__ import annotations
@@ -18,13 +20,14 @@ from diagnosis.machine.flexible_arm import NOISE
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.dependence import dependences
 from diagnosis.where.distortion import periodic_findings
-from diagnosis.where.findings import Where, sensors_of
+from diagnosis.where.findings import BandGap, RegimeFinding, Where, sensors_of
 from diagnosis.where.regimes import axes_of_output, motions, regime_axes, regime_findings
 from diagnosis.where.where_energy import Energy, band_gaps, experiment_gaps, part_gap, sensor_gaps
 from diagnosis.where.where_trends import amplitude_finding, common_findings, drift_findings, linear_correction
 from plant.effects import EFFECTS
 
-LEVEL = 0.01  # one false finding an axis in a hundred pages of noise
+# Chance of a false finding in each axis: one in a hundred pages of noise. Chosen; doubled, twice as many.
+LEVEL = 0.01
 
 
 def where(
@@ -35,70 +38,105 @@ def where(
     level: float = LEVEL,
     rng: np.random.Generator | None = None,
 ) -> Where:
-    """Locate the gap.
+    """Locate the gap between a flexible link and its model.
 
-    residuals : experiment name -> (T, Y). (measured - model) / noise, standard deviation 1 where the model
-        explains everything; every experiment of the case.
+    Parameters
+    ----------
+    case : Case
+    residuals : experiment -> (T, Y) array
+        (measured - model) / noise, standard deviation 1 where the model explains everything; of every
+        experiment of the case.
     probabilities : effect id, "none" or "unknown" -> probability, optional
         Of the causes, for the grouping by subsystem.
-    level : Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
+    level : float
+        Chance of a false finding in each axis (frequency, regimes, drift, experiments, sensors) when the
         records hold only noise.
-    rng : Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
+    rng : numpy Generator, optional
+        Of the shifts and blocks; without it a fixed sequence, so that the same records give the same page.
 
-    Raises ValueError: missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
+    Returns
+    -------
+    Where
+
+    Raises
+    ------
+    ValueError
+        Missing or misshaped residuals, a level outside (0, 1), an effect that does not exist.
     """
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
     rng = np.random.default_rng(0) if rng is None else rng
-    given_case, given = case, residuals
+    weighed_case = case
+    weighed = residuals
     if case.model_error > 0:
-        case, residuals = over_levels(case, residuals, thresholds_of(case))
-    moved, sensors = motions(case, residuals), sensors_of(case)
-    e = {name: np.asarray(residuals[name], dtype=np.float64) for name in moved}
-    found = _by_parts(e, sensors, case.rig.sampling.dt_s, level)
-    bands = found.bands
+        weighed_case, weighed = over_levels(case, residuals, thresholds_of(case))
+    motion = motions(weighed_case, weighed)
+    sensors = sensors_of(weighed_case)
+    e = {name: np.asarray(weighed[name], dtype=np.float64) for name in motion}
+    parts = _by_parts(e, sensors, case.rig.sampling.dt_s, level)
+    bands = parts.bands
     if case.model_error > 0:
         # What a model may miss is stated for all frequencies together, not for each of them.
-        quiet = [s.sensor for s in found.sensors if not s.gap.found]
-        bands = tuple(replace(b, gap=replace(b.gap, found=False)) if b.sensor in quiet else b for b in bands)
+        quiet = [s.sensor for s in parts.sensors if not s.gap.found]
+        bands = tuple(_not_found(band) if band.sensor in quiet else band for band in bands)
     return replace(
-        found,
+        parts,
         bands=bands,
-        regimes=regime_findings(e, sensors, regime_axes(moved), level, rng),
-        drift=drift_findings(case, e, level),
-        common=common_findings(case, e, level),
-        dependences=dependences(given_case, given, case.dt_s, level) if found.is_gap else (),
-        periodic=periodic_findings(case, e, level),
-        amplitude=amplitude_finding(case, e, level, rng),
-        linear=linear_correction(case, e),
+        regimes=regime_findings(e, sensors, regime_axes(motion), level, rng),
+        drift=drift_findings(weighed_case, e, level),
+        common=common_findings(weighed_case, e, level),
+        # A missing force is followed to the sensors' noise, whatever a model may miss.
+        dependences=dependences(case, residuals, case.dt_s, level) if parts.is_gap else (),
+        periodic=periodic_findings(weighed_case, e, level),
+        amplitude=amplitude_finding(weighed_case, e, level, rng),
+        linear=linear_correction(weighed_case, e),
         subsystem=subsystem_mass(probabilities) if probabilities else {},
     )
 
 
+def _not_found(band: BandGap) -> BandGap:
+    """A band whose gap counts as chance."""
+    return replace(band, gap=replace(band.gap, found=False))
+
+
 def where_in_records(case: CaseOfMachine, residuals: Mapping[str, Real], dt_s: float) -> Where:
-    """Of any machine: by sensor, experiment, frequency, and by what its outputs and inputs do (direction,
-    size, rate, time in the record), and what it depends on; arguments as of `where`. Raises ValueError
-    without a sampling period."""
+    """Locate the gap between any machine and its simulation.
+
+    By sensor, experiment, frequency; by what its outputs and inputs do (direction, size, rate, time in the
+    record); and what it depends on. Each axis at the level `LEVEL`.
+
+    Parameters
+    ----------
+    case : CaseOfMachine
+    residuals : experiment -> (T, Y) array
+        (measured - model) / noise, of every experiment of the case.
+    dt_s : float
+        Sampling period [s].
+
+    Raises
+    ------
+    ValueError
+        The sampling period is not positive.
+    """
     if not dt_s > 0:
         raise ValueError(f"case {case.name}: state the plant's sampling period (Plant(dt_s=...)) for a page")
-    names, rng = case.machine.output_names, np.random.default_rng(0)
+    names = case.machine.output_names
+    rng = np.random.default_rng(0)
     axes = [axes_of_output(case, residuals, dt_s, k) for k in range(len(names))]
-    given = residuals
+    weighed = residuals
     if case.machine.weighing.model_error > 0:
-        _, residuals = over_levels(case, residuals, thresholds_of(case))
-    regimes = [
-        finding
-        for k, (sensor, own) in enumerate(zip(names, axes, strict=True))
-        for finding in regime_findings(
-            {name: e[:, [k]] for name, e in residuals.items()}, (sensor,), own, LEVEL / len(names), rng
-        )
-    ]
-    found = _by_parts(residuals, names, dt_s, LEVEL)
-    depends = dependences(case, given, dt_s, LEVEL) if found.is_gap else ()
-    return replace(found, regimes=tuple(regimes), dependences=depends)
+        _, weighed = over_levels(case, residuals, thresholds_of(case))
+    regimes: list[RegimeFinding] = []
+    for k, sensor in enumerate(names):
+        column = {name: e[:, [k]] for name, e in weighed.items()}
+        regimes += regime_findings(column, (sensor,), axes[k], LEVEL / len(names), rng)
+    parts = _by_parts(weighed, names, dt_s, LEVEL)
+    depends = dependences(case, residuals, dt_s, LEVEL) if parts.is_gap else ()
+    return replace(parts, regimes=tuple(regimes), dependences=depends)
 
 
 def _by_parts(residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float) -> Where:
+    """The gap as a whole, by sensor, experiment and band; residuals (T, Y) over noise or threshold."""
     whole = Energy.of(residuals.values())
     return Where(
         gap=part_gap(whole, whole, level),
@@ -110,11 +148,11 @@ def _by_parts(residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float
 
 
 def motion_of(case: CaseOfMachine) -> Real:
-    """(Y,) RMS of the outputs about their means over the held-out records."""
-    held = case.held_out
-    return np.sqrt(
-        np.average([np.var(e.output, axis=0) for e in held], axis=0, weights=[len(e.output) for e in held])
-    )
+    """(Y,) RMS of the outputs about their means over the held-out records, in the outputs' units."""
+    records = case.held_out
+    variances = [np.var(record.output, axis=0) for record in records]
+    rows = [len(record.output) for record in records]
+    return np.sqrt(np.average(variances, axis=0, weights=rows))
 
 
 def thresholds_of(case: CaseOfMachine) -> Real:
@@ -128,7 +166,16 @@ AnyCase = TypeVar("AnyCase", bound=CaseOfMachine)
 def over_levels(
     case: AnyCase, residuals: Mapping[str, Real], levels: Real
 ) -> tuple[AnyCase, dict[str, Real]]:
-    """Case (only of a rig) and residuals with levels (Y,), in the outputs' units, in place of the noise."""
+    """Case and residuals with levels in place of the noise; only the case of a rig states them as its noise.
+
+    Parameters
+    ----------
+    case : Case or other case of a machine
+    residuals : experiment -> (T, Y) array
+        Over the case's noise.
+    levels : (Y,) array
+        In the outputs' units, above zero.
+    """
     weighed = {name: e * (case.noise / levels) for name, e in residuals.items()}
     if not isinstance(case, Case):
         return case, weighed
@@ -142,7 +189,10 @@ def subsystem_mass(probabilities: Mapping[str, float]) -> dict[str, float]:
     "none" and "unknown" stay on their own. What comes from outside the machine (a periodic disturbance,
     gravity) counts as environment.
 
-    Raises ValueError if a name is neither an effect of the registry nor none or unknown.
+    Raises
+    ------
+    ValueError
+        A name is neither an effect of the registry nor none or unknown.
     """
     mass = dict.fromkeys(("none", "actuator", "joint", "link", "sensor", "environment", "unknown"), 0.0)
     for name, value in probabilities.items():

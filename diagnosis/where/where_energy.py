@@ -17,10 +17,16 @@ from scipy.stats import chi2, norm
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import BandGap, ExperimentGap, PartGap, SensorGap
 
+# Standard deviations of a two-sided interval of 95 %.
 _Z95 = float(norm.ppf(0.975))
-# Half a decade a band: edges 1, 3.2, 10, ... Hz, rounded for reading aloud.
+# Band edges, two a decade: 1, 3, 10, ... Hz, rounded for reading aloud. Chosen; with half as many a mode and
+# a drift share a band, with twice as many no band of a short record is beyond chance.
 _EDGES_HZ = tuple(m * 10.0**k for k in range(-4, 6) for m in (1.0, 3.0))
-_LEAST_LINES = 3  # fewer make no band: offset and drift fill them
+# Lines of the cosine transform in the lowest band: fewer are filled by an offset and a drift alone.
+_LEAST_LINES = 3
+# The highest band begins at this share of the Nyquist frequency at the latest, so that it is wide enough for
+# a comparison. Chosen; with half of it most pages have one band less.
+_HIGHEST_BAND_BEGINS = 0.6
 
 
 @dataclass(frozen=True)
@@ -32,46 +38,76 @@ class Energy:
 
     @classmethod
     def of(cls, signals: Iterable[Real]) -> Energy:
-        parts = [(float(np.sum(signal**2)), signal.size) for signal in signals]
-        return cls(sum(squares for squares, _ in parts), sum(size for _, size in parts))
+        """Energy of all values of some arrays of any shape; zero of none."""
+        squares = 0.0
+        count = 0
+        for signal in signals:
+            squares += float(np.sum(signal**2))
+            count += signal.size
+        return cls(squares, count)
 
     @property
     def gap(self) -> float:
+        """Energy beyond that of the noise, below zero where there is less: its estimate without bias."""
         return self.squares - self.count
 
     @property
     def variance(self) -> float:
-        """Of the sum of squares: 2 n + 4 lambda, the noncentrality lambda estimated."""
+        """Variance of the sum of squares: 2 n + 4 lambda, the noncentrality lambda estimated by the gap."""
         return 2.0 * self.count + 4.0 * max(self.gap, 0.0)
 
     @property
     def p_value(self) -> float:
+        """Chance of as much energy from noise alone."""
         return float(chi2.sf(self.squares, self.count))
 
 
 def total(parts: Sequence[Energy]) -> Energy:
+    """Energy of parts that share no value."""
     return Energy(sum(p.squares for p in parts), sum(p.count for p in parts))
 
 
 def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
-    """The gap of a part of the whole; found if its p-value lies below `level`.
+    """The gap of a part of the whole, found if its p-value lies below `level`.
 
-    The share's interval is by the delta method for two independent energies, the part and the rest.
+    Parameters
+    ----------
+    part, whole : Energy
+        The whole holds the part, and at least one value.
+    level : float
+        Chance of a false finding in noise.
+
+    Notes
+    -----
+    The interval of the share is by the delta method for two independent energies, the part and what is
+    beside it. The share is not cut to 0 and 1: a part with less energy than noise counts a little below zero,
+    so that shares of disjoint parts sum to one.
     """
     half = _Z95 * np.sqrt(part.variance)
-    rms = [float(np.sqrt(max(part.gap + shift, 0.0) / part.count)) for shift in (0.0, -half, half)]
-    if whole.gap <= _Z95 * np.sqrt(2.0 * whole.count):
-        # No gap beyond chance to take a share of.
-        share, interval = 0.0, (0.0, 0.0)
-    else:
+
+    def rms(energy: float) -> float:
+        return float(np.sqrt(max(energy, 0.0) / part.count))
+
+    # Without a gap beyond chance there is nothing to take a share of.
+    share = 0.0
+    interval = (0.0, 0.0)
+    if whole.gap > _Z95 * np.sqrt(2.0 * whole.count):
         share = part.gap / whole.gap
-        rest = max(whole.variance - part.variance, 0.0)
-        sd = np.sqrt((1 - share) ** 2 * part.variance + share**2 * rest) / whole.gap
-        interval = (float(share - _Z95 * sd), float(share + _Z95 * sd))
-    return PartGap(rms[0], (rms[1], rms[2]), float(share), interval, part.p_value, bool(part.p_value < level))
+        variance_beside = max(whole.variance - part.variance, 0.0)
+        deviation = np.sqrt((1 - share) ** 2 * part.variance + share**2 * variance_beside) / whole.gap
+        interval = (float(share - _Z95 * deviation), float(share + _Z95 * deviation))
+    return PartGap(
+        gap_rms=rms(part.gap),
+        interval=(rms(part.gap - half), rms(part.gap + half)),
+        share=float(share),
+        share_interval=interval,
+        p_value=part.p_value,
+        found=bool(part.p_value < level),
+    )
 
 
 def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: float) -> tuple[SensorGap, ...]:
+    """Gap of every sensor over all experiments; residuals (T, Y) by experiment, one level for all sensors."""
     energies = [Energy.of(e[:, s] for e in residuals.values()) for s in range(len(sensors))]
     whole = total(energies)
     return tuple(
@@ -81,16 +117,16 @@ def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: fl
 
 
 def experiment_gaps(residuals: Mapping[str, Real], level: float) -> tuple[ExperimentGap, ...]:
-    """Every experiment: all sensors together and each; one level for all these tests."""
+    """Gap of every experiment, all sensors together and each; residuals (T, Y), one level for all tests."""
     energies = {name: [Energy.of([column]) for column in e.T] for name, e in residuals.items()}
     whole = total([energy for parts in energies.values() for energy in parts])
-    each = level / sum(1 + len(parts) for parts in energies.values())
-    return tuple(
-        ExperimentGap(
-            name, part_gap(total(parts), whole, each), tuple(part_gap(part, whole, each) for part in parts)
-        )
-        for name, parts in energies.items()
-    )
+    tests = sum(1 + len(parts) for parts in energies.values())
+    gaps = []
+    for name, parts in energies.items():
+        together = part_gap(total(parts), whole, level / tests)
+        by_sensor = tuple(part_gap(part, whole, level / tests) for part in parts)
+        gaps.append(ExperimentGap(name, together, by_sensor))
+    return tuple(gaps)
 
 
 def band_edges_Hz(shortest_s: float, dt_s: float) -> tuple[float, ...]:
@@ -100,22 +136,38 @@ def band_edges_Hz(shortest_s: float, dt_s: float) -> tuple[float, ...]:
     transform) and the highest reaches from no later than 60 % of Nyquist.
     """
     nyquist = 0.5 / dt_s
-    return (0.0, *[f for f in _EDGES_HZ if _LEAST_LINES / (2 * shortest_s) <= f <= 0.6 * nyquist], nyquist)
+    lowest = _LEAST_LINES / (2 * shortest_s)
+    inner = [f for f in _EDGES_HZ if lowest <= f <= _HIGHEST_BAND_BEGINS * nyquist]
+    return (0.0, *inner, nyquist)
 
 
 def band_gaps(
     residuals: Mapping[str, Real], sensors: Sequence[str], dt_s: float, level: float
 ) -> tuple[BandGap, ...]:
-    """Energy per sensor and band, all experiments added up."""
-    edges = band_edges_Hz(min(e.shape[0] for e in residuals.values()) * dt_s, dt_s)
+    """Gap of every sensor in every band, all experiments added up.
+
+    Parameters
+    ----------
+    residuals : experiment -> (T, Y) array
+        Over the noise; one experiment at least.
+    sensors : sequence of str, length Y
+    dt_s : float
+        Sampling period [s].
+    level : float
+        Chance of a false finding in all bands and sensors together.
+    """
+    shortest = min(e.shape[0] for e in residuals.values())
+    edges = band_edges_Hz(shortest * dt_s, dt_s)
     squares = np.zeros((len(sensors), len(edges) - 1))
     counts = np.zeros(len(edges) - 1, dtype=int)
     for e in residuals.values():
         spectrum = dct(e, axis=0, norm="ortho") ** 2
-        band = np.searchsorted(edges, np.arange(e.shape[0]) / (2 * e.shape[0] * dt_s), side="right") - 1
+        frequencies_Hz = np.arange(e.shape[0]) / (2 * e.shape[0] * dt_s)
+        band = np.searchsorted(edges, frequencies_Hz, side="right") - 1
         counts += np.bincount(band, minlength=counts.size)
         for s in range(len(sensors)):
             squares[s] += np.bincount(band, weights=spectrum[:, s], minlength=counts.size)
+
     energies = [[Energy(float(v), int(n)) for v, n in zip(row, counts, strict=True)] for row in squares]
     whole = total([energy for row in energies for energy in row])
     return tuple(
