@@ -20,12 +20,12 @@ from diagnosis.where.findings import BandGap, ExperimentGap, PartGap, SensorGap
 # Standard deviations of a two-sided interval of 95 %.
 _Z95 = float(norm.ppf(0.975))
 # Band edges, two a decade: 1, 3, 10, ... Hz, rounded for reading aloud. Chosen; with half as many a mode and
-# a drift share a band, with twice as many no band of a short record is beyond chance.
+# a drift share a band, with twice as many each holds half the energy to be found by.
 _EDGES_HZ = tuple(m * 10.0**k for k in range(-4, 6) for m in (1.0, 3.0))
 # Lines of the cosine transform in the lowest band: fewer are filled by an offset and a drift alone.
 _LEAST_LINES = 3
 # The highest band begins at this share of the Nyquist frequency at the latest, so that it is wide enough for
-# a comparison. Chosen; with half of it most pages have one band less.
+# a comparison. Chosen; with half of it three pages of five have one band less.
 _HIGHEST_BAND_BEGINS = 0.6
 
 
