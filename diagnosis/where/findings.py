@@ -1,7 +1,8 @@
 """What `diagnosis.where.where` answers: findings by frequency, regime, experiment, sensor, size.
 
 Every finding carries its number, an interval, a p-value against chance and whether it is `found` (beyond
-chance at the level of its axis).
+chance at the level of its axis). Sizes are in noise standard deviations, or in those of noise and what a good
+model may miss together. A sensor, an experiment and an effect are named as in the case.
 """
 
 from __future__ import annotations
@@ -25,15 +26,31 @@ SENSORS: dict[Output, tuple[str, str]] = {
     "tip_deflection_m": ("tip_deflection", "m/s"),
 }
 
+# Standard deviations of a two-sided interval of 95 %.
 _Z95 = float(norm.ppf(0.975))
-# A statement about where "most" of the gap lies covers at least this share of it.
+# A statement about where "most" of the gap lies covers at least this share of it. Chosen; at 0.9 most gaps of
+# an arm with one mode have no such band.
 _MOST = 0.8
-# From such a share of the gap on it is called linear in the voltage; below the other one it is not.
-_LINEAR, _NOT_LINEAR = 0.9, 0.5
-# A straight drift has 7 % of its energy around its fourth line.
+# And at least this share for certain, at the lower end of its interval: half of it is not most of it.
+_MOST_FOR_CERTAIN = 0.5
+# From such a share of the gap on it is called linear in the voltage: what a linear correction leaves of a
+# linear cause is what its poles are off by, a tenth of it. Chosen.
+_LINEAR = 0.9
+# Below such a share it is called nonlinear: of dry friction about a half looks like viscous friction.
+_NOT_LINEAR = 0.5
+# Share of a common part within one line of its strongest one from which on it is called a line: a straight
+# drift has 7 % of its energy around its fourth line. Chosen; doubled, a disturbance that swells has no line.
 _LINE = 0.2
-# A drift that explains less of a gap is not worth a sentence.
+# A drift that explains less of a gap is not worth a sentence. Chosen, as of a dependence.
 _LEAST_DRIFT = 0.1
+# A sensor alone shows the gap where it has this share at the lower end of its interval.
+_ALONE_FOR_CERTAIN = 0.95
+# Or this share where the gap of every other sensor is within chance.
+_ALONE = 0.9
+# Axes of regimes that are told: a page says no more than a reader keeps. Chosen.
+_MOST_AXES = 3
+# Below this a standard deviation is zero: it keeps a ratio finite.
+_TINY = 1e-12
 
 
 def sensors_of(case: Case) -> tuple[str, ...]:
@@ -65,6 +82,8 @@ class PartGap:
 
 @dataclass(frozen=True)
 class SensorGap:
+    """Gap of one sensor, all experiments together."""
+
     sensor: str
     gap: PartGap
 
@@ -137,9 +156,9 @@ class RegimeFinding:
 class DriftFinding:
     """Slope of a sensor's residual over the time since start, common to all experiments.
 
-    `share` is what a drift from zero at this rate explains of the sensor's gap energy. The interval comes
-    from the scatter of the experiments' own slopes (Student), so that residuals of any colour are covered;
-    without three experiments there is none and nothing is found.
+    `rate` is in `unit`, as is its 95 % interval. `share` is what a drift from zero at this rate explains of
+    the sensor's gap energy. The interval comes from the scatter of the experiments' own slopes (Student), so
+    that residuals of any colour are covered; without three experiments there is none and nothing is found.
     """
 
     sensor: str
@@ -152,6 +171,7 @@ class DriftFinding:
 
     @property
     def notable(self) -> bool:
+        """Whether it is beyond chance and explains a tenth of the gap."""
         return self.found and self.share >= _LEAST_DRIFT
 
 
@@ -178,12 +198,14 @@ class CommonFinding:
 
     @property
     def has_line(self) -> bool:
+        """Whether the common part is, for a fifth at least, at one frequency."""
         return self.peak_share >= _LINE
 
 
+# What a variable is: the motion of an output, an output that is no motion, a command, the time in the log, a
+# column beside inputs and outputs.
 Quantity = Literal["position", "speed", "acceleration", "value", "command", "time", "beside"]
-
-
+# What a curve is: a straight line, a change of sign with the variable, or no less than the curve.
 Shape = Literal["line", "jump", "curve"]
 
 
@@ -259,6 +281,7 @@ class FrequencyResponseBand:
 
     `distance` is the root mean square over the lines of |measured - model| in radii of the 95 % noise disc: 1
     is the edge of what noise explains on a single line, sqrt(2/5.99) = 0.58 what noise alone gives.
+    `relative_error`: the same over the model's response, infinite where the model does not respond.
     """
 
     sensor: str
@@ -288,7 +311,11 @@ class LineGroup:
 
 @dataclass(frozen=True)
 class PeriodicFinding:
-    """What a record with repeated periods says."""
+    """What a record with repeated periods says.
+
+    period_samples, periods : length of a period, and how many whole ones the record has.
+    even_odd_separable : only odd lines are excited, so that even and odd distortion are told apart.
+    """
 
     experiment: str
     period_samples: int
@@ -305,7 +332,9 @@ Growth = Literal["offset", "saturating", "linear", "faster", "undecided"]
 class AmplitudeFinding:
     """How the gap grows between two open-loop experiments of one kind at different amplitude.
 
+    experiments: the weaker and the stronger. voltage_ratio, gap_ratio: stronger over weaker, RMS.
     exponent: gap_rms proportional to amplitude^exponent (1 in a linear machine), 95 % interval by blocks.
+    growth: what that allows to say; found: that it is not proportion.
     """
 
     experiments: tuple[str, str]
@@ -330,7 +359,11 @@ class LinearCorrection:
     @property
     def linear(self) -> bool | None:
         """Whether the cause is linear in the voltage; None where the share leaves that open."""
-        return True if self.share >= _LINEAR else False if self.share < _NOT_LINEAR else None
+        if self.share >= _LINEAR:
+            return True
+        if self.share < _NOT_LINEAR:
+            return False
+        return None
 
 
 @dataclass(frozen=True)
@@ -347,14 +380,20 @@ class Concentration:
 class Where:
     """Where the gap lies.
 
-    gap : PartGap. All records together.
-    sensors, experiments, bands, regimes, dependences, drift, common : See their records. Drift and common
-    only
-        of a flexible link.
-    periodic, amplitude, linear : None where the records do not allow it.
+    Parameters
+    ----------
+    gap : PartGap
+        All records together.
+    sensors, experiments, bands, regimes, dependences : tuple
+        See their records; at least one sensor, experiment and band.
+    drift, common, periodic : tuple
+        Only of a flexible link; empty where the records do not allow it.
+    amplitude, linear : AmplitudeFinding, LinearCorrection or None
+        Only of a flexible link; None where the records do not allow it.
     subsystem : dict
         Probability of none, actuator, joint, link, sensor, environment, unknown; empty without probabilities.
-    level : float. Chance of any finding of an axis when there is nothing.
+    level : float
+        Chance of any finding of an axis when there is nothing.
     """
 
     gap: PartGap
@@ -374,68 +413,91 @@ class Where:
     @property
     def is_gap(self) -> bool:
         """Anything beyond noise in the records as a whole, a sensor, an experiment or a band."""
-        parts = [self.gap, *(s.gap for s in self.sensors), *(b.gap for b in self.bands)]
-        parts += [g for x in self.experiments for g in (x.gap, *x.sensors)]
+        parts = [self.gap]
+        parts += [sensor.gap for sensor in self.sensors]
+        parts += [band.gap for band in self.bands]
+        for experiment in self.experiments:
+            parts += [experiment.gap, *experiment.sensors]
         return any(part.found for part in parts)
 
     @property
     def dominant_sensor(self) -> str | None:
-        """The sensor that alone shows the gap, if the other ones show none or next to none of it."""
+        """The sensor that alone shows the gap, if the other ones show none or next to none of it.
+
+        None of a machine with one sensor.
+        """
         if len(self.sensors) == 1:
             return None
-        shown = [s for s in self.sensors if s.gap.found]
-        for s in shown:
-            if s.gap.share_interval[0] > 0.95 or (len(shown) == 1 and s.gap.share > 0.9):
-                return s.sensor
+        with_gap = [sensor for sensor in self.sensors if sensor.gap.found]
+        for sensor in with_gap:
+            gap = sensor.gap
+            if gap.share_interval[0] > _ALONE_FOR_CERTAIN or (len(with_gap) == 1 and gap.share > _ALONE):
+                return sensor.sensor
         return None
 
     @property
     def telling_regimes(self) -> tuple[RegimeFinding, ...]:
         """The clearest regime of every axis, at most three axes."""
         best: dict[str, RegimeFinding] = {}
-        for r in self.regimes:
-            if r.peak is not None and (r.axis not in best or r.contrast > best[r.axis].contrast):
-                best[r.axis] = r
-        return tuple(sorted(best.values(), key=lambda r: -r.contrast)[:3])
+        for regime in self.regimes:
+            if regime.peak is None:
+                continue
+            if regime.axis not in best or regime.contrast > best[regime.axis].contrast:
+                best[regime.axis] = regime
+        clearest_first = sorted(best.values(), key=lambda regime: -regime.contrast)
+        return tuple(clearest_first[:_MOST_AXES])
 
     @property
     def common_found(self) -> tuple[CommonFinding, ...]:
-        """Largest share first."""
-        return tuple(sorted((c for c in self.common if c.found), key=lambda c: -c.share))
+        """What all experiments share beyond chance, largest share first."""
+        beyond_chance = [common for common in self.common if common.found]
+        return tuple(sorted(beyond_chance, key=lambda common: -common.share))
 
     def concentration(self, sensor: str | None = None) -> Concentration | None:
         """Narrowest run of bands with at least 80 % of the gap (of one sensor: of its own gap).
 
         None if only the whole range has it, no band is found, or it may be less than half.
         """
-        bands = [b for b in self.bands if sensor in (None, b.sensor)]
-        whole = sum(b.gap.share for b in bands) if sensor else 1.0
-        if not any(b.gap.found for b in bands):
+        bands = [band for band in self.bands if sensor is None or band.sensor == sensor]
+        if not any(band.gap.found for band in bands):
             return None
-        scale = whole if whole > 0 else 1.0
-        edges = sorted({b.low_Hz for b in bands} | {b.high_Hz for b in bands})
-        shares = [sum(b.gap.share / scale for b in bands if b.low_Hz == low) for low in edges[:-1]]
-        runs = [
-            (j - i, -sum(shares[i:j]), edges[i], edges[j])
-            for i in range(len(shares))
-            for j in range(i + 1, len(shares) + 1)
-            if sum(shares[i:j]) >= _MOST
-        ]
-        if not runs or min(runs)[0] == len(shares):
+        # Shares are of the gap of all sensors; those of one sensor are taken over its own.
+        scale = 1.0
+        if sensor is not None:
+            whole = sum(band.gap.share for band in bands)
+            scale = whole if whole > 0 else 1.0
+        edges = sorted({band.low_Hz for band in bands} | {band.high_Hz for band in bands})
+        shares = [sum(band.gap.share / scale for band in bands if band.low_Hz == low) for low in edges[:-1]]
+
+        runs = []
+        for begin in range(len(shares)):
+            for end in range(begin + 1, len(shares) + 1):
+                share = sum(shares[begin:end])
+                if share >= _MOST:
+                    runs.append((end - begin, -share, edges[begin], edges[end]))
+        # The narrowest; of two as narrow the one that holds more.
+        count, minus_share, low, high = min(runs, default=(len(shares), 0.0, 0.0, 0.0))
+        if count == len(shares):
             return None
-        _, less, low, high = min(runs)
-        halves = [np.ptp(b.gap.share_interval) / scale / 2 for b in bands if low <= b.low_Hz < high]
-        half, share = float(np.sqrt(np.sum(np.square(halves)))), min(-less, 1.0)
-        return Concentration(low, high, share, half) if share - half >= 0.5 else None
+        halves = [np.ptp(band.gap.share_interval) / scale / 2 for band in bands if low <= band.low_Hz < high]
+        half_width = float(np.sqrt(np.sum(np.square(halves))))
+        share = min(-minus_share, 1.0)
+        if share - half_width < _MOST_FOR_CERTAIN:
+            return None
+        return Concentration(low, high, share, half_width)
 
     def even(self, sensor: str) -> bool:
-        """Whether a sensor's gap is spread evenly over all frequencies, as more sensor noise would be."""
-        bands = [b for b in self.bands if b.sensor == sensor]
-        if not all(b.gap.found for b in bands):
+        """Whether a sensor's gap is spread evenly over all frequencies, as more sensor noise would be.
+
+        Chi-square of the bands' mean energies about their mean by width, at 5 %.
+        """
+        bands = [band for band in self.bands if band.sensor == sensor]
+        if not all(band.gap.found for band in bands):
             return False
-        width = np.array([b.high_Hz - b.low_Hz for b in bands])
-        mean = np.array([b.gap.gap_rms**2 for b in bands])
+        width = np.array([band.high_Hz - band.low_Hz for band in bands])
+        energy = np.array([band.gap.gap_rms**2 for band in bands])
         # Half the interval of gap_rms^2 over 1.96 is its standard deviation where the lower end is not cut.
-        sd = np.array([(b.gap.interval[1] ** 2 - b.gap.gap_rms**2) / _Z95 for b in bands])
-        away = (mean - np.sum(width * mean) / np.sum(width)) / np.maximum(sd, 1e-12)
+        deviation = np.array([(band.gap.interval[1] ** 2 - band.gap.gap_rms**2) / _Z95 for band in bands])
+        mean = np.sum(width * energy) / np.sum(width)
+        away = (energy - mean) / np.maximum(deviation, _TINY)
         return bool(np.sum(away**2) < chi2.ppf(0.95, len(bands) - 1))
