@@ -91,7 +91,8 @@ class Shares:
     """What effects carry of the gap of a machine with a model error, on held-out records.
 
     names : of the outputs. before, after : RMS left beyond sensor noise over that of the motion, per output:
-        nominal values re-estimated, effects added. interests : share of the motion from which on a gap does.
+        nominal values re-estimated, effects added; 1 where as much as the motion is left or more. interests :
+        share of the motion from which on a gap does.
     carried : effect of the repaired model, small ones too -> (share of the gap's energy beyond noise that it
         closes, whatever the order in which effects are added, with its 95 % interval).
     small : effects in the repaired model that carry less than what interests.
@@ -101,7 +102,8 @@ class Shares:
     in_windows : the answer rests on windows, each from the state that fits it best (`fit.windows`), and so do
         all residuals and shares of it.
     horizon_samples : length of these, and horizon_before, horizon_after : what is left in them, as before and
-        after; 0 and empty for a machine that forgets its inputs.
+        after; 0 and empty for a machine that forgets its inputs. horizon_closed : share of the gap that the
+        effects close in them, none above 1; nan without a gap there.
     """
 
     names: tuple[str, ...]
@@ -117,12 +119,7 @@ class Shares:
     horizon_samples: int = 0
     horizon_before: tuple[float, ...] = ()
     horizon_after: tuple[float, ...] = ()
-
-    @property
-    def horizon_closed(self) -> float:
-        """Share of the gap that the effects close in the windows; nan without a gap there."""
-        before, after = (float(np.sum(np.square(s))) for s in (self.horizon_before, self.horizon_after))
-        return min(1 - after / before, 1.0) if before > 0 else float("nan")
+    horizon_closed: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -414,13 +411,21 @@ def remarks(
 
 def left_of(case: CaseOfMachine, residuals: Mapping[str, Real]) -> tuple[Real, Real]:
     """(Y,) share of the motion, and (Y,) RMS in the outputs' units, that whitened residuals of validation
-    records (T, Y) have beyond sensor noise and rounding. The motion: RMS about the mean of a record."""
+    records (T, Y) have beyond sensor noise and rounding. The motion: RMS about the mean of a record.
+
+    A share is 1 where as much as the motion is left or more: of an output that hardly moves a model may miss
+    any multiple.
+    """
     held, rounding = case.held_out, rounding_effect(case)
     samples = sum(len(e.output) for e in held)
     white = 1.0 + (0.0 if rounding is None else rounding.variances / case.noise**2)
     energy = np.sum([np.sum(residuals[e.name] ** 2, axis=0) for e in held], axis=0)
     rms = case.noise * _beyond(energy / samples, white, samples)
-    return rms / np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples), rms
+    motion = np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # An output that stands still: all of what is left, or nothing.
+        shares = np.where(rms > 0, np.minimum(rms / motion, 1.0), 0.0)
+    return shares, rms
 
 
 def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:
@@ -433,13 +438,10 @@ def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[
     """What a model leaves, as `Completeness` says it.
 
     probability : that no more than the threshold remains. residuals : whitened (T, Y), of every record.
-
-    A share is 1 where as much as the motion is left or more: of an output that hardly moves a model may miss
-    any multiple.
     """
     names = case.machine.output_names
     shares, rms = left_of(case, residuals)
-    remains = {name: min(float(share), 1.0) for name, share in zip(names, shares, strict=True)}
+    remains = {name: float(share) for name, share in zip(names, shares, strict=True)}
     in_units = {name: float(size) for name, size in zip(names, rms, strict=True)}
     return Completeness(float(probability), case.machine.weighing.model_error, remains, in_units)
 

@@ -67,8 +67,8 @@ def shares_of(
     held_out = search.held_out
     return Shares(
         names=tuple(search.case.machine.output_names),
-        before=tuple(map(float, held_out.rms_shares(nominal.held_out_residuals))),
-        after=tuple(map(float, held_out.rms_shares(repaired.held_out_residuals))),
+        before=_no_more_than_all(held_out.rms_shares(nominal.held_out_residuals)),
+        after=_no_more_than_all(held_out.rms_shares(repaired.held_out_residuals)),
         interests=search.case.machine.weighing.model_error,
         carried=_carried_by_each(search, names, repaired, nominal, rng),
         small=tuple(name for name in names if name not in matter),
@@ -143,11 +143,23 @@ def _over_horizon(search: Search, repaired: Explanation, nominal: Explanation) -
     if search.drift_free_windows is None:
         return {}
     windows = Records(search.case, search.case.held_out, search.drift_free_windows)
+    before = windows.rms_shares(nominal.held_out_residuals)
+    after = windows.rms_shares(repaired.held_out_residuals)
+    energy_before = float(np.sum(before**2))
+    closed = float("nan")
+    if energy_before > 0:
+        closed = min(1 - float(np.sum(after**2)) / energy_before, 1.0)
     return {
         "horizon_samples": search.drift_free_windows.samples,
-        "horizon_before": tuple(map(float, windows.rms_shares(nominal.held_out_residuals))),
-        "horizon_after": tuple(map(float, windows.rms_shares(repaired.held_out_residuals))),
+        "horizon_before": _no_more_than_all(before),
+        "horizon_after": _no_more_than_all(after),
+        "horizon_closed": closed,
     }
+
+
+def _no_more_than_all(shares: Real) -> tuple[float, ...]:
+    """Shares (Y,) of the motion; 1 of an output of which a model misses more than its motion."""
+    return tuple(map(float, np.minimum(shares, 1.0)))
 
 
 def _blocks(search: Search, explanation: Explanation) -> Real:

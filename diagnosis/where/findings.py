@@ -65,11 +65,12 @@ class PartGap:
     gap_rms : float. Root mean square of the gap itself in noise standard deviations, the noise taken off:
         sqrt(max(mean e^2 - 1, 0)). 0 where the part holds no more than noise.
     interval : (low, high). 95 % for gap_rms; what sensor noise moves, the gap being what it is.
-    share : float. Of the gap energy of all records; shares of disjoint parts sum to 1 (a part below its noise
-        counts negative, a little). 0 when there is no gap at all.
-    share_interval : (low, high). 95 %.
+    share : float. Of the gap energy of all records, 0 to 1; shares of disjoint parts sum to 1 but for noise.
+        0 where there is no gap at all.
+    share_interval : (low, high). 95 %, cut to 0 and 1.
     p_value : float. Chance of as much energy from noise alone.
     found : bool
+    share_deviation : float. Standard deviation of the share, that is not cut.
     """
 
     gap_rms: float
@@ -78,6 +79,7 @@ class PartGap:
     share_interval: Interval
     p_value: float
     found: bool
+    share_deviation: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -350,7 +352,8 @@ class AmplitudeFinding:
 class LinearCorrection:
     """Share of the gap energy that any linear correction from voltage to sensors takes away.
 
-    Fitted on the estimation records, judged on the held-out ones: `share` with a 95 % interval.
+    Fitted on the estimation records, judged on the held-out ones: `share` with a 95 % interval, both cut to 0
+    and 1. One that makes the held-out error larger takes nothing away.
     """
 
     share: float
@@ -479,7 +482,7 @@ class Where:
         count, minus_share, low, high = min(runs, default=(len(shares), 0.0, 0.0, 0.0))
         if count == len(shares):
             return None
-        halves = [np.ptp(band.gap.share_interval) / scale / 2 for band in bands if low <= band.low_Hz < high]
+        halves = [_Z95 * band.gap.share_deviation / scale for band in bands if low <= band.low_Hz < high]
         half_width = float(np.sqrt(np.sum(np.square(halves))))
         share = min(-minus_share, 1.0)
         if share - half_width < _MOST_FOR_CERTAIN:

@@ -24,6 +24,9 @@ _Z95 = float(norm.ppf(0.975))
 _EDGES_HZ = tuple(m * 10.0**k for k in range(-4, 6) for m in (1.0, 3.0))
 # Lines of the cosine transform in the lowest band: fewer are filled by an offset and a drift alone.
 _LEAST_LINES = 3
+# Standard deviations below its noise from which on a part counts as without a gap in shares: no band of noise
+# comes there. Chosen; doubled, a part of two hundred values with no energy at all is still taken off.
+_BELOW_NOISE = 4.0
 # The highest band begins at this share of the Nyquist frequency at the latest, so that it is wide enough for
 # a comparison. Chosen; with half of it three pages of five have one band less.
 _HIGHEST_BAND_BEGINS = 0.6
@@ -67,6 +70,20 @@ def total(parts: Sequence[Energy]) -> Energy:
     return Energy(sum(p.squares for p in parts), sum(p.count for p in parts))
 
 
+def total_gap(parts: Sequence[Energy]) -> Energy:
+    """Energy of parts whose gaps add up, for shares of their gap.
+
+    A part below its noise beyond chance has more noise stated than it shows, or none of what a model may
+    miss: it counts as one without a gap. Its missing energy would otherwise be taken off the gap of the
+    others, whose shares grow above one without a bound.
+    """
+    counted = []
+    for part in parts:
+        below_noise = part.gap < -_BELOW_NOISE * np.sqrt(2.0 * part.count)
+        counted.append(Energy(float(part.count), part.count) if below_noise else part)
+    return total(counted)
+
+
 def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
     """The gap of a part of the whole, found if its p-value lies below `level`.
 
@@ -80,8 +97,7 @@ def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
     Notes
     -----
     The interval of the share is by the delta method for two independent energies, the part and what is
-    beside it. The share is not cut to 0 and 1: a part with less energy than noise counts a little below zero,
-    so that shares of disjoint parts sum to one.
+    beside it; share and interval are cut to 0 and 1.
     """
     half = _Z95 * np.sqrt(part.variance)
 
@@ -90,26 +106,31 @@ def part_gap(part: Energy, whole: Energy, level: float) -> PartGap:
 
     # Without a gap beyond chance there is nothing to take a share of.
     share = 0.0
-    interval = (0.0, 0.0)
+    deviation = 0.0
     if whole.gap > _Z95 * np.sqrt(2.0 * whole.count):
         share = part.gap / whole.gap
         variance_beside = max(whole.variance - part.variance, 0.0)
         deviation = np.sqrt((1 - share) ** 2 * part.variance + share**2 * variance_beside) / whole.gap
-        interval = (float(share - _Z95 * deviation), float(share + _Z95 * deviation))
     return PartGap(
         gap_rms=rms(part.gap),
         interval=(rms(part.gap - half), rms(part.gap + half)),
-        share=float(share),
-        share_interval=interval,
+        share=_cut(share),
+        share_interval=(_cut(share - _Z95 * deviation), _cut(share + _Z95 * deviation)),
         p_value=part.p_value,
         found=bool(part.p_value < level),
+        share_deviation=float(deviation),
     )
+
+
+def _cut(share: float) -> float:
+    """A share between 0 and 1."""
+    return float(np.clip(share, 0.0, 1.0))
 
 
 def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: float) -> tuple[SensorGap, ...]:
     """Gap of every sensor over all experiments; residuals (T, Y) by experiment, one level for all sensors."""
     energies = [Energy.of(e[:, s] for e in residuals.values()) for s in range(len(sensors))]
-    whole = total(energies)
+    whole = total_gap(energies)
     return tuple(
         SensorGap(sensor, part_gap(energy, whole, level / len(sensors)))
         for sensor, energy in zip(sensors, energies, strict=True)
@@ -119,7 +140,7 @@ def sensor_gaps(residuals: Mapping[str, Real], sensors: Sequence[str], level: fl
 def experiment_gaps(residuals: Mapping[str, Real], level: float) -> tuple[ExperimentGap, ...]:
     """Gap of every experiment, all sensors together and each; residuals (T, Y), one level for all tests."""
     energies = {name: [Energy.of([column]) for column in e.T] for name, e in residuals.items()}
-    whole = total([energy for parts in energies.values() for energy in parts])
+    whole = total_gap([energy for parts in energies.values() for energy in parts])
     tests = sum(1 + len(parts) for parts in energies.values())
     gaps = []
     for name, parts in energies.items():
@@ -169,7 +190,7 @@ def band_gaps(
             squares[s] += np.bincount(band, weights=spectrum[:, s], minlength=counts.size)
 
     energies = [[Energy(float(v), int(n)) for v, n in zip(row, counts, strict=True)] for row in squares]
-    whole = total([energy for row in energies for energy in row])
+    whole = total_gap([energy for row in energies for energy in row])
     return tuple(
         BandGap(sensor, edges[b], edges[b + 1], part_gap(energy, whole, level / squares.size))
         for sensor, row in zip(sensors, energies, strict=True)

@@ -227,9 +227,10 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         gap = float(np.trace(products)) - n * length
         shares = np.zeros(energy.size)
         if gap > _CLEAR_OF_CHANCE * np.sqrt(2.0 * n * length):
-            shares = (energy - length) / gap
+            # The mean's noise can make it more than the gap, or less than nothing.
+            shares = np.clip((energy - length) / gap, 0.0, 1.0)
         share = float(shares[0])
-        by_chance = max(float(np.max(shares[1:])), 0.0)
+        by_chance = float(np.max(shares[1:]))
         beyond_noise = p_value < level / len(case.outputs)
 
         power = np.abs(np.fft.rfft(e[:, :, s].mean(axis=0))) ** 2
@@ -309,8 +310,8 @@ def linear_correction(case: Case, residuals: Mapping[str, Real]) -> LinearCorrec
         predicted_energy += float(np.sum(prediction**2))
     # e = gap + noise: the energy taken, 2 e.p - p.p, moves with the noise by 2 |p|.
     half = _Z95 * 2 * np.sqrt(predicted_energy) / gap
-    share = taken / gap
-    return LinearCorrection(share, (float(share - half), float(share + half)))
+    share, low, high = np.clip(taken / gap + np.array([0.0, -half, half]), 0.0, 1.0)
+    return LinearCorrection(float(share), (float(low), float(high)))
 
 
 def _columns(poles: Poles, voltage: Real) -> Real:

@@ -364,6 +364,55 @@ def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():
     assert not where(case, {name: e[:, None] / 4 for name, e in tone.items()}).is_gap
 
 
+def _shares_of(found):
+    """All shares that a page may show, with the ends of their intervals."""
+    gaps = [found.gap, *(s.gap for s in found.sensors), *(b.gap for b in found.bands)]
+    gaps += [g for x in found.experiments for g in (x.gap, *x.sensors)]
+    shares = [value for g in gaps for value in (g.share, *g.share_interval)]
+    shares += [c.share for c in found.common] + [d.share for d in found.drift]
+    shares += [d.share for d in found.dependences]
+    if found.linear is not None:
+        shares += [found.linear.share, *found.linear.interval]
+    runs = [found.concentration(), *(found.concentration(s.sensor) for s in found.sensors)]
+    return np.array(shares + [run.share for run in runs if run is not None])
+
+
+def _less_noise_than_stated(name, T):
+    """A tip sensor with a tenth of the noise that is stated; the white part of `_gap` has all of it."""
+    tip = -0.9 * white(np.random.default_rng(5))[name][:, 1]
+    return np.column_stack([0.6 * np.sin(0.3 * np.arange(T)), tip])
+
+
+def _only_in_one_record(name, T):
+    """What a correction of the estimation records makes worse in the held-out one."""
+    voltage = inputs()[name]
+    sign = -1.0 if name == "fresh" else 1.0
+    return np.column_stack([sign * lfilter([0.5], [1, -0.95], voltage), np.zeros(T)])
+
+
+def _same_everywhere(name, T):
+    return np.column_stack([2.0 * np.sin(0.1 * np.arange(T)), 0.01 * np.arange(T)])
+
+
+@pytest.mark.parametrize("shape", [_less_noise_than_stated, _only_in_one_record, _same_everywhere])
+@pytest.mark.parametrize("model_error", [0.0, 0.02])
+def test_shares_lie_between_none_and_all(shape, model_error):
+    residuals = _gap(shape)
+    shares = _shares_of(where(replace(made(residuals), model_error=model_error), residuals))
+    assert np.all((shares >= 0) & (shares <= 1)), shares[(shares < 0) | (shares > 1)]
+
+
+def test_a_sensor_below_its_noise_takes_nothing_off_the_shares_of_others():
+    """Two sensors have gaps of 3 and 1 in energy, a third one none of the noise that is stated."""
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal((4000, 3)) * (1.0, 1.0, 0.0)
+    tones = np.sqrt(2) * np.sin(np.outer(np.arange(4000), (0.3, 0.3, 0.0))) * np.sqrt((3.0, 1.0, 0.0))
+    first, second, third = sensor_gaps({"one": noise + tones}, ("a", "b", "c"), 0.01)
+    assert first.gap.share == pytest.approx(0.75, abs=0.03)
+    assert second.gap.share == pytest.approx(0.25, abs=0.03)
+    assert third.gap.share == 0.0
+
+
 def test_more_noise_than_stated_is_called_that():
     residuals = {name: e * (1.0, 1.5) for name, e in white(np.random.default_rng(12)).items()}
     found = where(made(residuals), residuals)

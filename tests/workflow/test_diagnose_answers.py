@@ -118,7 +118,7 @@ def beside(found: Diagnosis) -> Diagnosis:
     shares = found.shares and replace(
         found.shares, small=("gravity",), silent=(name,), not_tried=("backlash",), horizon_samples=50,
         horizon_before=(0.3,) * len(found.shares.names), horizon_after=(0.1,) * len(found.shares.names),
-        carried={**found.shares.carried, "gravity": (0.02, 0.01, 0.03)},
+        horizon_closed=0.89, carried={**found.shares.carried, "gravity": (0.02, 0.01, 0.03)},
     )  # fmt: skip
     second = replace(others[0], name="gravity", presence=0.3, probability=0.0)
     return replace(
