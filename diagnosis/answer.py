@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from diagnosis.fit.residual import pooled_rms
-from diagnosis.machine.machine_protocol import CaseOfMachine, Real
+from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from ident.data.shown import Shown
@@ -30,8 +30,12 @@ SURE, POSSIBLE = 0.8, 0.05
 _PINNED, _WIDE = 1e-3, 0.9
 # Of the bootstrap of the share closed: draws, samples of a block.
 _BLOCKS, BLOCK = 2000, 50
-# Standard deviations by which energies exceed that of noise, or it is noise.
+# Standard deviations by which energies exceed that of noise, or it is noise: one in a thousand records of
+# noise is above.
 _CHANCE = 3.0
+# Times the noise that an output has to move in a record for a share of its motion to mean anything. Chosen;
+# doubled, records whose motion is a tenth noise are passed over.
+_MOVES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,21 +73,44 @@ class NamedEffect:
 class Completeness:
     """Whether the effects of the repaired model are all, whichever they are.
 
-    probability : that no more than the threshold remains. threshold : share of the motion; 0 where the
-        simulation is to be as good as the sensors.
-    remains : output -> share of the motion (RMS about its mean) that remains beyond sensor noise in
-        validation records. in_units : the same in the output's unit.
+    Attributes
+    ----------
+    probability : float
+        That no more than the threshold remains, from all records.
+    threshold : float
+        Share of the motion; 0 where the simulation is to be as good as the sensors.
+    remains : output -> float
+        Share of the motion (RMS about its mean), 0 to 1, that remains beyond sensor noise in validation
+        records.
+    in_units : output -> float
+        What remains there in the output's unit, RMS.
+    in_record : str
+        The record, validation or not, of whose motion most remains.
+    remains_in_record : output -> float
+        Share of that record's own motion that remains in it.
     """
 
     probability: float
     threshold: float
     remains: Mapping[str, float]
     in_units: Mapping[str, float]
+    in_record: str = ""
+    remains_in_record: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def most(self) -> float:
-        """Of the output that shows most."""
+        """Share of the output that shows most in validation records."""
         return max(self.remains.values())
+
+    @property
+    def most_in_record(self) -> float:
+        """Share of the output that shows most in the record that is furthest off."""
+        return max(self.remains_in_record.values(), default=self.most)
+
+    @property
+    def above_elsewhere(self) -> bool:
+        """Whether validation records stay below the threshold, and another record does not."""
+        return self.most < self.threshold <= self.most_in_record
 
 
 @dataclass(frozen=True)
@@ -409,19 +436,35 @@ def remarks(
     return found
 
 
-def left_of(case: CaseOfMachine, residuals: Mapping[str, Real]) -> tuple[Real, Real]:
-    """(Y,) share of the motion, and (Y,) RMS in the outputs' units, that whitened residuals of validation
-    records (T, Y) have beyond sensor noise and rounding. The motion: RMS about the mean of a record.
+def left_of(
+    case: CaseOfMachine, residuals: Mapping[str, Real], records: Sequence[RecordOfMachine] | None = None
+) -> tuple[Real, Real]:
+    """Share of the motion, and size, of what a model leaves beyond sensor noise and rounding.
 
-    A share is 1 where as much as the motion is left or more: of an output that hardly moves a model may miss
-    any multiple.
+    Parameters
+    ----------
+    case : CaseOfMachine
+    residuals : record -> (T, Y) array
+        (measured - model) / noise.
+    records : sequence, optional
+        Those that count, together; by default the validation records.
+
+    Returns
+    -------
+    shares : (Y,) array
+        Of the motion, RMS about the mean of a record; 1 where as much as the motion is left or more, for of
+        an output that hardly moves a model may miss any multiple.
+    rms : (Y,) array
+        In the outputs' units.
     """
-    held, rounding = case.held_out, rounding_effect(case)
-    samples = sum(len(e.output) for e in held)
-    white = 1.0 + (0.0 if rounding is None else rounding.variances / case.noise**2)
-    energy = np.sum([np.sum(residuals[e.name] ** 2, axis=0) for e in held], axis=0)
+    records = case.held_out if records is None else records
+    rounding = rounding_effect(case)
+    samples = sum(len(record.output) for record in records)
+    white = np.ones(case.noise.size) if rounding is None else 1.0 + rounding.variances / case.noise**2
+    energy = np.sum([np.sum(residuals[record.name] ** 2, axis=0) for record in records], axis=0)
     rms = case.noise * _beyond(energy / samples, white, samples)
-    motion = np.sqrt(sum(len(e.output) * np.var(e.output, axis=0) for e in held) / samples)
+    moved = sum(len(record.output) * np.var(record.output, axis=0) for record in records)
+    motion = np.sqrt(moved / samples)
     with np.errstate(divide="ignore", invalid="ignore"):
         # An output that stands still: all of what is left, or nothing.
         shares = np.where(rms > 0, np.minimum(rms / motion, 1.0), 0.0)
@@ -437,13 +480,32 @@ def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:
 def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[str, Real]) -> Completeness:
     """What a model leaves, as `Completeness` says it.
 
-    probability : that no more than the threshold remains. residuals : whitened (T, Y), of every record.
+    Parameters
+    ----------
+    case : CaseOfMachine
+    probability : float
+        That no more than the threshold remains.
+    residuals : record -> (T, Y) array
+        Of every record, (measured - model) / noise.
     """
     names = case.machine.output_names
     shares, rms = left_of(case, residuals)
-    remains = {name: float(share) for name, share in zip(names, shares, strict=True)}
-    in_units = {name: float(size) for name, size in zip(names, rms, strict=True)}
-    return Completeness(float(probability), case.machine.weighing.model_error, remains, in_units)
+    by_record: dict[str, dict[str, float]] = {}
+    for record in case.experiments:
+        of_record, _ = left_of(case, residuals, [record])
+        # An output that rests in a record has no motion to take a share of.
+        moves = np.std(record.output, axis=0) > _MOVES * case.noise
+        of_record = np.where(moves, of_record, 0.0)
+        by_record[record.name] = dict(zip(names, map(float, of_record), strict=True))
+    furthest_off = max(by_record, key=lambda name: max(by_record[name].values()))
+    return Completeness(
+        probability=float(probability),
+        threshold=case.machine.weighing.model_error,
+        remains=dict(zip(names, map(float, shares), strict=True)),
+        in_units=dict(zip(names, map(float, rms), strict=True)),
+        in_record=furthest_off,
+        remains_in_record=by_record[furthest_off],
+    )
 
 
 def share_closed(

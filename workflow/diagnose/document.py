@@ -19,7 +19,7 @@ def completeness_of(found: Diagnosis, remains: Where) -> dict[str, Any]:
     """Whether the effects are all, what remains, and between which frequencies most of it lies."""
     run = remains.concentration() if remains.is_gap else None
     mostly = None if run is None else (run.low_Hz, run.high_Hz)
-    return {**codec.plain(found.completeness), "mostly_Hz": mostly, "in_record": found.worst_experiment[0]}
+    return {**codec.plain(found.completeness), "mostly_Hz": mostly}
 
 
 def document_of(
