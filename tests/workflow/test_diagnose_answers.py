@@ -7,6 +7,7 @@ simulation, with all that an answer may hold beside and without it. Nothing is s
 import json
 import re
 from dataclasses import replace
+from html import escape
 from itertools import product
 from typing import get_args, get_type_hints
 
@@ -25,9 +26,10 @@ from plant.effects.joint import GroundSpring
 from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.diagnose import command, outputs, pages
+from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.fleet import FleetMachine
-from workflow.diagnose.following import Following
+from workflow.diagnose.following import Following, following
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.text.templates import RunSummary, environment
@@ -225,20 +227,88 @@ def test_every_verdict_is_drawn_with_every_proposal(loaded, monkeypatch, kind):
         assert (document["verdict"], document["detail_verdict"]) == (verdict, detail)
         assert document["next_experiment"]["advice"] == coming.advice
         values = dict(rows)
-        decides = values.get("to decide", "")
-        assert bool(decides) == (detail == "ambiguous")
-        repeat = coming.repeat
-        if decides and repeat and repeat.separates:
-            assert decides.startswith(f"repeat {repeat.record} ")
-            assert f"Repeat {repeat.record} " in page
-        elif decides:
-            written = bool(kind != "own" and coming.proposal and coming.proposal.separates)
-            assert written == decides.startswith("run found/")
+        # One advice, the same words everywhere.
+        words = document["next_experiment"]["words"]
+        assert values["next"] == words[0]
+        assert all(escape(sentence) in page for sentence in words)
+        assert (
+            len(re.findall("No further experiment is needed|before you record again", " ".join(words))) <= 1
+        )
+        if coming.repeat and coming.repeat.separates:
+            assert words[0].startswith(f"Repeat {coming.repeat.record} ")
+        written = bool(coming.proposal and coming.proposal.separates)
+        assert written == (f"run {case.case.name}.next.csv, a chirp" in words[0].lower())
         for text in (page, *values.values()):
             assert not re.search(r"\bUndefined\b|\bNone\b(?! of)|\bnan\b|object at 0x", text)
         assert all(
             doubt in page and doubt in [v for k, v in rows if k == "doubtful"] for doubt in found.doubts
         )
+
+
+SURE = {"ambiguous_with": ()}
+OPEN = {"ambiguous_with": ("unknown",), "detail_verdict": "ambiguous"}
+NONE = {"verdict": "none", "combination": ()}
+
+
+@pytest.mark.parametrize(
+    ("answer", "complete", "advice", "first"),
+    [
+        (SURE, 0.97, "none", "These candidates that were tried need no further experiment"),
+        # More is left than the threshold: something is to be found out, whether effects are named or not.
+        (SURE, 0.1, "repeat_worst", "Repeat a, the worst record,"),
+        ({**NONE, **OPEN}, 0.1, "repeat_worst", "Repeat a, the worst record,"),
+        ({**NONE, **OPEN}, 0.9, "repeat_all", "No other candidate effect is left."),
+        (OPEN, 0.97, "look", "Check the machine before you record again. These records leave"),
+        ({"detail_verdict": "not_converged"}, 0.97, "time", "Check units, columns and nominal values"),
+        ({**OPEN, "detail_verdict": "not_converged"}, 0.1, "time", "Check units, columns"),
+    ],
+)
+def test_one_advice_follows_from_an_answer(loaded, answer, complete, advice, first):
+    _, found = loaded["own"]
+    completeness = replace(
+        found.completeness, probability=complete, in_record="a", remains_in_record={"x_m": 0.3}
+    )
+    found = replace(found, **answer, completeness=completeness)
+    coming = following(found)
+    words = advice_words(found, coming)
+    assert coming.advice == advice
+    assert words[0].startswith(first)
+
+
+def test_nobody_calls_a_candidate_ruled_out_that_was_not_tried(loaded):
+    _, found = loaded["own"]
+    (last,) = found.effects[-1:]
+    untried = replace(found, effects=(*found.effects, replace(last, name="kv", untried="more time")))
+    tried = replace(found, effects=tuple(replace(effect, untried="") for effect in found.effects))
+    (all_of_them,), (some,) = (advice_words(one, Following("none")) for one in (tried, untried))
+    assert "every other candidate" in all_of_them
+    assert "others were not tried" in some
+
+
+@pytest.mark.parametrize(
+    ("separations", "same", "first", "without"),
+    [
+        (
+            [7.0],
+            4.0,
+            "separate dry friction from backlash by 7 times the threshold, as it was by 4 at",
+            "No record",
+        ),
+        # How small the noise is says nothing about how different answers are.
+        ([4.5e13], 4.4e13, "by more than 20 times the threshold, as it was by more than 20 at most", "e+13"),
+        ([0.3], 0.2, "No record repeated, as it was or changed, separates them: by 0.3 times", "at another"),
+        ([2.9, 2.0], 0.2, "separates them: by 2.9 times the threshold at most", "Repeat"),
+    ],
+)
+def test_a_record_to_repeat_is_advised_or_said_to_tell_nothing(loaded, separations, same, first, without):
+    _, found = loaded["own"]
+    pairs = tuple(Separation(TWO, size, size**2 / 2) for size in separations)
+    parts = any(pair.separated for pair in pairs)
+    repeat = Repeat("a", "third", pairs, (Separation(TWO, same, same**2 / 2),), parts)
+    words = advice_words(replace(found, ambiguous_with=("unknown",)), Following("look", repeat=repeat))
+    assert first in words[0]
+    assert without not in words[0]
+    assert words[0].startswith("Repeat a at a third of its size" if parts else "Check the machine")
 
 
 @pytest.mark.parametrize(

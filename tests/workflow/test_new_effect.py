@@ -63,7 +63,7 @@ def test_every_page_has_the_words_of_its_class(tmp_path, undrawn, check, engine,
     assert in_words("wind_drag") == "a sail at the hub"
     assert "sail at the hub" in words
     asked = document["next_experiment"]["advice"] == "look"
-    assert ("For a sail at the hub: take the sail off" in words) == (asked and check is not None)
+    assert ("Check for a sail at the hub: take the sail off" in words) == (asked and check is not None)
     if engine.effects == (WIND,):
         assert parse_effects(tomllib.loads(files["arm.effects.toml"].decode())["effects"]) == parse_effects(
             [WIND]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from workflow.diagnose.advice import advice_words
 from workflow.diagnose.following import following
 from workflow.diagnose.pages import plant_page, remains_of
 
@@ -57,12 +58,12 @@ def test_the_guide_runs_and_its_page_says_what_was_found(tmp_path, faults_seen):
     with pytest.raises(ValueError, match=r"state the plant's sampling period \(Plant\(dt_s=...\)\)"):
         remains_of(unsampled)
     quiet = replace(found, noise_below_stated=(("speed_rad_s", 0.05, 0.5),))
-    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(quiet, following(quiet))).split())
+    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(quiet, advice_words(quiet, following(quiet)))).split())
     assert page.count("the noise they show is used: speed 0.05 rad/s (specified: 0.5 rad/s).") == 1
     # Of two effects of the repaired model the one that may carry less than the threshold is not left out.
     doubtful = tuple(replace(e, presence=0.24) if e.name == "output_offset" else e for e in found.effects)
     beside = replace(found.shares, small=("output_offset",))
     alone = replace(found, combination=("input_delay",), effects=doubtful, shares=beside, ambiguous_with=())
-    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(alone, following(alone))).split())
+    page = " ".join(re.sub(r"<[^>]+>", " ", plant_page(alone, advice_words(alone, following(alone)))).split())
     assert page.count("; the repaired model also has output offset (not certain: 24 %)") == 1
     assert "With the effects added, every experiment is below the threshold of" in page

@@ -1,4 +1,4 @@
-"""The experiment to run next, for the answers that one case leaves."""
+"""What to do next for the answers that one case leaves: `advice_words` (advice.py) says it."""
 
 from __future__ import annotations
 
@@ -18,23 +18,38 @@ from workflow.diagnose.document import LEAST_SHOWN
 from workflow.engine import storage
 from workflow.text.formats import listing
 
-_SHORTEST = 200  # samples
+# Samples of a proposed experiment at least, however short the records are: two periods of a hundred, which
+# is what `excitations` needs.
+_SHORTEST = 200
 # From this probability on an effect is looked for at the machine first, though an unknown cause is likelier.
+# Chosen; a look costs less than a record.
 _LOOKED_FOR = 0.2
+# Below this probability that no more than the threshold remains, something else is there as likely as not.
+_COMPLETE = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Following:
-    """What to run next and why.
+    """What to do next, and the experiment or record that it names.
 
-    advice: look at the machine for the unlisted cause (confirm); repeat the worst experiment, or all of them,
-    to see what an unknown cause follows; nothing (none); the proposal, which separates the competing ones;
-    a look at the machine for every cause left (look), where no simulation can show that they separate, or
-    where one is likely though an unknown cause is likelier.
-    repeat : of one's own machine, the record that separates the competing ones.
+    Attributes
+    ----------
+    advice : str
+        "time": nothing was tried, or the fit did not converge. "confirm": look at the machine for the
+        unlisted cause.
+        "repeat_worst": repeat the record with most error otherwise, to see what an unknown cause follows;
+        "repeat_all": repeat all, for what they have in common. "none": nothing. "separate": run the proposal,
+        which separates the competing answers. "look": look at the machine for every cause left, or repeat
+        the record that separates them.
+    proposal : NextExperiment or None
+        Of "separate" only.
+    competing : tuple of CompetingHypothesis
+        Answers that are left, in words.
+    repeat : Repeat or None
+        Of one's own machine, the record that separates the competing ones best.
     """
 
-    advice: Literal["confirm", "repeat_worst", "repeat_all", "none", "separate", "look"]
+    advice: Literal["time", "confirm", "repeat_worst", "repeat_all", "none", "separate", "look"]
     proposal: NextExperiment | None = None
     competing: tuple[CompetingHypothesis, ...] = ()
     repeat: Repeat | None = None
@@ -58,27 +73,52 @@ class Following:
 
 
 def following(found: Diagnosis) -> Following:
-    """As long as the longest record, within the largest voltage, angle and deflection of all of them."""
+    """The one advice for an answer.
+
+    A proposed experiment is as long as the longest record, within the largest voltage, angle and deflection
+    of all of them.
+    """
+    if found.detail_verdict == "not_converged" or found.nothing_tried:
+        return Following("time")
+
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
         if found.unlisted:
             return Following("confirm")
         likely = {name for name in found.ambiguous_with if found.presence(name) >= _LOOKED_FOR} - {"none"}
         return Following("look" if likely else "repeat_worst")
-    # By name; a second one only where it is thinkable at all or fits as well.
-    competing = tuple(
-        replace(one, name=listing([in_words(cause) for cause in one.causes] or [in_words("none")]))
-        for k, one in enumerate(found.competing)
-        if k == 0
-        or one.probability >= LEAST_SHOWN
-        or any(cause in found.ambiguous_with for cause in one.causes)
-    )
-    if not isinstance(found.case, Case) or (found.case.model_error > 0 and len(competing) < 2):
-        # Of a machine of one's own nobody has said what it can be asked for.
-        repeat = best_repeat(found.case, competing) if len(competing) > 1 else None
-        return Following("look" if found.ambiguous_with else "none", competing=competing, repeat=repeat)
-    if len(competing) < 2:
-        return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")
-    longest = max(e.voltage_V.size for e in found.case.experiments)
-    proposal = next_experiment(competing, Limits.of_records(found.case), n_samples=max(longest, _SHORTEST))
-    return Following("separate", proposal, competing)
+
+    competing = _competing(found)
+    has_limits = isinstance(found.case, Case) and not found.case.model_error > 0
+    if has_limits and len(competing) < 2:
+        return _without_rivals(found)
+    if isinstance(found.case, Case) and len(competing) > 1:
+        longest = max(e.voltage_V.size for e in found.case.experiments)
+        limits = Limits.of_records(found.case)
+        proposal = next_experiment(competing, limits, n_samples=max(longest, _SHORTEST))
+        return Following("separate", proposal, competing)
+
+    # Of a machine of one's own nobody has said what it can be asked for: a record is repeated.
+    named_rivals = set(found.ambiguous_with) - {"unknown"}
+    if not named_rivals and not (found.combination and found.ambiguous_with):
+        return _without_rivals(found)
+    repeat = best_repeat(found.case, competing) if len(competing) > 1 else None
+    return Following("look", competing=competing, repeat=repeat)
+
+
+def _competing(found: Diagnosis) -> tuple[CompetingHypothesis, ...]:
+    """Fitted answers in words; a second one only where it is thinkable at all or fits as well."""
+    competing = []
+    for k, hypothesis in enumerate(found.competing):
+        is_open = any(cause in found.ambiguous_with for cause in hypothesis.causes)
+        if k == 0 or hypothesis.probability >= LEAST_SHOWN or is_open:
+            causes = [in_words(cause) for cause in hypothesis.causes] or [in_words("none")]
+            competing.append(replace(hypothesis, name=listing(causes)))
+    return tuple(competing)
+
+
+def _without_rivals(found: Diagnosis) -> Following:
+    """Where no other named answer is left: more records for what is no name, or none."""
+    if found.completeness.probability < _COMPLETE:
+        return Following("repeat_worst")
+    return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")

@@ -14,13 +14,14 @@ from diagnosis.answer import Diagnosis
 from diagnosis.machine.telling import telling
 from diagnosis.where.where import where, where_in_records
 from plant.rig import Rig
+from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.check import of_case
 from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import completeness_of, document_of
 from workflow.diagnose.following import following
-from workflow.diagnose.pages import case_page, moved, plant_page, remains_of
+from workflow.diagnose.pages import case_page, moved, plant_page, remains_of, shown
 from workflow.diagnose.simulator_case import SimulatorCase, with_units
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
@@ -73,6 +74,7 @@ def _of_rig(
         remains = remains_of(found)
         report(_DIAGNOSED, "next experiment")
         coming = following(found)
+        advice = advice_words(shown(found), coming)
         report(_DIAGNOSED, "controller")
         check, no_check = _control(found) if controller else (None, "not_asked")
     rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
@@ -87,6 +89,7 @@ def _of_rig(
         where=place,
         remains=remains,
         next_experiment=coming,
+        advice=advice,
         check=check,
         no_check=no_check,
         rig_text=rig,
@@ -101,7 +104,7 @@ def _of_rig(
         "where": place,
         "remains": remains,
         "completeness": completeness_of(found, remains),
-        "next_experiment": {"advice": coming.advice, **codec.plain(coming.proposal or {})},
+        "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.proposal or {})},
         "controller": {"skipped": no_check} if check is None else check.document(),
     }
     return beside, files
@@ -110,22 +113,26 @@ def _of_rig(
 def _of_simulator(
     loaded: SimulatorCase, found: Diagnosis, out: Path
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The same."""
-    name, coming, files = loaded.case.name, following(found), dict[str, bytes]()
+    """What the answer says beside the diagnosis of a simulation, and the files beside the answer."""
+    name = loaded.case.name
+    files: dict[str, bytes] = {}
+    coming = following(found)
+    advice = advice_words(shown(found), coming)
     place = where_in_records(found.case, found.residuals_refit, found.case.dt_s)
     remains = remains_of(found)
     told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
     if loaded.repaired is not None:
         files[f"{name}.xml"] = loaded.repaired(found, out).encode()
     files[f"{name}.html"] = plant_page(
-        found, coming, told, loaded.model_error, *files, places=(place, remains)
+        found, advice, told, loaded.model_error, *files, places=(place, remains)
     ).encode()
     beside = {
         "where": place,
         "remains": remains,
         "completeness": completeness_of(found, remains),
-        "next_experiment": {"advice": coming.advice, **codec.plain(coming.repeat or {})},
-        "check": told.numbers,
+        "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.repeat or {})},
+        # What records can tell advises more records, whatever the answer; the answer has its own advice.
+        "check": {name: value for name, value in told.numbers.items() if name != "advice"},
     }
     return beside, files
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from importlib import metadata
 from math import copysign
@@ -13,12 +13,11 @@ from typing import Any
 import numpy as np
 
 from diagnosis.answer import Diagnosis, left_of
-from diagnosis.machine.own_plant import Plant, PlantCase
+from diagnosis.machine.own_plant import PlantCase
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.where.findings import Where
 from diagnosis.where.where import motion_of, over_levels, where, where_in_records
 from plant.effects import EFFECTS
-from workflow.diagnose.following import Following
 from workflow.diagnose.stick_figures import moving_figures
 from workflow.diagnose.words import FILTERS
 from workflow.report.rendering import render_page
@@ -29,8 +28,8 @@ def case_page(found: Diagnosis, progress: Callable[[float, str], None] | None = 
     """One self-contained HTML page; equal content gives equal bytes.
 
     page: the loaded case; where the gap is when the nominal parameters are re-estimated within their
-    tolerances, and what remains of it; next_experiment; the controller's check, or None and no_check, why;
-    rig_text and effects_text of the files.
+    tolerances, and what remains of it; next_experiment, and its advice in words; the controller's check, or
+    None and no_check, why; rig_text and effects_text of the files.
     """
     versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "numba")]
     versions.append(("python", sys.version.split()[0]))
@@ -40,19 +39,33 @@ def case_page(found: Diagnosis, progress: Callable[[float, str], None] | None = 
 
 def plant_page(
     found: Diagnosis,
-    coming: Following,
+    advice: Sequence[str],
     told: RunSummary | None = None,
     model_error: float = 0.0,
     repaired: str = "",
     *,
     places: tuple[Where, Where] | None = None,
 ) -> str:
-    """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes. told: what its
-    records can tell (`workflow.diagnose.check`). model_error: as stated. repaired: file of the repaired model
-    beside the page. places: where the error
-    lies and what remains lies, where these are known.
+    """One self-contained HTML page about a `PlantCase`; equal content gives equal bytes.
 
-    Raises ValueError if the plant does not state its sampling period (`where_in_records`).
+    Parameters
+    ----------
+    found : Diagnosis
+    advice : sequence of str
+        On what to do next, in sentences (`advice_words`).
+    told : RunSummary, optional
+        What its records can tell (`workflow.diagnose.check`).
+    model_error : float
+        As specified, a share of the motion.
+    repaired : str
+        File of the repaired model beside the page.
+    places : (Where, Where), optional
+        Where the error lies and where what remains lies; computed where they are not given.
+
+    Raises
+    ------
+    ValueError
+        The plant does not state its sampling period (`where_in_records`).
     """
     dt_s = found.case.dt_s
     numbers = {
@@ -64,7 +77,7 @@ def plant_page(
         "found": found,
         "where": place,
         "remains": remains,
-        "next_experiment": coming,
+        "advice": advice,
         "can_show": told,
         "model_error": model_error,
         "repaired": repaired,
@@ -92,16 +105,8 @@ def _rendered(
         partial=tuple(one for one in (found.shares.closes if found.shares else ()) if one[1] > 0)[:5],
         left=left(found),
         effects=EFFECTS,
-        checks=checks(found),
         **values,
     ).html
-
-
-def checks(found: Diagnosis) -> dict[str, str]:
-    """Effect -> what to do to see whether it is there, as its class says."""
-    machine = found.case.machine
-    kinds = machine.effects if isinstance(machine, Plant) else EFFECTS.values()
-    return {kind.id: kind.check for kind in kinds if kind.check}
 
 
 def shown(found: Diagnosis) -> Diagnosis:

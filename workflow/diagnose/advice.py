@@ -1,0 +1,221 @@
+"""What to do next, in sentences: the one advice that page, terminal and JSON answer give alike.
+
+`following` decides which advice that is, and computes the experiment that it names; `advice_words` says it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from diagnosis.answer import Diagnosis
+from diagnosis.machine.own_plant import Plant
+from diagnosis.next_experiment.next_experiment import NextExperiment, Separation
+from diagnosis.next_experiment.repeat import Repeat
+from plant.effects import EFFECTS, in_words
+from workflow.diagnose.following import Following
+from workflow.diagnose.words import parameter_words, probability_words, setting_words
+from workflow.text.formats import interval, listing, number, si
+from workflow.text.names import stated_name
+
+# Effects whose check at the machine is told. Chosen: whoever reads on has the list of effects.
+_MOST_CHECKED = 4
+# Times the noise or the threshold from which on a separation is no longer told as a number: beyond that it
+# says how small the noise is, not how different the answers are.
+_CLEARLY = 20.0
+_AGAIN = {
+    "same": "as it was",
+    "third": "at a third of its size",
+    "reversed": "with the sign of its inputs changed",
+    "slower": "half as fast",
+}
+
+
+def advice_words(found: Diagnosis, coming: Following) -> tuple[str, ...]:
+    """The advice in sentences, the decision first; never empty.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    coming : Following
+        What `following` decided for it.
+    """
+    return tuple(_ADVICES[coming.advice](found, coming))
+
+
+def _time(found: Diagnosis, coming: Following) -> Iterator[str]:
+    if found.nothing_tried:
+        yield "Give the diagnosis more time (--time-limit) before you record again: nothing was tried."
+    else:
+        yield (
+            "Check units, columns and nominal values before you record again, or give the diagnosis more time"
+            " (--time-limit): its fit did not converge."
+        )
+
+
+def _confirm(found: Diagnosis, coming: Following) -> Iterator[str]:
+    sizes = []
+    for effect in found.unlisted:
+        parameters = [parameter_words(key, value) for key, value in effect.parameters().items()]
+        sizes.append(f"{in_words(effect.id)} ({' and '.join(parameters)})")
+    yield f"Look at the machine for {' and '.join(sizes)}: one run without it would confirm it."
+
+
+def _repeat_worst(found: Diagnosis, coming: Following) -> Iterator[str]:
+    yield _of_worst(found, "Repeat")
+
+
+def _of_worst(found: Diagnosis, begin: str) -> str:
+    """A sentence on the record in which most is left: of its motion, or over the noise."""
+    worst = found.worst_experiment[0]
+    if found.completeness.threshold > 0:
+        worst = found.completeness.in_record or worst
+    return (
+        f"{begin} {worst}, the worst record, at half and twice its amplitude and at another speed. What the"
+        " residual follows shows where to look."
+    )
+
+
+def _repeat_all(found: Diagnosis, coming: Following) -> Iterator[str]:
+    yield (
+        "No other candidate effect is left. Repeat the experiments: what two runs have in common beyond noise"
+        " would be another cause."
+    )
+
+
+def _none(found: Diagnosis, coming: Following) -> Iterator[str]:
+    if found.untried:
+        yield "These candidates that were tried need no further experiment; others were not tried."
+    else:
+        yield (
+            "No further experiment is needed for this answer: every other candidate of a significant size is"
+            " ruled out."
+        )
+
+
+def _look(found: Diagnosis, coming: Following) -> Iterator[str]:
+    open_answers = _open_answers(found)
+    left_open = f"These records leave {listing([in_words(name) for name in open_answers])} open."
+    repeat = coming.repeat
+    if repeat is not None and repeat.separates:
+        yield f"{_of_repeat(repeat)} {left_open}"
+        begin = "Without a record, check the machine"
+    else:
+        nothing = ""
+        if repeat is not None:
+            most = max(pair.standard_deviations for pair in repeat.separations)
+            nothing = (
+                " No record repeated, as it was or changed, separates them: by"
+                f" {number(most, 2)} times the threshold at most."
+            )
+        yield f"Check the machine before you record again. {left_open}{nothing}"
+        begin = "Check"
+    yield from _checks(found, begin)
+    if found.verdict == "unknown" and not found.unlisted:
+        yield _of_worst(found, "If none of these is the cause, repeat")
+
+
+def _open_answers(found: Diagnosis) -> list[str]:
+    """Answers that the records leave open: the accepted effects and what may stand for or beside them."""
+    return [*found.combination, *found.instead, *found.perhaps]
+
+
+def _checks(found: Diagnosis, begin: str) -> Iterator[str]:
+    """How each of the first effects that are open is checked at the machine, where that is known."""
+    known = checks(found)
+    effects = [name for name in _open_answers(found) if name not in ("none", "unknown")]
+    for name in effects[:_MOST_CHECKED]:
+        if name in known:
+            yield f"{begin} for {in_words(name)}: {known[name]}."
+        elif name.startswith("wrong_"):
+            value = stated_name(name.removeprefix("wrong_"))
+            yield f"{begin} for {in_words(name)}: measure {value} by itself."
+
+
+def checks(found: Diagnosis) -> dict[str, str]:
+    """Effect -> what to do to see whether it is there, as its class says."""
+    machine = found.case.machine
+    kinds = machine.effects if isinstance(machine, Plant) else EFFECTS.values()
+    return {kind.id: kind.check for kind in kinds if kind.check}
+
+
+def _of_repeat(repeat: Repeat) -> str:
+    """A record to repeat, which pairs of answers it separates, and by how much the record as it was does."""
+    pairs = "; ".join(_apart(pair, "times the threshold") for pair in repeat.separations if pair.separated)
+    as_it_was = ""
+    if repeat.change != "same":
+        most = max(pair.standard_deviations for pair in repeat.same)
+        as_it_was = f", as it was by {_size(most)} at most"
+    return f"Repeat {repeat.record} {_AGAIN[repeat.change]}: it would {pairs}{as_it_was}."
+
+
+def _separate(found: Diagnosis, coming: Following) -> Iterator[str]:
+    proposal = coming.proposal
+    assert proposal is not None
+    first = coming.competing[0].name
+    left_open = ""
+    if not found.instead and not found.perhaps:
+        names = [f"{one.name} ({probability_words(one.probability)})" for one in coming.competing]
+        left_open = f" Still possible: {listing(names)}."
+    best = _of_excitation(proposal)
+    if not proposal.separates:
+        most = max(pair.standard_deviations for pair in proposal.separations)
+        nothing = (
+            f"None of {len(proposal.considered)} simulated experiments separates these answers: the best,"
+            f" {best}, does by {number(most, 2)} standard deviations at most."
+        )
+        if proposal.decided:
+            yield f"No further experiment is needed: the records already decide for {first}. {nothing}"
+        else:
+            yield f"Check the machine before you record again. {nothing}{left_open}"
+            yield from _checks(found, "Check")
+        return
+
+    separated = [_apart(pair, "standard deviations") for pair in proposal.separations if pair.separated]
+    others = [
+        f"not separate {' from '.join(pair.hypotheses)} ({number(pair.standard_deviations, 2)})"
+        for pair in proposal.separations
+        if not pair.separated
+    ]
+    would = "; it would ".join([*separated, *others])
+    if proposal.decided:
+        yield (
+            f"No further experiment is needed: the records already decide for {first}. To confirm it, run"
+            f" {found.case.name}.next.csv, a {best}: it would {would}."
+        )
+    else:
+        yield f"Run {found.case.name}.next.csv, a {best}: it would {would}.{left_open}"
+    low, high = (1000 * end for end in proposal.deflection_range_m)
+    yield (
+        f"In it the hub stays within {interval(proposal.hub_angle_range_rad, 2)} rad, the deflection within"
+        f" {number(low, 2)} to {number(high, 2)} mm."
+    )
+
+
+def _of_excitation(proposal: NextExperiment) -> str:
+    """Kind, largest voltage, settings and length of a proposed experiment."""
+    settings = [setting_words(key, value) for key, value in proposal.parameters.items()]
+    words = f" ({', '.join(settings)})" if settings else ""
+    return f"{proposal.kind} of {number(proposal.amplitude_V)} V{words} over {si(proposal.duration_s, 's')}"
+
+
+def _apart(pair: Separation, unit: str) -> str:
+    """How far a pair comes apart."""
+    first, second = pair.hypotheses
+    return f"separate {first} from {second} by {_size(pair.standard_deviations)} {unit}"
+
+
+def _size(times: float) -> str:
+    """A number of standard deviations, of which many are all alike."""
+    return f"more than {number(_CLEARLY)}" if times > _CLEARLY else number(times, 2)
+
+
+_ADVICES: Mapping[str, Any] = {
+    "time": _time,
+    "confirm": _confirm,
+    "repeat_worst": _repeat_worst,
+    "repeat_all": _repeat_all,
+    "none": _none,
+    "separate": _separate,
+    "look": _look,
+}
