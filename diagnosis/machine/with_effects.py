@@ -18,6 +18,7 @@ from diagnosis.machine.listed_effects import KINDS, Magnitudes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import Plant, PlantExperiment
 from diagnosis.machine.plant_effect import PlantEffect
+from ident.data.units import size_of, written_unit
 
 # Where an effect acts -> why it cannot.
 _MISSING = {
@@ -25,6 +26,9 @@ _MISSING = {
     "body": "needs body=Body(motion), the output that is its position or speed",
 }
 _NEEDS_MOTION = "motion: the output that is the body's motion"
+# Kinds of units of what is no motion: two parts between which there is play move against each other, and
+# what drives or loads them jumps instead.
+_NO_MOTION = frozenset({"N", "Nm", "A", "V", "W", "Pa"})
 # Samples of a measured position that a parabola is fitted to for its speed: noise of a difference of
 # neighbours is fifteen times as large.
 _SMOOTHED = 11
@@ -133,9 +137,12 @@ def with_effects(
     known = {effect.name for effect in plant.effects}
     usual = _tried(several_outputs=len(plant.output_names) > 1)
     if names == "all":
-        chosen = [
-            kind for kind in usual if places[kind.law.where] is not None and prefix + kind.name not in known
-        ]
+        chosen = []
+        for kind in usual:
+            has_place = places[kind.law.where] is not None
+            cannot_act = kind.name == "backlash" and _is_no_motion(plant, seen)
+            if has_place and not cannot_act and prefix + kind.name not in known:
+                chosen.append(kind)
     else:
         chosen = [KINDS[name] for name in names]
     effects = list(plant.effects)
@@ -202,6 +209,13 @@ def _warn_of_doubt(body: Body, chosen: Sequence[PlantEffect]) -> None:
             "per cent off; sample finer or write their equations into it",
             stacklevel=3,
         )
+
+
+def _is_no_motion(plant: Plant, output: int) -> bool:
+    """Whether the unit of an output is that of a force, a torque, a current, a voltage, power or pressure."""
+    name = plant.output_names[output]
+    size = size_of(plant.units.get(name) or written_unit(name))
+    return size is not None and size.kind in _NO_MOTION
 
 
 def _column(plant: Plant, output: str | int) -> int:

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.signal import lfilter, lsim
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
-from diagnosis.machine.around import Actuator, Body, EffectLaw, MeasuredBody
+from diagnosis.machine.around import Actuator, Body, EffectLaw, MeasuredBody, Sensor
 from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothForce, SmoothLaw
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.motion_effects import LinearBody, PulseResponse
@@ -563,3 +563,30 @@ def test_a_response_that_grows_without_end_prints_nothing(capfd):
     assert not PulseResponse.of(response, 0.002, of_speed=False).linear
     printed = capfd.readouterr()
     assert (printed.out, printed.err) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("output", "unit", "has_play"),
+    [
+        ("torque_Nm", "", False),
+        ("force", "N", False),
+        ("current_A", "", False),
+        ("drive", "V", False),
+        ("angle_deg", "", True),
+        ("speed", "m/s", True),
+        ("reading", "", True),
+    ],
+)
+def test_what_is_no_motion_has_no_play(output, unit, has_play):
+    rng = np.random.default_rng(0)
+    record = PlantExperiment("a", "held_out", rng.standard_normal((100, 1)), rng.standard_normal((100, 2)))
+    plant = Plant(
+        lambda p, e, u: np.repeat(u, 2, axis=1),
+        {},
+        {},
+        ("position_m", output),
+        np.array([0.1, 0.1]),
+        units={output: unit},
+    )
+    equipped = with_effects(plant, "all", [record], dt_s=DT_S, sensor=Sensor(output))
+    assert ("backlash" in {effect.name for effect in equipped.effects}) == has_play
