@@ -24,14 +24,18 @@ from diagnosis.machine.probed import doubts_about
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from diagnosis.search.white import WhiteSearch
+from diagnosis.where.late import is_noise, samples_late
 
-# Share of a time limit for fits; the rest is for what the answer needs besides.
+# Share of a time limit for fits; the rest is for what the answer needs besides. Chosen: intervals and shares
+# take less than a tenth of a search.
 _SEARCHED = 0.9
-# Share of the progress that the first search is; the second may not be needed.
+# Share of the progress that the first search is; the second may not be needed. Of what is shown only.
 _FIRST_SEARCH = 0.6
-# Noise of an own machine is what the quietest octave shows where that is below the one share of what is
-# stated, not below the other.
-_TOO_LOUD, _LEAST = 0.5, 1e-3
+# Noise of an own machine is what the quietest octave shows where that is below this share of what is stated:
+# nobody states noise to better than a factor of two.
+_TOO_LOUD = 0.5
+# And no less than this share of it: records that show none (made by a simulation) would have infinite weight.
+_LEAST_NOISE = 1e-3
 
 
 def diagnose(
@@ -43,15 +47,34 @@ def diagnose(
 ) -> Diagnosis:
     """Search, weigh, and answer.
 
-    case : A `Case` (flexible link) or a `PlantCase` (a simulation of one's own).
-    progress : Called with the share done (0 to 1) and what is being done.
-    time_limit_s : After it nothing more is tried, and the answer says what was not.
-    rng : Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
+    Parameters
+    ----------
+    case : Case or PlantCase
+        Of a flexible link, or of a simulation of one's own.
+    progress : callable, optional
+        Called with the share done (0 to 1) and what is being done.
+    rng : numpy Generator, optional
+        Of interval draws and bootstrap; without it a fixed sequence, so that one case has one answer.
+    time_limit_s : float
+        After it nothing more is tried, and the answer says what was not.
 
-    A candidate with which a simulation of one's own fails is left out, and a doubt of the answer says so.
+    Returns
+    -------
+    Diagnosis
+        A candidate with which a simulation of one's own fails is left out, and a doubt of the answer says so.
 
-    Warns where the records of an own machine show less noise than is stated, and an effect in what that hid,
-    and of what makes its answer doubtful (`doubts_about`, which raises ValueError where it is random).
+    Raises
+    ------
+    ValueError
+        The simulation is random (`doubts_about`).
+    SimulationError
+        It fails without any candidate, or with the only one.
+
+    Warns
+    -----
+    UserWarning
+        Where the records of an own machine show less noise than is stated, and an effect in what that hid,
+        and of what makes its answer doubtful.
     """
     # Matrices are small: threads of linear algebra would only wait for one another, at several times the CPU.
     with threadpool_limits(1):
@@ -59,33 +82,52 @@ def diagnose(
         progress = progress or (lambda fraction, message: None)
         deadline_s = time.monotonic() + _SEARCHED * time_limit_s
         if not isinstance(case, PlantCase):
-            answer = _at_noise_seen(case, progress, rng, deadline_s)
-            return replace(answer, doubts=(*_asked_of(case, answer), *answer.doubts))
+            return _at_noise_seen(case, progress, rng, deadline_s)
 
         # Every failure takes one candidate off the list: there are no more rounds than candidates.
-        left_out: tuple[str, ...] = ()
+        failures: tuple[str, ...] = ()
         while True:
             try:
-                doubts = (*left_out, *doubts_about(case, deadline_s))
+                doubts = (*failures, *doubts_about(case, deadline_s))
                 answer = _at_noise_seen(case, progress, rng, deadline_s)
                 break
             except SimulationError as error:
-                case, said = case.without_failing(error)
-                left_out = (*left_out, said)
+                case, sentence = case.without_failing(error)
+                failures = (*failures, sentence)
         for doubt in doubts:
             warnings.warn(f"plant: {doubt}", stacklevel=2)
-        return replace(answer, doubts=(*doubts, *_asked_of(case, answer), *answer.doubts))
+        return replace(answer, doubts=(*doubts, *_late(answer), *_unstated(case, answer), *answer.doubts))
 
 
-def _asked_of(case: CaseOfMachine, answer: Diagnosis) -> tuple[str, ...]:
-    """What decides an "unknown" that is small where nobody has said how much the simulation may miss."""
-    if not isinstance(case, PlantCase) or case.machine.weighing.stated or answer.verdict != "unknown":
+def _late(answer: Diagnosis) -> tuple[str, ...]:
+    """A doubt where the simulation is late, as stated, re-estimated or repaired; else none.
+
+    A repaired model that leaves noise alone has found another cause.
+    """
+    if is_noise(answer.residuals_after.values()):
         return ()
-    left, usual = answer.completeness.most, case.machine.weighing.model_error
-    if not left < usual:
+    for residuals in (answer.residuals_before, answer.residuals_refit, answer.residuals_after):
+        late = samples_late(answer.case, residuals)
+        if late:
+            samples = "one sample" if late == 1 else f"{late} samples"
+            return (
+                f"the motion follows the stated input by {samples} more than the machine's: does the"
+                " simulation step before it reads its input, or return each row one step later?",
+            )
+    return ()
+
+
+def _unstated(case: PlantCase, answer: Diagnosis) -> tuple[str, ...]:
+    """What decides an "unknown" that is small where nobody has said how much the simulation may miss: a doubt
+    that says so, else none."""
+    if case.machine.weighing.stated or answer.verdict != "unknown":
+        return ()
+    remains = answer.completeness.most
+    usual = case.machine.weighing.model_error
+    if not remains < usual:
         return ()
     return (
-        f"model_error is unspecified, and {100 * left:.2g} % of the motion remains, more than noise. If a"
+        f"model_error is unspecified, and {100 * remains:.2g} % of the motion remains, more than noise. If a"
         f" good simulation may miss that much, specify it, as model_error={usual:g}",
     )
 
@@ -93,7 +135,10 @@ def _asked_of(case: CaseOfMachine, answer: Diagnosis) -> tuple[str, ...]:
 def _at_noise_seen(
     case: CaseOfMachine, progress: Progress, rng: np.random.Generator, deadline_s: float
 ) -> Diagnosis:
-    """With the noise as stated, or as the records show it where that tells more."""
+    """The answer with the noise as stated, or as the records of an own machine show it where that tells more.
+
+    An answer without any gap may be due to noise that was stated far too large.
+    """
     answer = _answered(case, progress, rng, deadline_s)
     hidden = answer.verdict == "none" or (answer.shares and not any(answer.shares.before))
     if not (hidden and isinstance(case, PlantCase)) or time.monotonic() > deadline_s:
@@ -101,38 +146,41 @@ def _at_noise_seen(
     seen = quietest([e * case.noise for e in answer.residuals_refit.values()])
     if not np.any(seen < _TOO_LOUD * case.noise):
         return answer
-    quieter = case.with_noise(np.clip(seen, _LEAST * case.noise, case.noise))
-    last = _answered(quieter, lambda done, what: progress(1.0, f"{what}, less noise"), rng, deadline_s)
-    if last.verdict != "effect":
+    quieter = case.with_noise(np.clip(seen, _LEAST_NOISE * case.noise, case.noise))
+    again = _answered(quieter, lambda done, what: progress(1.0, f"{what}, less noise"), rng, deadline_s)
+    if again.verdict != "effect":
         return answer
     noise = zip(case.outputs, map(float, quieter.noise), map(float, case.noise), strict=True)
-    last = replace(last, noise_below_stated=tuple(noise))
+    again = replace(again, noise_below_stated=tuple(noise))
     words = ", ".join(
-        f"{name} {seen:.3g}, stated {stated:.3g}" for name, seen, stated in last.noise_below_stated
+        f"{name} {seen:.3g}, stated {stated:.3g}" for name, seen, stated in again.noise_below_stated
     )
     warnings.warn(f"plant: the records show less noise than stated, which counts: {words}", stacklevel=3)
-    return last
+    return again
 
 
 def _answered(
     case: CaseOfMachine, progress: Progress, rng: np.random.Generator, deadline_s: float
 ) -> Diagnosis:
-    """With the noise as stated."""
+    """The answer with the noise as stated: by the noise where that is known, else beside a model error."""
     weighing = case.machine.weighing
     if not weighing.model_error > 0:
         return KnownNoise(WhiteSearch(case, progress, deadline_s).run_in_time()).answer(rng)
     if isinstance(case, Case):
         case = case.at_fast_lengths()
-    found = Search(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s).run_in_time()
-    if found.skipped_for_time:
-        return BesideModelError(found, rng).answer(rng)
+    search = Search(case, lambda done, what: progress(_FIRST_SEARCH * done, what), deadline_s).run_in_time()
+    if search.skipped_for_time:
+        return BesideModelError(search, rng).answer(rng)
 
-    def again(done: float, what: str) -> None:
+    def progress_of_second(done: float, what: str) -> None:
         progress(_FIRST_SEARCH + (1 - _FIRST_SEARCH) * done, what)
 
-    if isinstance(case, PlantCase) and not weighing.stated and reaches_noise(found):
+    # A simulation whose error may be none is first taken for exact: beside the sensors' noise alone smaller
+    # effects are told.
+    if isinstance(case, PlantCase) and not weighing.stated and reaches_noise(search):
         as_sensors = replace(case, plant=replace(case.plant, model_error=0.0))
-        exact = KnownNoise(WhiteSearch(as_sensors, again, deadline_s).run_in_time()).answer(rng)
+        exact_search = WhiteSearch(as_sensors, progress_of_second, deadline_s).run_in_time()
+        exact = KnownNoise(exact_search).answer(rng)
         if exact.verdict != "unknown":
             return exact
-    return looked_at_again(BesideModelError(found, rng), again, deadline_s, rng)
+    return looked_at_again(BesideModelError(search, rng), progress_of_second, deadline_s, rng)

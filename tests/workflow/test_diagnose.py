@@ -185,10 +185,10 @@ def test_what_closes_most_of_the_gap_of_an_unknown_cause_is_written_down(folder,
     [
         (
             0.3,
-            ("For dry (Coulomb) friction: raise the voltage", "If none of these is the cause, repeat"),
+            ("Check for dry (Coulomb) friction: raise the voltage", "If none of these is the cause, repeat"),
             "no hypotheses",
         ),
-        (0.1, (", the worst record, at half and twice its amplitude",), "For dry"),
+        (0.1, (", the worst record, at half and twice its amplitude",), "Check for dry"),
     ],
 )
 def test_an_effect_that_is_likely_is_looked_for_before_an_unknown_cause(
