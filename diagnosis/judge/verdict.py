@@ -53,13 +53,11 @@ class JudgedEffect:
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedSet:
-    """A fitted set of effects with its probability.
+class WeightedSet:
+    """A set of effects with its probability, whatever fitted it.
 
     Attributes
     ----------
-    explanation : Explanation
-        Its likeliest fit.
     probability : float
         Among the fitted sets.
     effects : tuple of JudgedEffect
@@ -68,10 +66,22 @@ class JudgedSet:
         Probability that a cause on no list is behind what the set leaves.
     """
 
-    explanation: Explanation
     probability: float
     effects: tuple[JudgedEffect, ...]
     unlisted_beside: float
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedSet(WeightedSet):
+    """A fitted set of effects with its probability.
+
+    Attributes
+    ----------
+    explanation : Explanation
+        Its likeliest fit.
+    """
+
+    explanation: Explanation
 
     def holding(self, least_probability: float) -> set[str]:
         """Its effects that are at least as probable as this."""
@@ -134,7 +144,7 @@ def judged(search: Search) -> JudgedSets:
         if len(search.explanations) == known:
             break
 
-    probabilities = _probabilities(sets, search.case.machine.weighing.listed)
+    probabilities = probabilities_of_answers(sets, search.case.machine.weighing.listed)
     # Rounding of a sensor is read off the measured values and stands in no fitted set.
     rounding = rounding_effect(search.case)
     rounding_share = 0.0 if rounding is None else _rounding_share(search, rounding)
@@ -153,7 +163,7 @@ def judged(search: Search) -> JudgedSets:
     return JudgedSets(
         probabilities,
         answer,
-        _accepted(probabilities, answer, shares),
+        accepted_set(probabilities, answer, shares),
         untried,
         rounding,
         judged=sets,
@@ -221,7 +231,7 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
         # Where nobody has said what does not interest, whatever is left has a cause.
         is_stated = search.case.machine.weighing.stated
         unlisted = model.has_unlisted_cause(one.rest_features) if is_stated else 1.0
-        sets.append(JudgedSet(one.explanation, probability / total, effects, unlisted))
+        sets.append(JudgedSet(probability / total, effects, unlisted, one.explanation))
     return tuple(sets)
 
 
@@ -230,7 +240,7 @@ def _nearly_as_probable(sets: Sequence[JudgedSet]) -> list[JudgedSet]:
     return [one for one in sets if one.probability > sets[0].probability * np.exp(-SUBSTANTIAL)]
 
 
-def _probabilities(sets: Sequence[JudgedSet], listed: Sequence[str]) -> Probabilities:
+def probabilities_of_answers(sets: Sequence[WeightedSet], listed: Sequence[str]) -> Probabilities:
     """Every set shared out among those of its effects that are there.
 
     Each effect of a set is there, or too small to interest, or stands in for a cause on no list. Where none
@@ -239,7 +249,7 @@ def _probabilities(sets: Sequence[JudgedSet], listed: Sequence[str]) -> Probabil
 
     Parameters
     ----------
-    sets : sequence of JudgedSet
+    sets : sequence of WeightedSet
         With probabilities that sum to one.
     listed : sequence of str
         Effects that were looked for.
@@ -274,7 +284,7 @@ def _probabilities(sets: Sequence[JudgedSet], listed: Sequence[str]) -> Probabil
     return Probabilities(cause, of_sets, presence)
 
 
-def _accepted(probabilities: Probabilities, answer: str, shares: Mapping[str, float]) -> Names:
+def accepted_set(probabilities: Probabilities, answer: str, shares: Mapping[str, float]) -> Names:
     """The most probable set that holds the answer, what carries most first; nothing for none and unknown.
 
     shares : name -> share of the motion that it carries, of every effect.
