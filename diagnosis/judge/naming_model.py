@@ -67,11 +67,15 @@ class NamingModel:
             return 0.0
         return (1 - effect.by_name) * float(expit(np.dot(effect.features, self.of_effect)))
 
-    def has_unlisted_cause(self, rest_features: tuple[float, ...]) -> float:
+    def has_unlisted_cause(self, rest_features: tuple[float, ...], model_error_is_stated: bool) -> float:
         """Probability that a cause on no list is behind what is left.
+
+        Where nobody has said what does not interest, whatever is left has a cause: 1.
 
         rest_features : `SetFeatures.rest_features` of the set that leaves it.
         """
+        if not model_error_is_stated:
+            return 1.0
         return float(expit(np.dot(rest_features, self.of_rest)))
 
 

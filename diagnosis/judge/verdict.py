@@ -203,8 +203,8 @@ def below_threshold(search: Search, explanation: Explanation) -> float:
     return max(probabilities)
 
 
-def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tuple[JudgedSet, ...]:
-    """The fitted sets that are not negligible, the most probable first.
+def explanations_to_judge(search: Search, nominal: Explanation) -> dict[Names, Explanation]:
+    """Sorted names -> the likeliest fit of these effects, the likeliest first.
 
     None leaves more of the validation records than the nominal, as stated or re-estimated.
     """
@@ -214,6 +214,12 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
     for key, explanation in best_of_sets(search.explanations).items():
         if not key or explanation.held_out_energy(noise) <= farthest:
             explanations[key] = explanation
+    return explanations
+
+
+def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tuple[JudgedSet, ...]:
+    """The fitted sets that are not negligible, the most probable first."""
+    explanations = explanations_to_judge(search, nominal)
     features = features_of_sets(search, explanations)
     probabilities = model.set_probabilities(features)
     kept: list[tuple[float, SetFeatures]] = []
@@ -228,9 +234,7 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
             JudgedEffect(effect, model.is_genuine(effect))
             for effect in features_of_effects(search, one.explanation, explanations)
         )
-        # Where nobody has said what does not interest, whatever is left has a cause.
-        is_stated = search.case.machine.weighing.stated
-        unlisted = model.has_unlisted_cause(one.rest_features) if is_stated else 1.0
+        unlisted = model.has_unlisted_cause(one.rest_features, search.case.machine.weighing.stated)
         sets.append(JudgedSet(probability / total, effects, unlisted, one.explanation))
     return tuple(sets)
 
