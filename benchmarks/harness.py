@@ -35,6 +35,7 @@ class Results:
     """Lines of one results file: printed as they come, written whole at the end, so never half of a run."""
 
     def __init__(self, head: str) -> None:
+        self.head = head
         self._lines: list[str] = []
         self(head)
 
