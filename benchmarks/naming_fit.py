@@ -40,9 +40,12 @@ COEFFICIENTS = {
     "set": {
         "log_evidence_behind": (
             1.0,
-            "a set loses by this power of its evidence behind the best one; 1 would trust the likelihood",
+            "the probability of a set falls with this power of its log evidence behind the best one",
         ),
-        "evidence_behind": (1.0, "it loses in proportion to log evidence as well, 10 units of it at a time"),
+        "evidence_behind": (
+            1.0,
+            "it falls exponentially with log evidence as well; 10 would trust the likelihood",
+        ),
         "left_beyond_model_error": (
             -1.0,
             "negative: a set that leaves more than the model error is less probable",
@@ -57,7 +60,10 @@ COEFFICIENTS = {
         "value_off": (2.0, "the more tolerances a value is off, the more probably it is wrong"),
     },
     "rest": {
-        "constant": (-1.0, "what is as large as the stated model error has a cause on no list"),
+        "constant": (
+            -2.0,
+            "negative: what is as large as the stated model error has no cause that interests",
+        ),
         "left_to_model_error": (2.0, "the more is left, the more probably an unlisted cause is behind it"),
     },
 }
