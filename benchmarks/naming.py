@@ -54,7 +54,7 @@ from diagnosis.judge.judgement import Judge
 from diagnosis.judge.model_error import BesideModelError
 from diagnosis.judge.naming_model import NamingModel
 from diagnosis.judge.set_features import EffectFeatures, features_of_effects, features_of_sets, share_left
-from diagnosis.judge.verdict import fits_to_judge
+from diagnosis.judge.verdict import explanations_to_judge
 from validation.blind.generate import case_name, generate
 from workflow.diagnose.case_files import load_case
 
@@ -193,7 +193,7 @@ def training_case(labelled: LabelledCase) -> TrainingCase | str:
     if has_cause and share_left(search.base) < LEAST_SHARE * weighing.model_error:
         return HIDDEN
 
-    fits = fits_to_judge(search, judge.said.nominal)
+    fits = explanations_to_judge(search, judge.said.nominal)
     sets = tuple(
         TrainingSet(
             one.log_prior,
