@@ -55,6 +55,7 @@ from diagnosis.judge.model_error import BesideModelError
 from diagnosis.judge.naming_model import NamingModel
 from diagnosis.judge.set_features import EffectFeatures, features_of_effects, features_of_sets, share_left
 from diagnosis.judge.verdict import explanations_to_judge
+from diagnosis.repair.stability import shares_of_sets
 from validation.blind.generate import case_name, generate
 from workflow.diagnose.case_files import load_case
 
@@ -190,18 +191,19 @@ def training_case(labelled: LabelledCase) -> TrainingCase | str:
     weighing = search.case.machine.weighing
     # Nobody knows the true shares of MuJoCo cases. What is left without effects has the cause in it.
     has_cause = labelled.route == "mujoco" and bool(labelled.present or labelled.unlisted)
-    if has_cause and share_left(search.base) < LEAST_SHARE * weighing.model_error:
+    if has_cause and share_left(search.nominal_alone) < LEAST_SHARE * weighing.model_error:
         return HIDDEN
 
-    fits = explanations_to_judge(search, judge.said.nominal)
+    explanations = explanations_to_judge(search, judge.said.nominal)
     sets = tuple(
         TrainingSet(
             one.log_prior,
             one.features,
             one.rest_features,
-            features_of_effects(search, one.explanation, fits),
+            one.repair_share,
+            features_of_effects(search, one.explanation, explanations),
         )
-        for one in features_of_sets(search, fits)
+        for one in features_of_sets(search, explanations, shares_of_sets(judge.trials))
     )
     return TrainingCase(
         labelled.route,
@@ -240,7 +242,13 @@ def case_of_line(line: str) -> TrainingCase | str:
             EffectFeatures(**{**effect, "features": tuple(effect["features"])}) for effect in one["effects"]
         ]
         sets.append(
-            TrainingSet(one["log_prior"], tuple(one["features"]), tuple(one["rest_features"]), tuple(effects))
+            TrainingSet(
+                one["log_prior"],
+                tuple(one["features"]),
+                tuple(one["rest_features"]),
+                one["repair_share"],
+                tuple(effects),
+            )
         )
     return TrainingCase(
         stored["route"],
@@ -385,7 +393,7 @@ def run(
     out: Print,
     *,
     folder: str = "build/naming",
-    workshop: int = 60,
+    workshop: int = 48,
     mujoco: int = 60,
     mujoco_off_list: int = 20,
     made: int = 200,

@@ -26,7 +26,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from diagnosis.evidence.hypotheses import Probabilities
-from diagnosis.judge.naming_model import NamingModel
+from diagnosis.judge.naming_model import PREDICTION, NamingModel
 from diagnosis.judge.set_features import EFFECT_FEATURES, REST_FEATURES, SET_FEATURES, EffectFeatures
 from diagnosis.judge.verdict import JudgedEffect, WeightedSet, accepted_set, probabilities_of_answers
 
@@ -93,6 +93,7 @@ class TrainingSet:
     log_prior : float
     features : (3,) tuple of float
     rest_features : (2,) tuple of float
+    repair_share : float
     effects : tuple of EffectFeatures
         The one that carries most first; none of the nominal.
     """
@@ -100,6 +101,7 @@ class TrainingSet:
     log_prior: float
     features: tuple[float, ...]
     rest_features: tuple[float, ...]
+    repair_share: float
     effects: tuple[EffectFeatures, ...]
 
 
@@ -179,6 +181,11 @@ class TrainingData:
         self.rest_features = np.array([fitted.rest_features for _, fitted in sets])
         self.is_stated = np.array([cases[i].model_error_is_stated for i, _ in sets], dtype=bool)
         self.log_priors = np.array([fitted.log_prior for _, fitted in sets])
+        repair_shares = np.array([fitted.repair_share for _, fitted in sets])
+        of_case = np.add.reduceat(repair_shares, self.first_set)[self.case_of_set]
+        # Where no set is a repair, evidence alone counts (`NamingModel.set_probabilities`).
+        self.prediction = np.where(of_case > 0, PREDICTION, 0.0)
+        self.by_prediction = repair_shares / np.where(of_case > 0, of_case, 1.0)
 
         # Effects of all sets one below the other. places: (S, most effects of a set) -> row of the effect,
         # the one that carries most first; E, a row behind the last, where the set has fewer.
@@ -223,6 +230,7 @@ class TrainingData:
         score -= np.maximum.reduceat(score, self.first_set)[self.case_of_set]
         weights = np.exp(score)
         weights /= np.add.reduceat(weights, self.first_set)[self.case_of_set]
+        weights = (1 - self.prediction) * weights + self.prediction * self.by_prediction
         genuine = expit(self.effect_features @ model.of_effect) * (1 - self.by_name) * self.is_answer
         # A row behind the last: an effect that is not there, too small and no stand-in.
         is_there = np.append(self.interests * genuine, 0.0)

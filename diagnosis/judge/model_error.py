@@ -18,6 +18,7 @@ from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.next_experiment.discrimination import MOST_COMPETING, CompetingHypothesis, fitted_hypothesis
 from diagnosis.repair.repair import Repairs
+from diagnosis.repair.stability import shares_of_sets
 from diagnosis.search.loop import Progress
 from diagnosis.search.search import Search
 from plant.effects.search_space import Candidate
@@ -98,12 +99,12 @@ class BesideModelError(Judge[Explanation]):
         Without such an effect everything is judged anew.
         """
         self.search = search
-        repairs: Repairs[Explanation] | None = None
+        nominal = judging.better_nominal(search)
+        judging.look_closer(search, nominal)
+        search.progress(1.0, "done")
+        repairs = Repairs(search, nominal)
         while True:
-            self.said = judging.judged(search)
-            search.progress(1.0, "done")
-            if repairs is None:
-                repairs = Repairs(search, self.said.nominal)
+            self.said = judging.judged(search, nominal, shares_of_sets(repairs.trials))
             named = self.said.fitted(self.said.accepted)
             self.repair = repairs.best(named)
             surely_worse = self._surely_worse(repairs, named)

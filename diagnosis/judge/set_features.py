@@ -103,16 +103,21 @@ class SetFeatures:
         In the order of `SET_FEATURES`.
     rest_features : (2,) tuple of float
         Of what the set leaves, in the order of `REST_FEATURES`.
+    repair_share : float
+        Share of the repairs that are this set, when the logs are drawn anew.
     """
 
     explanation: Explanation
     log_prior: float
     features: tuple[float, ...]
     rest_features: tuple[float, ...]
+    repair_share: float
 
 
 def features_of_sets(
-    search: Search, explanations: Mapping[tuple[str, ...], Explanation]
+    search: Search,
+    explanations: Mapping[tuple[str, ...], Explanation],
+    repair_shares: Mapping[tuple[str, ...], float],
 ) -> list[SetFeatures]:
     """The features of every set, in the order given.
 
@@ -122,6 +127,9 @@ def features_of_sets(
         That has fitted them.
     explanations : mapping
         Sorted names -> the likeliest fit of these effects; () is the nominal without an effect.
+    repair_shares : mapping
+        Sorted names -> share of the repairs that are this set (`repair.stability`); empty where nobody has
+        looked at logs left out yet.
 
     Notes
     -----
@@ -158,6 +166,7 @@ def features_of_sets(
                     max(left_to_model_error, 0.0),
                 ),
                 rest_features=(1.0, left_to_model_error),
+                repair_share=repair_shares.get(key, 0.0),
             )
         )
     return sets

@@ -14,7 +14,7 @@ from diagnosis.evidence.hypotheses import Probabilities
 from diagnosis.fit.likelihood import SUBSTANTIAL
 from diagnosis.fit.records import Records, mean_square_left
 from diagnosis.judge.judgement import Judgement
-from diagnosis.judge.naming_model import NamingModel, fitted_model
+from diagnosis.judge.naming_model import fitted_model
 from diagnosis.judge.set_features import EffectFeatures, SetFeatures, features_of_effects, features_of_sets
 from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.loop import FOLLOWED_SETS
@@ -113,37 +113,57 @@ class JudgedSets(Judgement):
         return self.probabilities.sets.get(tuple(sorted((*fitted, *rounding))), 0.0)
 
 
-def judged(search: Search) -> JudgedSets:
-    """The answer from everything that a search has fitted.
+def better_nominal(search: Search) -> Explanation:
+    """The model without effects: as stated, or re-estimated where that leaves less of validation records."""
+    noise = search.case.noise
+    candidates = (search.nominal_alone, search.at_stated_values())
+    return min(candidates, key=lambda explanation: explanation.held_out_energy(noise))
 
-    Sets that are nearly as probable as the best are looked at more closely first: with an effect exchanged
-    for another one, with a simpler one, and without one. What that finds is judged with all others, until
-    nothing new is found or the time is up.
+
+def look_closer(search: Search, nominal: Explanation) -> None:
+    """Fit what is near the most probable sets, until nothing new is found or the time is up.
+
+    Sets that are nearly as probable as the best are fitted with an effect exchanged for another one and with
+    a simpler one, the best one without each of its effects.
+
+    Parameters
+    ----------
+    search : Search
+        After its run; it gets the new explanations.
+    nominal : Explanation
+        `better_nominal`.
     """
-    nominal = min(
-        search.nominal_alone,
-        search.at_stated_values(),
-        key=lambda explanation: explanation.held_out_energy(search.case.noise),
-    )
-    model = fitted_model()
     for _ in range(FOLLOWED_SETS):
         known = len(search.explanations)
-        sets = _judged_sets(search, model, nominal)
+        sets = _judged_sets(search, nominal, {})
         if search.out_of_time:
-            break
-        for near in _nearly_as_probable(sets):
-            search.add_exchanged(near.explanation, near.holding(0.5))
+            return
+        near = [one for one in sets if one.probability > sets[0].probability * np.exp(-SUBSTANTIAL)]
+        for one in near:
+            search.add_exchanged(one.explanation, one.holding(0.5))
         likeliest = sets[0].explanation
-        for place in range(len(likeliest.names)):
-            if len(likeliest.names) > 1:
+        if len(likeliest.names) > 1:
+            for place in range(len(likeliest.names)):
                 search.without_effect(likeliest, place)
-        for explanation in [near.explanation for near in _nearly_as_probable(sets)] + search.explanations[
-            known:
-        ]:
+        for explanation in [*(one.explanation for one in near), *search.explanations[known:]]:
             search.add_simpler(explanation)
         if len(search.explanations) == known:
-            break
+            return
 
+
+def judged(search: Search, nominal: Explanation, repair_shares: Mapping[Names, float]) -> JudgedSets:
+    """The answer from everything that a search has fitted.
+
+    Parameters
+    ----------
+    search : Search
+        After its run, and `look_closer`.
+    nominal : Explanation
+        `better_nominal`.
+    repair_shares : mapping
+        Sorted names -> share of the repairs that are this set (`repair.stability`).
+    """
+    sets = _judged_sets(search, nominal, repair_shares)
     probabilities = probabilities_of_answers(sets, search.case.machine.weighing.listed)
     # Rounding of a sensor is read off the measured values and stands in no fitted set.
     rounding = rounding_effect(search.case)
@@ -217,10 +237,13 @@ def explanations_to_judge(search: Search, nominal: Explanation) -> dict[Names, E
     return explanations
 
 
-def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tuple[JudgedSet, ...]:
+def _judged_sets(
+    search: Search, nominal: Explanation, repair_shares: Mapping[Names, float]
+) -> tuple[JudgedSet, ...]:
     """The fitted sets that are not negligible, the most probable first."""
+    model = fitted_model()
     explanations = explanations_to_judge(search, nominal)
-    features = features_of_sets(search, explanations)
+    features = features_of_sets(search, explanations, repair_shares)
     probabilities = model.set_probabilities(features)
     kept: list[tuple[float, SetFeatures]] = []
     for probability, one in zip(probabilities, features, strict=True):
@@ -237,11 +260,6 @@ def _judged_sets(search: Search, model: NamingModel, nominal: Explanation) -> tu
         unlisted = model.has_unlisted_cause(one.rest_features, search.case.machine.weighing.stated)
         sets.append(JudgedSet(probability / total, effects, unlisted, one.explanation))
     return tuple(sets)
-
-
-def _nearly_as_probable(sets: Sequence[JudgedSet]) -> list[JudgedSet]:
-    """Those within a factor of e^SUBSTANTIAL of the most probable one."""
-    return [one for one in sets if one.probability > sets[0].probability * np.exp(-SUBSTANTIAL)]
 
 
 def probabilities_of_answers(sets: Sequence[WeightedSet], listed: Sequence[str]) -> Probabilities:

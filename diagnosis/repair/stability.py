@@ -14,6 +14,25 @@ from diagnosis.repair.repair import Trial
 def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
     """For every effect the share of the repairs that hold it, when blocks of the logs are drawn anew.
 
+    0 to 1: an effect without which the logs are predicted notably worse has 1 whatever is drawn; two that
+    take each other's place share it.
+
+    Parameters
+    ----------
+    trials : sequence of Trial
+        Sets of effects with their errors in the same blocks.
+    """
+    shares = dict.fromkeys((name for trial in trials for name in trial.names), 0.0)
+    for names, share in shares_of_sets(trials).items():
+        for name in names:
+            shares[name] += share
+    return shares
+
+
+def shares_of_sets(trials: Sequence[Trial[Any]]) -> dict[tuple[str, ...], float]:
+    """For every set of effects the share of the repairs that are this set, when blocks of the logs are drawn
+    anew.
+
     Parameters
     ----------
     trials : sequence of Trial
@@ -22,8 +41,7 @@ def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
     Returns
     -------
     dict
-        Effect -> 0 to 1. An effect without which the logs are predicted notably worse has 1 whatever is
-        drawn; two that take each other's place share it.
+        Sorted names -> 0 to 1, summing to one.
 
     Notes
     -----
@@ -36,13 +54,12 @@ def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
     weights = blocks * np.random.default_rng(0).dirichlet(np.ones(blocks), MONTE_CARLO_DRAWS)
     totals = energies @ weights.T
     sizes = np.array([len(trial.names) for trial in trials])
-    shares = dict.fromkeys((name for trial in trials for name in trial.names), 0.0)
+    shares = {trial.explanation.sorted_names: 0.0 for trial in trials}
     for total in totals.T:
         best = int(np.argmin(total))
         differences = energies - energies[best]
         standard_errors = np.sqrt(blocks) * np.std(differences, axis=1, ddof=1)
         as_good = [int(k) for k in np.flatnonzero(total - total[best] <= standard_errors)]
         chosen = min(as_good, key=lambda k: (sizes[k], total[k]))
-        for name in trials[chosen].names:
-            shares[name] += 1 / MONTE_CARLO_DRAWS
+        shares[trials[chosen].explanation.sorted_names] += 1 / MONTE_CARLO_DRAWS
     return shares

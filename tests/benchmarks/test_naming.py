@@ -48,6 +48,7 @@ def drawn_set(rng, names):
         float(rng.normal()),
         tuple(map(float, rng.normal(size=len(SET_FEATURES)))),
         (1.0, float(rng.normal())),
+        float(rng.choice([0.0, 0.0, 0.5])),
         tuple(sorted(effects, key=lambda effect: -effect.share)),
     )
 

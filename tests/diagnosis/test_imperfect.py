@@ -25,7 +25,7 @@ from diagnosis.fit.records import FittedStart, Records, StartColumns
 from diagnosis.fit.starts import StartPoint, points_of
 from diagnosis.judge.carried import shares_of
 from diagnosis.judge.set_features import is_silent
-from diagnosis.judge.verdict import judged
+from diagnosis.judge.verdict import better_nominal, judged, look_closer
 from diagnosis.machine.flexible_arm import FlexibleArm
 from diagnosis.search.moves import BesideSet, InWindows, LookAlike, descend_from_best
 from diagnosis.search.search import Search
@@ -240,7 +240,7 @@ def test_what_the_held_out_records_contradict_is_no_answer():
     )
     search = Search(Case("two", RIG, records, 0.05), lambda share, words: None)
     search.run()
-    found = judged(search)
+    found = _answer(search)
     assert "hardening_spring" not in found.accepted
     shares = shares_of(search, found.accepted, found.nominal, found.nominal, rng)
     assert all(closed > 0 for _, closed in shares.closes)
@@ -659,7 +659,13 @@ def test_far_values_are_scanned_where_contacts_switch():
 
 
 def _judged(sets, **told):
-    return judged(_searched(sets, **told))
+    return _answer(_searched(sets, **told))
+
+
+def _answer(search):
+    nominal = better_nominal(search)
+    look_closer(search, nominal)
+    return judged(search, nominal, {})
 
 
 def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
@@ -726,10 +732,10 @@ def test_what_makes_validation_records_worse_is_not_there():
     nothing, dry, both = (0.0, 0.5, 0.5), ("coulomb_friction",), ("coulomb_friction", "gravity")
     sets = {(): nothing, ("gravity",): nothing, dry: (400.0, 0.1, 0.1), both: (900.0, 0.01, 0.01)}
     search = _searched(sets)
-    assert judged(search).accepted == both
+    assert _answer(search).accepted == both
     search.refuted.add("gravity")
-    assert judged(search).accepted == dry
-    assert judged(search).probabilities.presence["gravity"] == 0
+    assert _answer(search).accepted == dry
+    assert _answer(search).probabilities.presence["gravity"] == 0
 
 
 @pytest.mark.parametrize(("further_gain", "sought"), [(12.0, True), (0.0, False)])
@@ -740,7 +746,7 @@ def test_simpler_effects_are_sought_in_every_set_that_is_as_likely(further_gain,
     search = _searched({(): nothing, ("gravity",): nothing, **gains})
     asked = []
     search.add_simpler = lambda explanation: asked.append(explanation.sorted_names)
-    assert len(judged(search).judged) > 1
+    assert len(_answer(search).judged) > 1
     assert set(asked) == {friction, with_tilt} if sought else {friction}
 
 
@@ -760,10 +766,10 @@ def test_an_effect_is_present_though_something_else_is_missing(left, answer, pre
 
 def test_untried_is_not_absent():
     search = _searched({(): (0.0, 0.3, 0.3), ("gravity",): (4.0, 0.29, 0.29)})
-    tried = judged(search)
+    tried = _answer(search)
     search.skipped_for_time = ["joint_compliance", "further effects beside gravity"]
     search.untried = {"joint_compliance": "more time"}
-    found = judged(search)
+    found = _answer(search)
     assert tried.probabilities.cause["unknown"] > 0.8
     assert found.answer == "unknown"
     assert found.probabilities.cause["unknown"] < 0.4
