@@ -194,7 +194,7 @@ def training_case(labelled: LabelledCase) -> TrainingCase | str:
     if has_cause and share_left(search.nominal_alone) < LEAST_SHARE * weighing.model_error:
         return HIDDEN
 
-    explanations = explanations_to_judge(search, judge.said.nominal)
+    explanations = explanations_to_judge(search, judge.judgement.nominal)
     sets = tuple(
         TrainingSet(
             one.log_prior,
@@ -354,7 +354,7 @@ def calibration_picture(outcomes: Sequence[Outcome], path: Path) -> None:
 
     They are those of Clopper and Pearson. Neglected: presences of one case are no independent trials.
     """
-    answers = [(each.said, each.is_right) for each in outcomes]
+    answers = [(each.judgement, each.is_right) for each in outcomes]
     presences = [
         (probability, name in each.case.present)
         for each in outcomes

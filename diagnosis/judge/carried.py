@@ -189,12 +189,12 @@ def _shapley(name: str, names: Names, energy: Mapping[Names, Real]) -> Real:
     energy : mapping
         Every subset of the names, in their order -> (D,) energy that it leaves, of D draws.
     """
-    others = [other for other in names if other != name]
+    other_names = [other for other in names if other != name]
     gain = np.zeros_like(energy[()])
     for count in range(len(names)):
         # Share of the orders in which exactly these others come first.
         weight = factorial(count) * factorial(len(names) - count - 1) / factorial(len(names))
-        for before in combinations(others, count):
+        for before in combinations(other_names, count):
             after = tuple(n for n in names if n == name or n in before)
             gain = gain + weight * (energy[before] - energy[after])
     return np.asarray(gain / energy[()])

@@ -196,18 +196,18 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     H = end.hessian
     scale = np.sqrt(np.maximum(np.diag(H), _LEAST_CURVATURE))
     H = H + _DAMPING * np.diag(scale**2)
-    both = H + J.T @ J
+    hessian_of_both = H + J.T @ J
     gradient = J.T @ residuals
-    step = np.asarray(-np.linalg.solve(both, gradient))
+    step = np.asarray(-np.linalg.solve(hessian_of_both, gradient))
     # A value that would leave its range stays where it is.
     free = np.flatnonzero(_inside(end, step))
     step = np.zeros(step.size)
-    step[free] = -np.linalg.solve(both[np.ix_(free, free)], gradient[free])
+    step[free] = -np.linalg.solve(hessian_of_both[np.ix_(free, free)], gradient[free])
 
     quadratic = float(residuals @ residuals + gradient @ step)
     # Scaled, so that values of different size lose no digits.
     scales = np.outer(scale, scale)
-    log_determinant = float(np.linalg.slogdet(both / scales)[1] - np.linalg.slogdet(H / scales)[1])
+    log_determinant = float(np.linalg.slogdet(hessian_of_both / scales)[1] - np.linalg.slogdet(H / scales)[1])
     return np.asarray(residuals + J @ step), log_density - 0.5 * (quadratic + log_determinant)
 
 

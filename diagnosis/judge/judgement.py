@@ -87,11 +87,11 @@ class Judgement:
         An effect that contains an accepted one (Stribeck friction contains Coulomb friction) is improbable
         for the parameters that it does not need, yet the records do not rule it out.
         """
-        others = {}
+        probability_of_others = {}
         for name, probability in self.shares.items():
             if name != self.answer and name not in self.accepted and probability >= POSSIBLE:
-                others[name] = probability
-        likely = sorted(others, key=lambda name: -others[name])
+                probability_of_others[name] = probability
+        likely = sorted(probability_of_others, key=lambda name: -probability_of_others[name])
         fitting = [name for name in self.alike if name not in self.accepted]
         # A dictionary keeps the first of each name, in order.
         return tuple(dict.fromkeys([*likely, *fitting]))
@@ -122,7 +122,7 @@ class Judge(ABC, Generic[E]):
     ----------
     search : SearchLoop
         After its run.
-    said : Judgement
+    judgement : Judgement
         The answer.
     stated, refit, repaired : Explanation or Hypothesis
         The models to compare: as stated, with nominal values re-estimated, with effects added.
@@ -135,7 +135,7 @@ class Judge(ABC, Generic[E]):
     """
 
     search: SearchLoop[E]
-    said: Judgement
+    judgement: Judgement
     stated: E
     refit: E
     repaired: E
@@ -172,7 +172,7 @@ class Judge(ABC, Generic[E]):
             Of `Diagnosis`, which only one kind of judge knows.
         """
         case = self.search.case
-        probabilities = self.said.probabilities
+        probabilities = self.judgement.probabilities
         value_names = self.search.records.nominal.keys
         residuals_before = self.search.whitened_residuals(self.stated)
         residuals_refit = self.search.whitened_residuals(self.refit)
@@ -193,19 +193,19 @@ class Judge(ABC, Generic[E]):
             entries.append(NamedEffect(name, probability, probability, {}, {}, not_a_number, explains))
 
         repair = self.repaired.fit.effects
-        if self.said.rounding is not None:
-            repair = (*repair, self.said.rounding.effect)
-        is_effect = self.said.verdict == "effect"
+        if self.judgement.rounding is not None:
+            repair = (*repair, self.judgement.rounding.effect)
+        is_effect = self.judgement.verdict == "effect"
         deviations = self.repaired.fit.deviations
         return Diagnosis(
             case=case,
-            verdict=self.said.verdict,
-            detail_verdict=self.said.detail(deviations),
+            verdict=self.judgement.verdict,
+            detail_verdict=self.judgement.detail(deviations),
             probabilities=probabilities.cause,
             sets=probabilities.sets,
-            effects=best_first(entries, self.said.answer, self.said.accepted),
-            combination=self.said.accepted if is_effect else (),
-            ambiguous_with=self.said.ambiguous_with,
+            effects=best_first(entries, self.judgement.answer, self.judgement.accepted),
+            combination=self.judgement.accepted if is_effect else (),
+            ambiguous_with=self.judgement.ambiguous_with,
             gap_before=held_out_gap(case, residuals_before),
             gap_refit=held_out_gap(case, residuals_refit),
             gap_after=held_out_gap(case, residuals_after),
@@ -251,14 +251,14 @@ class Judge(ABC, Generic[E]):
         case = self.search.case
         entry = NamedEffect(
             name,
-            self.said.probabilities.cause[name],
-            self.said.probabilities.presence[name],
+            self.judgement.probabilities.cause[name],
+            self.judgement.probabilities.presence[name],
             {},
             {},
             float("nan"),
-            untried=self.said.untried.get(name, ""),
+            untried=self.judgement.untried.get(name, ""),
         )
-        rounding = self.said.rounding
+        rounding = self.judgement.rounding
         fit = self.holding(name)
         if fit is None:
             if rounding is None or name != rounding.name:

@@ -103,7 +103,7 @@ class KnownNoise(Judge[Hypothesis]):
             weighed = weighed.with_untried(untried, larger=True)
         # What was not tried counts as unknown.
         answer = weighed.counting_as_unknown(untried).answer
-        self.said = Judgement(
+        self.judgement = Judgement(
             weighed,
             answer,
             accepted_names,
@@ -116,7 +116,7 @@ class KnownNoise(Judge[Hypothesis]):
         self.gap_refit = held_out_gap(case, search.whitened_residuals(base, case.held_out))
         if answer == "unknown":
             presence = {**weighed.presence, **self._presence_by_prediction()}
-            self.said = replace(self.said, probabilities=replace(weighed, presence=presence))
+            self.judgement = replace(self.judgement, probabilities=replace(weighed, presence=presence))
 
     def _fitting_as_well(self, accepted: Hypothesis) -> tuple[str, ...]:
         """Effects of sets of the same number that fit the estimation records as well as the accepted one,
@@ -145,20 +145,20 @@ class KnownNoise(Judge[Hypothesis]):
         in_repairs = share_of_repairs(self.trials)
         presence = {}
         for name in self.repaired.names:
-            if name not in self.said.probabilities.presence:
+            if name not in self.judgement.probabilities.presence:
                 continue
             share, _, _ = self.explains(self.repaired, name, gap_after)
             if np.isfinite(share):
                 by_prediction = presence_by_prediction(in_repairs.get(name, 0.0), share, share_left)
-                presence[name] = max(by_prediction, self.said.probabilities.presence[name])
+                presence[name] = max(by_prediction, self.judgement.probabilities.presence[name])
         return presence
 
     def answer(self, rng: np.random.Generator) -> Diagnosis:
         """The record of the judgement; what a time limit left out is a doubt."""
         likeliest = max(self.found, key=lambda hypothesis: hypothesis.log_weight_with_unknown)
-        left_out = [what for what in self.search.skipped_for_time if what not in self.said.untried]
+        left_out = [what for what in self.search.skipped_for_time if what not in self.judgement.untried]
         doubts = (f"the time limit left out {', '.join(left_out)}",) if left_out else ()
-        looks_like = self.said.verdict == "unknown" and not likeliest.is_answer
+        looks_like = self.judgement.verdict == "unknown" and not likeliest.is_answer
         return self.recorded(
             rng,
             held_out_decided=self.held_out_decided,
@@ -192,10 +192,10 @@ class KnownNoise(Judge[Hypothesis]):
     def explains(self, fit: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
         """See `Judge.explains`: without an interval, and NaN where the set without the effect was not
         fitted."""
-        others = {other for other in fit.names if other != name}
+        other_names = {other for other in fit.names if other != name}
         gap_without = self.gap_refit
-        if others:
-            fitted = [h for h in self.found if h.is_answer and set(h.names) == others]
+        if other_names:
+            fitted = [h for h in self.found if h.is_answer and set(h.names) == other_names]
             gap_without = min((self._validation_gap(h) for h in fitted), default=float("nan"))
         beyond_noise = self.gap_refit**2 - self.floor**2
         explained = (gap_without**2 - gap_after**2) / beyond_noise if beyond_noise > 0 else float("nan")
@@ -215,7 +215,7 @@ class KnownNoise(Judge[Hypothesis]):
         case = self.search.case
         if not isinstance(case, Case):
             return ()
-        weighed = self.said.probabilities
+        weighed = self.judgement.probabilities
         answers = [h for h in self.found if h.is_answer]
         look_alikes = [h for h in self.found if not h.is_answer]
         competing = competing_hypotheses(case, answers, weighed.sets)

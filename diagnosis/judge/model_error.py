@@ -90,7 +90,7 @@ class BesideModelError(Judge[Explanation]):
     """
 
     search: Search
-    said: JudgedSets
+    judgement: JudgedSets
 
     def __init__(self, search: Search, rng: np.random.Generator) -> None:
         """Judge what a search has fitted.
@@ -104,8 +104,8 @@ class BesideModelError(Judge[Explanation]):
         search.progress(1.0, "done")
         repairs = Repairs(search, nominal)
         while True:
-            self.said = judging.judged(search, nominal, shares_of_sets(repairs.trials))
-            named = self.said.fitted(self.said.accepted)
+            self.judgement = judging.judged(search, nominal, shares_of_sets(repairs.trials))
+            named = self.judgement.fitted(self.judgement.accepted)
             self.repair = repairs.best(named)
             surely_worse = self._surely_worse(repairs, named)
             if not surely_worse:
@@ -114,16 +114,16 @@ class BesideModelError(Judge[Explanation]):
         self.trials = repairs.trials
         self.repaired = self.repair.explanation
         self.shares = shares_of(
-            search, self.said.accepted or self.repair.names, self.repaired, self.said.nominal, rng
+            search, self.judgement.accepted or self.repair.names, self.repaired, self.judgement.nominal, rng
         )
-        cause = self.said.probabilities.cause
+        cause = self.judgement.probabilities.cause
         self.names_something = cause["none"] + cause["unknown"] < 0.5
-        likeliest = self.said.judged[0].explanation
-        self.looks_like = self.said.answer == "unknown" and not set(likeliest.names) <= set(
+        likeliest = self.judgement.judged[0].explanation
+        self.looks_like = self.judgement.answer == "unknown" and not set(likeliest.names) <= set(
             search.case.machine.weighing.listed
         )
         self.stated = search.at_stated_values()
-        self.refit = self.said.nominal
+        self.refit = self.judgement.nominal
         self.complete = judging.below_threshold(search, self.repaired)
         self.sets = best_of_sets(search.explanations)
 
@@ -133,7 +133,11 @@ class BesideModelError(Judge[Explanation]):
         Not asked are those of the repair, those that were refuted already, and those about which validation
         records say nothing.
         """
-        holding = [one.explanation for one in self.said.judged if named <= set(one.explanation.names)]
+        holding = [
+            judged_set.explanation
+            for judged_set in self.judgement.judged
+            if named <= set(judged_set.explanation.names)
+        ]
         if not named or not holding:
             return set()
         likeliest = holding[0]
@@ -147,14 +151,14 @@ class BesideModelError(Judge[Explanation]):
         """The record of the judgement, with shares and what the next experiment is to part."""
         return self.recorded(
             rng,
-            unlisted=self.said.judged[0].explanation.fit.effects if self.looks_like else (),
+            unlisted=self.judgement.judged[0].explanation.fit.effects if self.looks_like else (),
             shares=self.shares,
-            competing=_competing(self.search, self.said),
+            competing=_competing(self.search, self.judgement),
         )
 
     def holding(self, name: str) -> Explanation | None:
         """See `Judge.holding`: the repaired model, then the most probable set, then the likeliest one."""
-        judged = [one.explanation for one in self.said.judged]
+        judged = [judged_set.explanation for judged_set in self.judgement.judged]
         for fit in (self.repaired, *judged, *self.sets.values()):
             if name in fit.names:
                 return fit
@@ -182,7 +186,7 @@ class BesideModelError(Judge[Explanation]):
         return float(np.clip(closed, 0.0, 1.0)), float("nan"), float("nan")
 
 
-def _competing(search: Search, said: JudgedSets) -> tuple[CompetingHypothesis, ...]:
+def _competing(search: Search, judgement: JudgedSets) -> tuple[CompetingHypothesis, ...]:
     """Sets whose effects contradict each other, for the experiment that parts them, most probable first.
 
     One standard deviation of an output is what the likelihood counts as one: the energies that do not
@@ -191,11 +195,11 @@ def _competing(search: Search, said: JudgedSets) -> tuple[CompetingHypothesis, .
     case = search.case
     records = search.records
     contradicting: dict[tuple[str, ...], Fit] = {}
-    for one in said.judged:
-        key = tuple(sorted(one.holding(0.5)))
+    for judged_set in judgement.judged:
+        key = tuple(sorted(judged_set.holding(0.5)))
         related = [other for other in contradicting if set(key) <= set(other) or set(other) <= set(key)]
         if key and not related:
-            contradicting[key] = one.explanation.fit
+            contradicting[key] = judged_set.explanation.fit
 
     # Bands are ordered by record, octave and output.
     outputs = case.noise.size
@@ -212,7 +216,7 @@ def _competing(search: Search, said: JudgedSets) -> tuple[CompetingHypothesis, .
             end.deviations,
             end.coordinates,
             end.precision(records) / TEMPER,
-            said.probability(key),
+            judgement.probability(key),
             noise,
             key,
         )

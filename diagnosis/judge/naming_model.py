@@ -63,10 +63,10 @@ class NamingModel:
 
         Where none of the sets is a repair, evidence alone counts.
         """
-        features = np.array([one.features for one in sets])
-        log_priors = np.array([one.log_prior for one in sets])
+        features = np.array([set_features.features for set_features in sets])
+        log_priors = np.array([set_features.log_prior for set_features in sets])
         by_evidence = softmax(features @ self.of_set + log_priors)
-        repair_shares = np.array([one.repair_share for one in sets])
+        repair_shares = np.array([set_features.repair_share for set_features in sets])
         if not np.sum(repair_shares) > 0:
             return np.asarray(by_evidence)
         by_prediction = repair_shares / np.sum(repair_shares)

@@ -228,9 +228,9 @@ def best_without(
     explanations: Mapping[tuple[str, ...], Explanation], explanation: Explanation, name: str
 ) -> Explanation:
     """The set without this effect; where nobody fitted that, the likeliest of its parts."""
-    others = {other for other in explanation.names if other != name}
-    parts = [part for key, part in explanations.items() if others.issuperset(key)]
-    return max(parts, key=lambda part: (len(part.names) == len(others), part.log_evidence))
+    other_names = {other for other in explanation.names if other != name}
+    parts = [part for key, part in explanations.items() if other_names.issuperset(key)]
+    return max(parts, key=lambda part: (len(part.names) == len(other_names), part.log_evidence))
 
 
 def is_silent(search: Search, explanation: Explanation, name: str) -> bool:

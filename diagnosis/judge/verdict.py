@@ -48,7 +48,7 @@ class JudgedEffect:
 
     @property
     def probability(self) -> float:
-        """That it is there and interests, if its set is the right one."""
+        """Probability that the effect is there and interests, if its set is the right one."""
         return self.features.interests * self.genuine
 
 
@@ -104,11 +104,11 @@ class JudgedSets(Judgement):
     nominal: Explanation = field(kw_only=True)
 
     def fitted(self, names: Iterable[str]) -> set[str]:
-        """Those of the names that are in fitted sets: rounding of a sensor is in none."""
+        """Names without rounding of a sensor, which is in no fitted set."""
         return set(names) - ({self.rounding.name} if self.rounding else set())
 
     def probability(self, fitted: Iterable[str]) -> float:
-        """Of exactly these fitted effects, with rounding where that interests."""
+        """Probability of exactly these fitted effects, with rounding where that interests."""
         rounding = () if self.rounding is None else (self.rounding.name,)
         return self.probabilities.sets.get(tuple(sorted((*fitted, *rounding))), 0.0)
 
@@ -138,14 +138,18 @@ def look_closer(search: Search, nominal: Explanation) -> None:
         sets = _judged_sets(search, nominal, {})
         if search.out_of_time:
             return
-        near = [one for one in sets if one.probability > sets[0].probability * np.exp(-SUBSTANTIAL)]
-        for one in near:
-            search.add_exchanged(one.explanation, one.holding(0.5))
+        near = [
+            judged_set
+            for judged_set in sets
+            if judged_set.probability > sets[0].probability * np.exp(-SUBSTANTIAL)
+        ]
+        for judged_set in near:
+            search.add_exchanged(judged_set.explanation, judged_set.holding(0.5))
         likeliest = sets[0].explanation
         if len(likeliest.names) > 1:
             for place in range(len(likeliest.names)):
                 search.without_effect(likeliest, place)
-        for explanation in [*(one.explanation for one in near), *search.explanations[known:]]:
+        for explanation in [*(judged_set.explanation for judged_set in near), *search.explanations[known:]]:
             search.add_simpler(explanation)
         if len(search.explanations) == known:
             return
@@ -177,7 +181,11 @@ def judged(search: Search, nominal: Explanation, repair_shares: Mapping[Names, f
     untried = search.untried
     probabilities = probabilities.with_untried(untried, larger=len(search.skipped_for_time) > 0)
     answer = probabilities.counting_as_unknown(untried).answer
-    shares = {effect.features.name: effect.features.share for one in reversed(sets) for effect in one.effects}
+    shares = {
+        effect.features.name: effect.features.share
+        for judged_set in reversed(sets)
+        for effect in judged_set.effects
+    }
     if rounding is not None:
         shares[rounding.name] = rounding_share
     return JudgedSets(
@@ -245,20 +253,20 @@ def _judged_sets(
     explanations = explanations_to_judge(search, nominal)
     features = features_of_sets(search, explanations, repair_shares)
     probabilities = model.set_probabilities(features)
-    kept: list[tuple[float, SetFeatures]] = []
-    for probability, one in zip(probabilities, features, strict=True):
+    remaining: list[tuple[float, SetFeatures]] = []
+    for probability, set_features in zip(probabilities, features, strict=True):
         if probability >= _NEGLIGIBLE * np.max(probabilities):
-            kept.append((float(probability), one))
-    kept.sort(key=lambda pair: -pair[0])
-    total = sum(probability for probability, _ in kept)
+            remaining.append((float(probability), set_features))
+    remaining.sort(key=lambda pair: -pair[0])
+    total = sum(probability for probability, _ in remaining)
     sets = []
-    for probability, one in kept:
+    for probability, set_features in remaining:
         effects = tuple(
             JudgedEffect(effect, model.is_genuine(effect))
-            for effect in features_of_effects(search, one.explanation, explanations)
+            for effect in features_of_effects(search, set_features.explanation, explanations)
         )
-        unlisted = model.has_unlisted_cause(one.rest_features, search.case.machine.weighing.stated)
-        sets.append(JudgedSet(probability / total, effects, unlisted, one.explanation))
+        unlisted = model.has_unlisted_cause(set_features.rest_features, search.case.machine.weighing.stated)
+        sets.append(JudgedSet(probability / total, effects, unlisted, set_features.explanation))
     return tuple(sets)
 
 
@@ -279,22 +287,22 @@ def probabilities_of_answers(sets: Sequence[WeightedSet], listed: Sequence[str])
     of_sets: dict[Names, float] = {(): 0.0, ("unknown",): 0.0}
     cause = {"none": 0.0, **dict.fromkeys(listed, 0.0), "unknown": 0.0}
     presence = dict.fromkeys(listed, 0.0)
-    for one in sets:
-        none_there = one.probability
-        all_small = one.probability
-        for effect in one.effects:
+    for judged_set in sets:
+        none_there = judged_set.probability
+        all_small = judged_set.probability
+        for effect in judged_set.effects:
             none_there *= 1 - effect.probability
             all_small *= 1 - effect.features.interests
-        of_sets[()] += all_small * (1 - one.unlisted_beside)
-        of_sets[("unknown",)] += none_there - all_small + all_small * one.unlisted_beside
+        of_sets[()] += all_small * (1 - judged_set.unlisted_beside)
+        of_sets[("unknown",)] += none_there - all_small + all_small * judged_set.unlisted_beside
 
-        possible = [effect for effect in one.effects if effect.probability > 0]
+        possible = [effect for effect in judged_set.effects if effect.probability > 0]
         for count in range(1, len(possible) + 1):
-            for there in combinations(possible, count):
-                probability = one.probability
+            for present in combinations(possible, count):
+                probability = judged_set.probability
                 for effect in possible:
-                    probability *= effect.probability if effect in there else 1 - effect.probability
-                names = [effect.features.name for effect in there]
+                    probability *= effect.probability if effect in present else 1 - effect.probability
+                names = [effect.features.name for effect in present]
                 key = tuple(sorted(names))
                 of_sets[key] = of_sets.get(key, 0.0) + probability
                 # The one that carries most is the main cause.

@@ -83,7 +83,7 @@ class PredictionError:
 
     @property
     def standard_error(self) -> float:
-        """Of the energy itself: sqrt(B) times the standard deviation between blocks."""
+        """Standard error of the energy itself: sqrt(B) times the standard deviation between blocks."""
         return float(np.sqrt(self.energy.size) * np.std(self.energy, ddof=1))
 
     def as_good_as(self, best: PredictionError, uninteresting: float = 0.0) -> bool:

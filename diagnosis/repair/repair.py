@@ -197,10 +197,11 @@ class Repairs(Generic[E]):
         return [self.search.nominal_alone, *(likeliest[key] for key in shortlist)]
 
     def _all_moved(self) -> npt.NDArray[np.bool_]:
+        """(P,) True for every nominal value."""
         return np.ones(self.search.records.nominal.count, dtype=bool)
 
     def _validation_error(self, explanation: E) -> PredictionError:
-        """Of a model as it was fitted, in the validation records."""
+        """Prediction error of a model, as it was fitted, in the validation records."""
         held_out = self.search.case.held_out
         residuals = self.search.whitened_residuals(explanation, held_out)
         return PredictionError.of([residuals[record.name] for record in held_out])
@@ -275,8 +276,8 @@ class Repairs(Generic[E]):
         return min(ends, key=lambda tried: tried.loss)
 
     def _smallest_set(self, named: Collection[str]) -> Trial[E]:
-        """Of the sets that predict as well as the best: with most of the named effects, then with fewest
-        effects, then the likeliest."""
+        """The set with most of the named effects, of those that predict as well as the best; of several the one
+        with fewest effects, then the likeliest."""
         best = min(self.trials, key=lambda trial: trial.error.rms)
         uninteresting = self.search.uninteresting_energy
         as_good = [trial for trial in self.trials if trial.error.as_good_as(best.error, uninteresting)]
@@ -288,7 +289,7 @@ class Repairs(Generic[E]):
         return min(as_good, key=rank)
 
     def _fewest_values(self, chosen: Trial[E]) -> Trial[E]:
-        """The same effects with as few nominal values moved as predict as well as the best number of them.
+        """A trial of the same effects with as few values moved as predict as well as the best number of them.
 
         Which value goes back next is told by the fit with all of them moved: the one without which the
         estimation records lose least.
