@@ -32,12 +32,15 @@ from plant.effects.search_space import Candidate
 from plant.rig import Rig
 from plant.simulation import simulate
 
-# In tolerances: small against one, large against the wobble of friction.
+# Step of a difference quotient, in tolerances: small against one, large against the wobble of friction.
 _DEVIATION_STEP = 0.02
-# At most so many explanations are told apart by the next experiment.
+# At most so many explanations are told apart by the next experiment: three make three pairs, which a page can
+# name.
 MOST_COMPETING = 3
 # A set less probable than this is only kept when there would be none at all without it.
 _SURVIVES = 0.01
+# Relative size of singular values of normal equations that are rounding.
+_ROUNDING = 1e-13
 
 
 def simulated(machine: Any, effects: Sequence[Any], inputs: Real) -> Real:
@@ -51,7 +54,7 @@ def simulated(machine: Any, effects: Sequence[Any], inputs: Real) -> Real:
 class CompetingHypothesis:
     """One explanation that is left.
 
-    probability : float
+    probability : float. 0 to 1; a ValueError else.
     rig : Rig, or Plant of one's own. With its fitted nominal parameters.
     effects : tuple of Effect, or of Change of an own plant
     directions : callable. Voltage (T,), or inputs (T, U) of an own plant -> derivatives (Y T, P) of the
@@ -74,7 +77,8 @@ class CompetingHypothesis:
     noise: Real = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        if not 0 <= self.probability <= 1 + 1e-9:  # a sum of shares may round above one
+        # A sum of shares may round above one.
+        if not 0 <= self.probability <= 1 + 1e-9:
             raise ValueError(f"a hypothesis' probability lies between 0 and 1; got {self.probability}")
         object.__setattr__(self, "effects", tuple(self.effects))
         if not self.noise.size:
@@ -90,34 +94,57 @@ class CompetingHypothesis:
 
 
 def competing_hypotheses(
-    case: Case, hypotheses: Sequence[Hypothesis], sets: Mapping[tuple[str, ...], float], at_most: int = 3
+    case: Case,
+    hypotheses: Sequence[Hypothesis],
+    sets: Mapping[tuple[str, ...], float],
+    at_most: int = MOST_COMPETING,
 ) -> tuple[CompetingHypothesis, ...]:
     """The most probable fitted sets of effects that contradict each other; two at least if there are two.
 
     A set that contains a more probable one, or lies within it, names the same cause and more or less beside
     it: they do not compete.
 
-    hypotheses : Of `search`; the best of every set counts.
-    sets : Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown")
-        are passed over.
+    Parameters
+    ----------
+    case : Case
+    hypotheses : sequence of Hypothesis
+        Of a search; the best of every set counts.
+    sets : tuple of str -> float
+        Sorted effect names -> probability, as `probabilities` gives them; names without a fit ("unknown") are
+        passed over.
+    at_most : int
     """
-    best = best_of_sets(hypotheses, lambda h: h.log_weight)
+    best = best_of_sets(hypotheses, lambda hypothesis: hypothesis.log_weight)
     # Equally hopeless sets have probabilities of zero alike: their weight orders them.
+    most_probable_first = sorted(
+        best, key=lambda key: (sets.get(key, 0.0), best[key].log_weight), reverse=True
+    )
     kept: list[tuple[str, ...]] = []
-    for key in sorted(best, key=lambda k: (sets.get(k, 0.0), best[k].log_weight), reverse=True):
+    for key in most_probable_first:
         if len(kept) == at_most or (len(kept) >= 2 and sets.get(key, 0.0) < _SURVIVES):
             break
-        # No effect at all competes with everything, though it is contained in every set.
-        if not any(key and other and (set(key) <= set(other) or set(other) <= set(key)) for other in kept):
+        if not any(_name_the_same(key, other) for other in kept):
             kept.append(key)
     return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
 
 
+def _name_the_same(key: tuple[str, ...], other: tuple[str, ...]) -> bool:
+    """Whether one set of effects holds the other. The empty one competes with all, though all hold it."""
+    if not key or not other:
+        return False
+    return set(key) <= set(other) or set(other) <= set(key)
+
+
 def competing_hypothesis(case: Case, fit: Fit, probability: float) -> CompetingHypothesis:
     """A fit as a hypothesis: rig and effects, its free parameters (d, x) and their Gauss-Newton precision."""
-    nominal = NominalParameters(case.machine)
     return fitted_hypothesis(
-        nominal, fit.candidates, fit.deviations, fit.coordinates, fit.hessian, probability, case.noise
+        NominalParameters(case.machine),
+        fit.candidates,
+        fit.deviations,
+        fit.coordinates,
+        fit.hessian,
+        probability,
+        case.noise,
     )
 
 
@@ -131,36 +158,62 @@ def fitted_hypothesis(
     noise: Real,
     causes: tuple[str, ...] = (),
 ) -> CompetingHypothesis:
-    """The same of deviations (P,) and coordinates (A,) of the candidates, which `precision` (P + A, P + A)
-    belongs to; noise (Y,), causes: as in `CompetingHypothesis`."""
+    """A fitted model as a hypothesis whose nominal values and effect sizes may still follow new records.
+
+    Parameters
+    ----------
+    nominal : NominalParameters
+        What makes a machine of deviations.
+    candidates : sequence of Candidate
+        Effects of the model.
+    deviations : (P,) array
+        Of the nominal values, in tolerances.
+    coordinates : (A,) array
+        Of the candidates' sizes, all axes.
+    precision : (P + A, P + A) array
+        What the records know about both, deviations first.
+    probability : float
+        0 to 1.
+    noise : (Y,) array
+        In the outputs' units.
+    causes : tuple of str, optional
+        As in `CompetingHypothesis`.
+    """
     fitted = effects_at(candidates, coordinates)
 
     def outputs(deviations: Real, effects: Sequence[Any], voltage: Real) -> Real:
         return np.asarray((simulated(nominal.at(deviations).description, effects, voltage) / noise).ravel())
 
-    axes = np.array([c.dependence != "non-smooth" for c in candidates for _ in c.axes], dtype=bool)
-    calm_coordinates = coordinates[axes]
+    # Contacts say little about a small change of a nominal parameter and cost most of the time: derivatives
+    # by nominal values are taken without them.
+    smooth = [candidate for candidate in candidates if candidate.dependence != "non-smooth"]
+    is_smooth = np.array(
+        [candidate.dependence != "non-smooth" for candidate in candidates for _ in candidate.axes],
+        dtype=bool,
+    )
+    smooth_coordinates = coordinates[is_smooth]
+    steps = np.array([axis.step for candidate in candidates for axis in candidate.axes])
+    highest = bounds_of(candidates)[1]
 
     def directions(voltage: Real) -> Real:
-        # Contacts say little about a small change of a nominal parameter and cost most of the time.
-        calm = effects_at([c for c in candidates if c.dependence != "non-smooth"], calm_coordinates)
-        start = outputs(deviations, calm, voltage)
-        by_d = difference_quotients(
-            lambda d: outputs(d, calm, voltage),
+        smooth_effects = effects_at(smooth, smooth_coordinates)
+        start = outputs(deviations, smooth_effects, voltage)
+        by_deviation = difference_quotients(
+            lambda d: outputs(d, smooth_effects, voltage),
             deviations,
             start,
             np.full(nominal.count, _DEVIATION_STEP),
         )
-        if len(calm) < len(fitted):
+        if len(smooth_effects) < len(fitted):
             start = outputs(deviations, fitted, voltage)
-        by_x = difference_quotients(
+        by_coordinate = difference_quotients(
             lambda x: outputs(deviations, effects_at(candidates, x), voltage),
             coordinates,
             start,
-            np.array([axis.step for candidate in candidates for axis in candidate.axes]),
-            bounds_of(candidates)[1],
+            steps,
+            highest,
         )
-        return np.hstack([by_d, by_x])
+        return np.hstack([by_deviation, by_coordinate])
 
     rig = nominal.at(deviations).description
     return CompetingHypothesis(probability, rig, fitted, directions, precision, causes, noise=noise)
@@ -172,23 +225,40 @@ def distances(
     whitened: Sequence[Real],
     scale: Real | None = None,
 ) -> tuple[Real, list[Real]]:
-    """d of every pair in standard deviations, and what parameters leave of its difference (Y T,).
+    """How far every pair comes apart by one experiment.
 
-    whitened: every hypothesis' outputs (Y T,) in noise deviations for the voltage (T,), sample by sample.
-    scale (Y T,): noise of the hypotheses over the one that these are whitened by; by default the same.
+    Parameters
+    ----------
+    competing : sequence of CompetingHypothesis
+    voltage : (T,) array, or inputs (T, U) of an own plant
+    whitened : sequence of (Y T,) arrays
+        Every hypothesis' outputs for it in noise deviations, sample by sample.
+    scale : (Y T,) array, optional
+        Noise of the hypotheses over the one that these are whitened by; by default the same.
+
+    Returns
+    -------
+    apart : (pairs,) array
+        d of the module's first lines, in standard deviations.
+    remains : list of (Y T,) arrays
+        What free parameters leave of each pair's difference.
     """
-    free = [
-        np.zeros((whitened[0].size, 0)) if one.directions is None else one.directions(voltage)
-        for one in competing
-    ]
-    if scale is not None:
-        free = [scale[:, None] * derivatives for derivatives in free]
-    found, remains = [], []
+    derivatives = []
+    for hypothesis in competing:
+        if hypothesis.directions is None:
+            of_hypothesis = np.zeros((whitened[0].size, 0))
+        else:
+            of_hypothesis = hypothesis.directions(voltage)
+        derivatives.append(of_hypothesis if scale is None else scale[:, None] * of_hypothesis)
+
+    apart = []
+    remains = []
     for i, j in combinations(range(len(competing)), 2):
-        D, J = whitened[i] - whitened[j], np.hstack([free[i], free[j]])
+        D = whitened[i] - whitened[j]
+        J = np.hstack([derivatives[i], derivatives[j]])
         L = block_diag(competing[i].precision, competing[j].precision)
         moment = J.T @ D
-        absorbed = np.linalg.lstsq(J.T @ J + L, moment, rcond=1e-13)[0]
-        found.append(np.sqrt(max(float(D @ D - moment @ absorbed), 0.0)))
+        absorbed = np.linalg.lstsq(J.T @ J + L, moment, rcond=_ROUNDING)[0]
+        apart.append(np.sqrt(max(float(D @ D - moment @ absorbed), 0.0)))
         remains.append(np.asarray(D - J @ absorbed))
-    return np.array(found), remains
+    return np.array(apart), remains

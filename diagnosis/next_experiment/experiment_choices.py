@@ -17,10 +17,42 @@ from plant.excitation import Grid, doublet, log_chirp, multisine, multisine_line
 Integer = npt.NDArray[np.int64]
 Parameters = Mapping[str, float | int | str]
 
+# Samples of an experiment at least: its slow kinds have twelve parts, and each needs some samples.
+_LEAST_SAMPLES = 100
+# Standard deviations of its noise that a deflection is measured too large by at most.
+_NOISE_OF_LARGEST = 3.0
+# Samples for which the fast binary signal holds: a quarter of the sampling rate, which drives still follow.
+_FAST_HOLD = 4
+# The slow one changes at most so often in a record, and holds for five samples at least.
+_SLOW_CHANGES = 60
+_LEAST_SLOW_HOLD = 5
+# Highest lines of the two multisines, and ends of the two chirps, over the Nyquist frequency. Chosen: a wide
+# one for delays and modes, a slow one for friction and springs.
+_WIDE = 0.35
+_SLOW = 0.06
+_CHIRP_WIDE = 0.6
+_CHIRP_SLOW = 0.05
+# Lengths of the pulses of the two doublets, and of a period of the triangle, as parts of a record.
+_SHORT_PULSES = 40
+_LONG_PULSES = 6
+_TRIANGLES = 3
+# Steps of the record with rests: four heights, each with its negative.
+_STEPS = 8
+# Smallest of these heights over the largest: where dry friction weighs most.
+_LOWEST_STEP = 0.25
+# Draws of phases of a multisine, of which the flattest signal is taken.
+_DRAWS = 20
+# Rounds of scaling an excitation into its limits: a nonlinear machine does not scale exactly.
+_SCALINGS = 5
+# What an excitation is scaled to, as a part of the limit it exceeds.
+_INSIDE = 0.95
+# Part of the voltage limit below which an excitation is of no use.
+_LEAST_VOLTAGE = 0.01
+
 
 @dataclass(frozen=True)
 class Limits:
-    """What an experiment may ask of the machine.
+    """What an experiment may ask of the machine; a ValueError where one is not positive.
 
     voltage_V : float. Largest commanded voltage.
     hub_angle_rad : float. Largest deviation of the hub angle from the start.
@@ -44,17 +76,26 @@ class Limits:
         deflection is the measured one less three deviations of its noise; without a tip position it has no
         limit.
         """
-        reach = case.rig.hub.radius_m + case.rig.link.length_m
-        hubs = [x.output[:, 0] - (x.output[0, 0] if case.model_error > 0 else 0.0) for x in case.experiments]
-        voltage = max(float(np.max(np.abs(x.voltage_V))) for x in case.experiments)
-        angle = max(float(np.max(np.abs(hub))) for hub in hubs)
+        zero_is_known = not case.model_error > 0
+        voltage = 0.0
+        angle = 0.0
+        for experiment in case.experiments:
+            hub = experiment.output[:, 0]
+            start = 0.0 if zero_is_known else hub[0]
+            voltage = max(voltage, float(np.max(np.abs(experiment.voltage_V))))
+            angle = max(angle, float(np.max(np.abs(hub - start))))
         if "tip_m" not in case.outputs:
             return cls(voltage, angle)
+
         tip = case.outputs.index("tip_m")
+        reach = case.rig.hub.radius_m + case.rig.link.length_m
         noise = float(np.hypot(case.noise[tip], reach * case.noise[0]))
-        bends = [x.output[:, tip] - reach * x.output[:, 0] for x in case.experiments]
-        bends = [bend - np.mean(bend) if case.model_error > 0 else bend for bend in bends]
-        return cls(voltage, angle, max(max(float(np.max(np.abs(bend))) for bend in bends) - 3 * noise, noise))
+        largest = 0.0
+        for experiment in case.experiments:
+            deflection = experiment.output[:, tip] - reach * experiment.output[:, 0]
+            middle = 0.0 if zero_is_known else np.mean(deflection)
+            largest = max(largest, float(np.max(np.abs(deflection - middle))))
+        return cls(voltage, angle, max(largest - _NOISE_OF_LARGEST * noise, noise))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,9 +111,11 @@ class Excitation:
 
     @property
     def amplitude_V(self) -> float:
+        """Largest voltage."""
         return float(np.max(np.abs(self.voltage_V)))
 
     def scaled(self, factor: float) -> Excitation:
+        """Every voltage times a factor."""
         return replace(self, voltage_V=self.voltage_V * factor)
 
 
@@ -84,28 +127,36 @@ def excitations(
     Random binary (fast, slow), multisine (wide, odd lines at low frequency), doublet (short, long), slow
     triangle through reversals, steps with rests, chirp (up, and slow alone).
 
-    Raises ValueError: fewer than 100 samples, or a voltage or period that is not positive.
+    Raises
+    ------
+    ValueError
+        Fewer than 100 samples, or a voltage or period that is not positive.
     """
-    if not n_samples >= 100:
-        raise ValueError(f"an experiment needs at least 100 samples; got {n_samples}")
+    if not n_samples >= _LEAST_SAMPLES:
+        raise ValueError(f"an experiment needs at least {_LEAST_SAMPLES} samples; got {n_samples}")
     if not (0 < voltage_V < np.inf and 0 < dt_s < np.inf):
         raise ValueError(f"need a positive voltage and sampling period; got {voltage_V} V and {dt_s} s")
-    T, nyquist, duration = n_samples, 0.5 / dt_s, n_samples * dt_s
+    T = n_samples
+    nyquist_Hz = 0.5 / dt_s
+    duration_s = n_samples * dt_s
+    slow_hold = max(T // _SLOW_CHANGES, _LEAST_SLOW_HOLD)
+    phase = 2 * np.pi * (np.arange(T) * _TRIANGLES / T) + np.pi / 2
+    triangle = Excitation(
+        "triangle",
+        {"period_s": round(duration_s / _TRIANGLES, 6)},
+        voltage_V * sawtooth(phase, 0.5),
+    )
     return (
-        _binary(voltage_V, T, 4, rng),
-        _binary(voltage_V, T, max(T // 60, 5), rng),
-        _multisine(voltage_V, T, dt_s, 0.35 * nyquist, "full", rng),
-        _multisine(voltage_V, T, dt_s, 0.06 * nyquist, "odd_random", rng),
-        _doublet(voltage_V, T, dt_s, T // 40),
-        _doublet(voltage_V, T, dt_s, T // 6),
-        Excitation(
-            "triangle",
-            {"period_s": round(T * dt_s / 3, 6)},
-            voltage_V * sawtooth(2 * np.pi * (np.arange(T) * 3 / T) + np.pi / 2, 0.5),
-        ),
-        _steps(voltage_V, T, dt_s, 8, rng),
-        _chirp(voltage_V, T, dt_s, 1 / duration, 0.6 * nyquist),
-        _chirp(voltage_V, T, dt_s, 0.5 / duration, 0.05 * nyquist),
+        _binary(voltage_V, T, _FAST_HOLD, rng),
+        _binary(voltage_V, T, slow_hold, rng),
+        _multisine(voltage_V, T, dt_s, _WIDE * nyquist_Hz, "full", rng),
+        _multisine(voltage_V, T, dt_s, _SLOW * nyquist_Hz, "odd_random", rng),
+        _doublet(voltage_V, T, dt_s, T // _SHORT_PULSES),
+        _doublet(voltage_V, T, dt_s, T // _LONG_PULSES),
+        triangle,
+        _steps(voltage_V, T, dt_s, _STEPS, rng),
+        _chirp(voltage_V, T, dt_s, 1 / duration_s, _CHIRP_WIDE * nyquist_Hz),
+        _chirp(voltage_V, T, dt_s, 0.5 / duration_s, _CHIRP_SLOW * nyquist_Hz),
     )
 
 
@@ -119,20 +170,30 @@ def within(
 ) -> Excitation | None:
     """The excitation, scaled down until its largest hub angle and deflection stay in the limits.
 
-    respond gives both for a voltage (T,). Five scalings at most (a nonlinear machine does not scale exactly);
-    None if the last is still outside or below a hundredth of the voltage limit.
+    Parameters
+    ----------
+    excitation : Excitation
+    limits : Limits
+    respond : callable
+        Voltage (T,) -> largest hub angle [rad] and deflection [m].
+
+    Returns
+    -------
+    Excitation or None
+        None if it is still outside after five scalings, below a hundredth of the voltage limit, or if the
+        response is not finite.
     """
     if excitation.amplitude_V > limits.voltage_V * (1 + 1e-9):
         excitation = excitation.scaled(limits.voltage_V / excitation.amplitude_V)
-    for _ in range(5):
+    for _ in range(_SCALINGS):
         angle, deflection = respond(excitation.voltage_V)
         excess = max(angle / limits.hub_angle_rad, deflection / limits.deflection_m)
         if not np.isfinite(excess):
             return None
         if excess <= 1:
             return excitation
-        excitation = excitation.scaled(0.95 / excess)
-        if excitation.amplitude_V < 0.01 * limits.voltage_V:
+        excitation = excitation.scaled(_INSIDE / excess)
+        if excitation.amplitude_V < _LEAST_VOLTAGE * limits.voltage_V:
             return None
     return None
 
@@ -140,7 +201,10 @@ def within(
 def tailored_excitations(
     lines: Integer, n_samples: int, dt_s: float, voltage_V: float, rng: np.random.Generator
 ) -> list[Excitation]:
-    """Multisine of the given lines, two periods, and the binary signal of its signs, which has more power."""
+    """Multisine of the given lines, two periods, and the binary signal of its signs, which has more power.
+
+    lines : (L,) of a period of half the samples, ascending. Both have the largest voltage voltage_V.
+    """
     period = n_samples // 2
     signal = _two_periods(lines, n_samples, rng)
     parameters: Parameters = {
@@ -155,6 +219,7 @@ def tailored_excitations(
 
 
 def _binary(voltage: float, T: int, hold: int, rng: np.random.Generator) -> Excitation:
+    """Pseudo-random binary signal (T,) that holds each value for some samples, without repeating itself."""
     length = int(np.clip(np.ceil(np.log2(T / hold + 1)), 4, 20))
     return Excitation("random binary", {"hold_samples": hold}, prbs(length, hold, voltage, T, rng))
 
@@ -162,6 +227,7 @@ def _binary(voltage: float, T: int, hold: int, rng: np.random.Generator) -> Exci
 def _multisine(
     voltage: float, T: int, dt: float, high_Hz: float, grid: Grid, rng: np.random.Generator
 ) -> Excitation:
+    """Two periods (T,) of a multisine from its lowest line up to a frequency."""
     period = T // 2
     low = 0.99 / (period * dt)
     lines = multisine_lines(period, dt, (low, max(high_Hz, 12 * low)), grid, rng)
@@ -175,17 +241,19 @@ def _multisine(
 
 
 def _two_periods(lines: Integer, T: int, rng: np.random.Generator) -> Real:
-    return np.resize(multisine(lines, T // 2, 1.0, rng, periods=2, draws=20), T)
+    """(T,) two periods of a flat multisine; of an odd T one sample of a third."""
+    return np.resize(multisine(lines, T // 2, 1.0, rng, periods=2, draws=_DRAWS), T)
 
 
 def _doublet(voltage: float, T: int, dt: float, pulse: int) -> Excitation:
+    """A pulse of some samples, two at least, and its negative, then rest (T,)."""
     pulse = max(pulse, 2)
     return Excitation("doublet", {"pulse_s": round(pulse * dt, 6)}, doublet(voltage, 0.0, pulse * dt, T, dt))
 
 
 def _steps(voltage: float, T: int, dt: float, count: int, rng: np.random.Generator) -> Excitation:
     """Steps of different height, each one followed by its negative and a rest, so that the hub comes back."""
-    heights = voltage * rng.permutation(np.linspace(1, 0.25, count // 2))
+    heights = voltage * rng.permutation(np.linspace(1, _LOWEST_STEP, count // 2))
     length = T // (3 * heights.size)
     pattern = np.concatenate([np.repeat([h, -h, 0.0], length) for h in heights])
     signal = np.concatenate([pattern, np.zeros(T - pattern.size)])
@@ -193,6 +261,7 @@ def _steps(voltage: float, T: int, dt: float, count: int, rng: np.random.Generat
 
 
 def _chirp(voltage: float, T: int, dt: float, low_Hz: float, high_Hz: float) -> Excitation:
+    """A sine (T,) whose frequency grows exponentially, by two octaves at least."""
     high = max(high_Hz, 4 * low_Hz)
     parameters = {"from_Hz": round(low_Hz, 4), "to_Hz": round(high, 4)}
     return Excitation("chirp", parameters, log_chirp(low_Hz, high, voltage, T, dt))

@@ -20,18 +20,24 @@ from diagnosis.next_experiment.experiment_choices import (
 )
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
+# Chosen; doubled, one pair that is far apart outweighs two that are not.
 _SETTLED = 20.0
-# Below this nothing is said to separate two hypotheses.
+# Below this many standard deviations nothing is said to separate two hypotheses: one in a thousand.
 _SEPARATES = 3.0
 # A runner-up with less than this share of the first hypothesis' probability is beaten.
 _DECIDED = 0.01
-# Enough amplitudes and phases that a handful of free parameters cannot absorb them.
+# Lines of a tailored excitation: enough amplitudes and phases that a handful of free parameters cannot absorb
+# them. Chosen; twice as many share the same voltage.
 _TAILORED_LINES = 12
+# Size of the weak excitations that are tried beside those at the limits.
+_WEAK = 1 / 3
+# Power of a line over that of the strongest one below which it is not driven.
+_DRIVEN = 1e-6
 
 
 @dataclass(frozen=True)
 class Separation:
-    """How far an experiment parts two hypotheses."""
+    """How far an experiment parts two hypotheses, by name; log_bayes_factor is the expected one."""
 
     hypotheses: tuple[str, str]
     standard_deviations: float
@@ -39,6 +45,7 @@ class Separation:
 
     @property
     def separated(self) -> bool:
+        """Whether the two come apart by three standard deviations."""
         return self.standard_deviations >= _SEPARATES
 
 
@@ -94,33 +101,51 @@ def next_experiment(
     n_samples: int = 1400,
     rng: np.random.Generator | None = None,
 ) -> NextExperiment:
-    """Choose among `excitations` of n_samples within the limits, and two made for these hypotheses.
+    """Choose among `excitations` within the limits, and two made for these hypotheses.
 
-    competing : Two at least, all with the same sampling period and noise.
-    rng : Of the random excitations; without it a fixed sequence.
+    Parameters
+    ----------
+    competing : sequence of CompetingHypothesis
+        Two at least, all with the same sampling period and noise.
+    limits : Limits
+    n_samples : int
+        Of every excitation; by default those of a record of the workshop.
+    rng : numpy Generator, optional
+        Of the random excitations; without it a fixed sequence.
 
-    Raises ValueError: fewer than two hypotheses, hypotheses that sample differently or are noise-free, no
-    excitation that stays in the limits.
+    Raises
+    ------
+    ValueError
+        Fewer than two hypotheses, hypotheses that sample differently or are noise-free, no excitation that
+        stays in the limits.
     """
     competing = tuple(competing)
     _check(competing)
     weights = pair_weights(competing)
     dt = competing[0].rig.sampling.dt_s
     rng = np.random.default_rng(0) if rng is None else rng
+
+    # Each at the limits; those that show friction and play also weaker; and what is made to measure.
     choices = list(excitations(limits.voltage_V, n_samples, dt, rng))
     looked_at = [_Prospect.of(choice, limits, competing) for choice in choices]
-    feasible = [p for p in looked_at if p is not None]
-    further = [p.excitation.scaled(1 / 3) for p in feasible if p.excitation.kind in ALSO_WEAK]
+    feasible = [prospect for prospect in looked_at if prospect is not None]
+    further = [
+        prospect.excitation.scaled(_WEAK) for prospect in feasible if prospect.excitation.kind in ALSO_WEAK
+    ]
     further += _tailored(feasible, competing, weights, limits, rng)
     looked_at += [_Prospect.of(choice, limits, competing) for choice in further]
     choices += further
-    prospects = sorted((p for p in looked_at if p is not None), key=lambda p: p.bound, reverse=True)
+    prospects = [prospect for prospect in looked_at if prospect is not None]
     if not prospects:
         raise ValueError(
             f"no experiment stays within {limits.hub_angle_rad} rad and {limits.deflection_m} m at a "
             f"hundredth of {limits.voltage_V} V or more: give wider limits"
         )
-    chosen, best, distance = prospects[0], (-np.inf, -np.inf), np.zeros(0)
+
+    prospects.sort(key=lambda prospect: prospect.bound, reverse=True)
+    chosen = prospects[0]
+    best = (-np.inf, -np.inf)
+    apart_in_best = np.zeros(0)
     for prospect in prospects:
         # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
         if prospect.bound[0] <= best[0]:
@@ -129,20 +154,26 @@ def next_experiment(
         score = expected_log_bayes_factor(apart, weights)
         prospect.score = score[0]
         if score > best:
-            chosen, best, distance = prospect, score, apart
-    left_out = [c for c, p in zip(choices, looked_at, strict=True) if p is None]
-    considered = [p.considered() for p in sorted(prospects, key=lambda p: -(p.score or 0.0))]
-    considered += [Considered(c.kind, c.parameters, c.amplitude_V, False, 0.0, None) for c in left_out]
-    x = chosen.excitation
-    pairs = separations(competing, distance)
-    first, second = sorted((r.probability for r in competing), reverse=True)[:2]
+            chosen = prospect
+            best = score
+            apart_in_best = apart
+
+    considered = [prospect.considered() for prospect in sorted(prospects, key=lambda p: -(p.score or 0.0))]
+    for choice, looked in zip(choices, looked_at, strict=True):
+        if looked is None:
+            considered.append(
+                Considered(choice.kind, choice.parameters, choice.amplitude_V, False, 0.0, None)
+            )
+    excitation = chosen.excitation
+    pairs = separations(competing, apart_in_best)
+    first, second = sorted((hypothesis.probability for hypothesis in competing), reverse=True)[:2]
     return NextExperiment(
-        kind=x.kind,
-        parameters=dict(x.parameters),
-        amplitude_V=x.amplitude_V,
-        duration_s=float(x.voltage_V.size * dt),
+        kind=excitation.kind,
+        parameters=dict(excitation.parameters),
+        amplitude_V=excitation.amplitude_V,
+        duration_s=float(excitation.voltage_V.size * dt),
         dt_s=dt,
-        voltage_V=x.voltage_V,
+        voltage_V=excitation.voltage_V,
         separations=pairs,
         expected_log_bayes_factor=best[1],
         hub_angle_range_rad=chosen.hub,
@@ -154,35 +185,47 @@ def next_experiment(
 
 
 def _check(competing: Sequence[CompetingHypothesis]) -> None:
+    """Raise ValueError where hypotheses cannot be compared (`next_experiment`)."""
     if len(competing) < 2:
         raise ValueError(f"an experiment separates at least two hypotheses; got {len(competing)}")
     first = competing[0]
-    for one in competing:
-        if one.rig.sampling.dt_s != first.rig.sampling.dt_s or not np.array_equal(one.noise, first.noise):
+    for hypothesis in competing:
+        same_period = hypothesis.rig.sampling.dt_s == first.rig.sampling.dt_s
+        if not same_period or not np.array_equal(hypothesis.noise, first.noise):
             raise ValueError("all hypotheses need the same sampling period and sensor noise")
     if not np.all(first.noise > 0):
         raise ValueError("sensors need a noise level above zero to tell hypotheses apart by")
 
 
-def separations(competing: Sequence[CompetingHypothesis], distance: Real) -> tuple[Separation, ...]:
-    """Of every pair, from `distances`."""
-    names = combinations([r.name for r in competing], 2)
-    return tuple(Separation(two, float(d), float(d**2 / 2)) for two, d in zip(names, distance, strict=True))
+def separations(competing: Sequence[CompetingHypothesis], apart: Real) -> tuple[Separation, ...]:
+    """Every pair with its distance, from (pairs,) standard deviations as `distances` gives them."""
+    names = combinations([hypothesis.name for hypothesis in competing], 2)
+    return tuple(Separation(pair, float(d), float(d**2 / 2)) for pair, d in zip(names, apart, strict=True))
 
 
 def pair_weights(competing: Sequence[CompetingHypothesis]) -> Real:
-    """Of every pair, the product of their probabilities; of hopeless ones all alike."""
-    p = np.array([a.probability * b.probability for a, b in combinations(competing, 2)])
-    return p / p.sum() if p.sum() > 0 else np.full(p.size, 1 / p.size)
+    """(pairs,) products of the probabilities, over their sum; of hopeless ones all alike."""
+    products = np.array([a.probability * b.probability for a, b in combinations(competing, 2)])
+    if not products.sum() > 0:
+        return np.full(products.size, 1 / products.size)
+    return products / products.sum()
 
 
-def expected_log_bayes_factor(distance: Real, weights: Real) -> tuple[float, float]:
-    """Expected log Bayes factor with settled pairs cut off, and without, to choose between equals."""
-    return float(weights @ np.minimum(distance, _SETTLED) ** 2 / 2), float(weights @ distance**2 / 2)
+def expected_log_bayes_factor(apart: Real, weights: Real) -> tuple[float, float]:
+    """Expected log Bayes factor with settled pairs cut off, and without, to choose between equals.
+
+    apart, weights : (pairs,) standard deviations, and weights that sum to one.
+    """
+    cut_off = np.minimum(apart, _SETTLED)
+    return float(weights @ cut_off**2 / 2), float(weights @ apart**2 / 2)
 
 
 class _Prospect:
-    """An excitation within the limits with every hypothesis' prediction."""
+    """An excitation within the limits with every hypothesis' prediction.
+
+    hub, deflection : least and largest value that any hypothesis predicts [rad], [m].
+    bound : score if no free parameter absorbed anything. score : the score, None before it is computed.
+    """
 
     def __init__(
         self, excitation: Excitation, outputs: Sequence[Real], competing: Sequence[CompetingHypothesis]
@@ -192,17 +235,18 @@ class _Prospect:
         self.hub = _range([y[:, 0] for y in outputs])
         self.deflection = _range(_deflections(competing, outputs))
         self.score: float | None = None
-        plain = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
-        self.bound = expected_log_bayes_factor(plain, pair_weights(competing))
+        differences = np.array([np.linalg.norm(a - b) for a, b in combinations(self._whitened, 2)])
+        self.bound = expected_log_bayes_factor(differences, pair_weights(competing))
 
     @classmethod
     def of(
         cls, choice: Excitation, limits: Limits, competing: Sequence[CompetingHypothesis]
     ) -> _Prospect | None:
+        """A choice, scaled into the limits by every hypothesis; None where that leaves nothing of use."""
         outputs: list[Real] = []
 
         def respond(voltage: Real) -> tuple[float, float]:
-            outputs[:] = [r.outputs(voltage) for r in competing]
+            outputs[:] = [hypothesis.outputs(voltage) for hypothesis in competing]
             angle = max(map(abs, _range([y[:, 0] for y in outputs])))
             return angle, max(map(abs, _range(_deflections(competing, outputs))))
 
@@ -210,11 +254,20 @@ class _Prospect:
         return None if excitation is None else cls(excitation, outputs, competing)
 
     def distances(self, competing: Sequence[CompetingHypothesis]) -> tuple[Real, list[Real]]:
+        """`discrimination.distances` of this experiment."""
         return distances(competing, self.excitation.voltage_V, self._whitened)
 
     def considered(self) -> Considered:
-        x = self.excitation
-        return Considered(x.kind, x.parameters, x.amplitude_V, True, self.bound[0], self.score)
+        """What is told of it."""
+        excitation = self.excitation
+        return Considered(
+            kind=excitation.kind,
+            parameters=excitation.parameters,
+            amplitude_V=excitation.amplitude_V,
+            feasible=True,
+            at_most=self.bound[0],
+            score=self.score,
+        )
 
 
 def _tailored(
@@ -225,31 +278,35 @@ def _tailored(
     rng: np.random.Generator,
 ) -> list[Excitation]:
     """Multisine and binary signal at the lines where the hypotheses differ most for the voltage spent there,
-    by the first multisine among the prospects; exact for linear machines with nothing to absorb."""
-    wide = [p for p in prospects if p.excitation.kind == "multisine"]
-    if not wide:
+    by the first multisine among the prospects; exact for linear machines with nothing to absorb. Empty
+    without a multisine."""
+    multisines = [prospect for prospect in prospects if prospect.excitation.kind == "multisine"]
+    if not multisines:
         return []
-    voltage = wide[0].excitation.voltage_V
+    voltage = multisines[0].excitation.voltage_V
     period = voltage.size // 2
-    _, remains = wide[0].distances(competing)
-    last = [rest.reshape(-1, 2)[period : 2 * period] for rest in remains]
-    power = sum(
-        w * np.sum(np.abs(np.fft.rfft(rest, axis=0)) ** 2, axis=1)
-        for w, rest in zip(weights, last, strict=True)
-    )
+    _, remains = multisines[0].distances(competing)
+    # Power of what remains of each pair's difference, line by line of the second period.
+    power = np.zeros(period // 2 + 1)
+    for weight, remaining in zip(weights, remains, strict=True):
+        last_period = remaining.reshape(-1, 2)[period : 2 * period]
+        power += weight * np.sum(np.abs(np.fft.rfft(last_period, axis=0)) ** 2, axis=1)
     drive = np.abs(np.fft.rfft(voltage[period : 2 * period])) ** 2
-    driven = np.flatnonzero(drive > 1e-6 * drive.max())
-    gain = np.asarray(power)[driven] / drive[driven]
+    driven = np.flatnonzero(drive > _DRIVEN * drive.max())
+    gain = power[driven] / drive[driven]
     lines = np.sort(driven[np.argsort(-gain, kind="stable")[:_TAILORED_LINES]])
     return tailored_excitations(lines, voltage.size, competing[0].rig.sampling.dt_s, limits.voltage_V, rng)
 
 
 def _deflections(competing: Sequence[CompetingHypothesis], outputs: Sequence[Real]) -> list[Real]:
-    return [
-        np.asarray(y[:, 1] - (r.rig.hub.radius_m + r.rig.link.length_m) * y[:, 0])
-        for r, y in zip(competing, outputs, strict=True)
-    ]
+    """(T,) deflection of the tip [m] of every hypothesis, from its outputs (T, 2): hub angle and tip."""
+    deflections = []
+    for hypothesis, output in zip(competing, outputs, strict=True):
+        reach = hypothesis.rig.hub.radius_m + hypothesis.rig.link.length_m
+        deflections.append(np.asarray(output[:, 1] - reach * output[:, 0]))
+    return deflections
 
 
 def _range(signals: Sequence[Real]) -> tuple[float, float]:
-    return float(min(s.min() for s in signals)), float(max(s.max() for s in signals))
+    """Least and largest value of some signals."""
+    return float(min(signal.min() for signal in signals)), float(max(signal.max() for signal in signals))

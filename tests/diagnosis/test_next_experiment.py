@@ -297,6 +297,27 @@ def test_of_ones_own_machine_the_record_that_shows_the_difference_is_repeated():
     assert not nothing.separates
 
 
+@pytest.mark.parametrize("bound", [2.0, 0.5])
+def test_where_a_hypothesis_runs_away_nothing_is_recorded(bound):
+    """A model that is unstable in large motions says nothing about how far a machine would go there."""
+    case, _ = _open(None)
+
+    def simulate(parameters, effects, inputs):
+        y = _valve(parameters, effects, inputs)
+        return np.where((np.abs(inputs) > bound) & ("dead_zone" in effects), 1e13, y)
+
+    plant = replace(case.plant, simulation=simulate)
+    noise = np.array([0.02])
+    competing = tuple(
+        discrimination.CompetingHypothesis(0.5, plant, changes, noise=noise)
+        for changes in ((), (Change("dead_zone", {"width": 0.05}),))
+    )
+    found = best_repeat(case, competing)
+    assert found.record == "small"
+    assert found.change == ("third" if bound < 1 else found.change)
+    assert found.separations[0].standard_deviations < 1e3
+
+
 def test_what_a_free_gain_imitates_separates_nothing():
     case, (stated, _) = _open(None, None, free=True)
     other = replace(stated, rig=case.plant.scaled({"gain": 1.2}))
