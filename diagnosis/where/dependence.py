@@ -27,6 +27,7 @@ from scipy.interpolate import BSpline
 from scipy.signal import savgol_filter
 from scipy.stats import norm
 
+from diagnosis.machine.around import MeasuredBody
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.findings import Alternative, Dependence, Quantity, Shape
 from diagnosis.where.missing_force import ForcedRecord, MissingForces, missing_forces
@@ -34,10 +35,11 @@ from ident.data.units import written_unit
 
 Integer = npt.NDArray[np.int64]
 
-# Inner intervals of a spline: a ripple of three periods over the range is followed; of the time also what
-# swells ten times in a log. Chosen; with twice as many the penalty takes over and shares of the series move
-# by less than 0.01.
-_INTERVALS, _INTERVALS_OF_TIME = 10, 40
+# Inner intervals of a spline: a ripple of three periods over the range is followed. Chosen; with twice as
+# many the penalty takes over and shares of the series move by less than 0.01.
+_INTERVALS = 10
+# Those of a curve of the time, which also follows what swells ten times in a log.
+_INTERVALS_OF_TIME = 40
 # Cubic: two derivatives of a force are continuous, as of what bends.
 _DEGREE = 3
 # Strengths of the penalty that are tried, over the mean energy of a basis function.
@@ -69,11 +71,19 @@ _SMOOTHED = 7
 _STILL = 0.01
 # Ends of a curve: shares of the samples that lie below and above are not drawn.
 _ENDS = 0.01
-# Points at which a curve is told.
+# Points at which a curve is told: what a picture of it needs.
 _POINTS = 25
+# Standard errors of a difference by which one dependence explains more than another.
+_DIFFER = 2.0
+# Singular values of normal equations, over the largest, that are rounding.
+_ROUNDING = 1e-13
+# Energies below this are zero: it keeps a ratio finite.
+_NO_ENERGY = 1e-300
 
-# Units of positions and of speeds; an output without a unit is taken for a position.
-_POSITIONS, _SPEEDS = ("rad", "m", "deg", "mm", ""), ("rad/s", "m/s", "deg/s")
+# Units of positions; an output without a unit is taken for one.
+_POSITIONS = ("rad", "m", "deg", "mm", "")
+# Units of speeds.
+_SPEEDS = ("rad/s", "m/s", "deg/s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +106,9 @@ class _Variable:
 class _Acts:
     """What depends on a variable: a force at a place of the machine, or the error of an output's reading.
 
-    own : the motion of the place itself. others : all else that is tried.
+    through, at : whether it goes through the machine's response at its place `at`, or through the reading of
+        output `at`. name, unit : of the place or output, and of the force or reading. own : the motion of the
+        place itself. others : all else that is tried.
     """
 
     acts: Literal["force", "reading"]
@@ -109,6 +121,7 @@ class _Acts:
 
     @property
     def variables(self) -> tuple[_Variable, ...]:
+        """Everything that is tried for it."""
         return (*self.own, *self.others)
 
     @property
@@ -117,6 +130,7 @@ class _Acts:
         return self.through, self.at
 
 
+# What acts, and the variable that it is a curve of.
 _Pair = tuple[_Acts, _Variable]
 
 
@@ -181,16 +195,17 @@ def _best_two(
     regressions = _Regressions(case, forced)
     pairs = [(acts, variable) for acts in acting for variable in acts.variables]
     deviations = float(norm.isf(level / max(len(pairs), 1)))
-    found: list[Dependence] = []
+    findings: list[Dependence] = []
     taken: list[_Pair] = []
-    while len(found) < _MOST:
-        tried = regressions.beyond_chance([pair for pair in pairs if pair not in taken], taken, deviations)
-        if not tried:
+    while len(findings) < _MOST:
+        left = [pair for pair in pairs if pair not in taken]
+        possible = regressions.beyond_chance(left, taken, deviations)
+        if not possible:
             break
-        best = _preferred(tried)
-        found.append(regressions.told(best, taken, tried))
+        best = _preferred(possible)
+        findings.append(regressions.finding(best, taken, possible))
         taken.append(best.pair)
-    return tuple(found)
+    return tuple(findings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,6 +214,7 @@ class _Tried:
 
     total, constant_total : energies that it, and a constant force at its place, take off the error.
     gained : (B,) the same of the dependence by block, every record over its own energy.
+    curve, constant : regressions on both, and on the constant force alone.
     """
 
     pair: _Pair
@@ -209,22 +225,27 @@ class _Tried:
     constant: _Judged
 
 
-def _preferred(tried: Sequence[_Tried]) -> _Tried:
-    """The one that explains most.
+def _preferred(possible: Sequence[_Tried]) -> _Tried:
+    """The dependence that explains most, of one at least.
 
     An error of a reading has to explain more than a force does, beyond two standard errors: a machine that
     follows stiffly shows the one as the other, and forces are what machines have.
     """
-    most = max(tried, key=lambda one: one.total)
-    forces = [one for one in tried if one.pair[0].acts == "force" and not _more(most, one)]
-    if most.pair[0].acts == "reading" and forces:
-        return max(forces, key=lambda one: one.total)
+    most = max(possible, key=lambda dependence: dependence.total)
+    as_good_forces = [
+        dependence
+        for dependence in possible
+        if dependence.pair[0].acts == "force" and not _explains_more(most, dependence)
+    ]
+    if most.pair[0].acts == "reading" and as_good_forces:
+        return max(as_good_forces, key=lambda dependence: dependence.total)
     return most
 
 
-def _more(one: _Tried, other: _Tried) -> bool:
+def _explains_more(first: _Tried, second: _Tried) -> bool:
     """Whether one explains more than another beyond two standard errors of the difference by block."""
-    return float(np.sum(one.gained - other.gained)) > 2 * _deviation(one.gained - other.gained)
+    difference = first.gained - second.gained
+    return float(np.sum(difference)) > _DIFFER * _deviation(difference)
 
 
 def _deviation(gained: Real) -> float:
@@ -233,7 +254,10 @@ def _deviation(gained: Real) -> float:
 
 
 class _Regressions:
-    """Regressions of the residuals of all records on forces and readings that depend on variables."""
+    """Regressions of the residuals of all records on forces and readings that depend on variables.
+
+    Rows of all records together, in their order, are N.
+    """
 
     def __init__(self, case: CaseOfMachine, forced: MissingForces) -> None:
         self._forced = forced
@@ -248,7 +272,7 @@ class _Regressions:
         self._error = energy - float(np.sum(noise))
         self._noise_scatter = _scatter(noise, [len(target) for target in self._targets])
         self._weights = np.concatenate(
-            [np.full(len(target), 1 / max(float(np.sum(target**2)), 1e-300)) for target in self._targets]
+            [np.full(len(target), 1 / max(float(np.sum(target**2)), _NO_ENERGY)) for target in self._targets]
         )
 
     def beyond_chance(
@@ -262,12 +286,14 @@ class _Regressions:
             return []
         before = self._judge(taken, None).left
         constants: dict[tuple[str, int], _Judged] = {}
-        found = []
+        possible = []
         for pair in pairs:
             where = pair[0].where
             if where not in constants:
                 constants[where] = self._judge(taken, where)
-            constant, curve = constants[where], self._judge([*taken, pair], where)
+            constant = constants[where]
+            curve = self._judge([*taken, pair], where)
+            # A constant force that predicts a record worse than none does is none there.
             without = self._less_by_record(before, constant.left)
             total = float(np.sum(before - curve.left))
             constant_total = float(np.sum(before - without))
@@ -280,8 +306,8 @@ class _Regressions:
                 and np.sum(by_block) > _BEYOND * _deviation(by_block)
             ):
                 gained = self._by_block(before - curve.left)
-                found.append(_Tried(pair, total, constant_total, gained, curve, constant))
-        return found
+                possible.append(_Tried(pair, total, constant_total, gained, curve, constant))
+        return possible
 
     def _less_by_record(self, rows: Real, other: Real) -> Real:
         """(N,) of either energies of rows, record by record those that are less."""
@@ -297,17 +323,22 @@ class _Regressions:
     def _judge(
         self, pairs: Sequence[_Pair], constant_at: tuple[str, int] | None, shape: Shape = "curve"
     ) -> _Judged:
-        """Curves of these pairs together, and a constant at a place; of the last pair a straight line or a
-        jump in place of its curve where `shape` says so. The penalty that is best on data not fitted to."""
-        bases, acts = list[_Basis](), list[tuple[str, int]]()
-        if constant_at is not None:
-            bases.append(_constant(self._forced.records))
-            acts.append(constant_at)
+        """A regression on curves of these pairs together, and a constant at a place.
+
+        Of the last pair a straight line or a jump stands in place of its curve where `shape` says so. The
+        penalty is the one that is best on data not fitted to.
+        """
         if not pairs and constant_at is None:
             rows = np.concatenate([np.sum(target**2, axis=1) for target in self._targets])
             return _Judged(np.zeros(0), np.zeros((0, 0)), rows)
+        bases: list[_Basis] = []
+        acts: list[tuple[str, int]] = []
+        if constant_at is not None:
+            bases.append(_constant(self._forced.records))
+            acts.append(constant_at)
         for k, (place, variable) in enumerate(pairs):
-            bases.append(_basis(variable, shape if k == len(pairs) - 1 else "curve"))
+            is_last = k == len(pairs) - 1
+            bases.append(_basis(variable, shape if is_last else "curve"))
             acts.append(place.where)
         columns = []
         for r, record in enumerate(self._forced.records):
@@ -318,13 +349,9 @@ class _Regressions:
             columns.append(np.concatenate(parts, axis=1))
         folds = self._sums(columns)
         penalty = _penalty(bases, [np.diag(fold.gram) for fold in folds])
-        least: _Judged | None = None
-        for strength in _PENALTIES if any(np.any(basis.rough) for basis in bases) else (0.0,):
-            judged = self._cross_validated(columns, folds, strength * penalty)
-            if least is None or np.sum(judged.left) < np.sum(least.left):
-                least = judged
-        assert least is not None
-        return least
+        strengths = _PENALTIES if np.any(penalty) else (0.0,)
+        judged = [self._cross_validated(columns, folds, strength * penalty) for strength in strengths]
+        return min(judged, key=lambda regression: float(np.sum(regression.left)))
 
     def _responses(self, place: tuple[str, int], functions: Real, record: ForcedRecord) -> Real:
         """(T, K, Y) whitened residuals of a record by functions (T, K) at a place."""
@@ -334,18 +361,23 @@ class _Regressions:
         return self._forced.response_to_reading(at, functions, record)
 
     def _sums(self, columns: Sequence[Real]) -> list[_Fold]:
-        """Of every fold; columns (T, K, Y) of every record."""
-        count, size = max(int(np.max(fold)) for fold in self._folds) + 1, columns[0].shape[1]
-        found = [_Fold(np.zeros((size, size)), np.zeros(size)) for _ in range(count)]
+        """Sums of every fold, from columns (T, K, Y) of every record."""
+        count = max(int(np.max(fold)) for fold in self._folds) + 1
+        size = columns[0].shape[1]
+        folds = [_Fold(np.zeros((size, size)), np.zeros(size)) for _ in range(count)]
         for fold, target, of_record in zip(self._folds, self._targets, columns, strict=True):
             for k in np.unique(fold):
-                here = of_record[fold == k]
-                flat = np.moveaxis(here, 1, 0).reshape(size, -1)
-                found[k].gram[:] += flat @ flat.T
-                found[k].moment[:] += flat @ target[fold == k].ravel()
-        return found
+                inside = fold == k
+                flat = np.moveaxis(of_record[inside], 1, 0).reshape(size, -1)
+                folds[k].gram[:] += flat @ flat.T
+                folds[k].moment[:] += flat @ target[inside].ravel()
+        return folds
 
     def _cross_validated(self, columns: Sequence[Real], folds: Sequence[_Fold], penalty: Real) -> _Judged:
+        """A regression on all data, judged fold by fold by those on the others.
+
+        columns : (T, K, Y) of every record. penalty : (K, K).
+        """
         gram = np.sum([fold.gram for fold in folds], axis=0)
         moment = np.sum([fold.moment for fold in folds], axis=0)
         without = [_solved(gram - fold.gram + penalty, moment - fold.moment) for fold in folds]
@@ -355,26 +387,37 @@ class _Regressions:
             predicted = np.einsum("tky,tk->ty", of_record, values)
             left.append(np.sum((target - predicted) ** 2, axis=1))
         rows = np.concatenate(left)
-        scale = np.sqrt(np.maximum(np.diag(gram + penalty), 1e-300))
-        inverse = np.linalg.pinv((gram + penalty) / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-        inverse /= np.outer(scale, scale)
+        # Covariance of penalised least squares: s^2 H^-1 G H^-1 with H = G + penalty.
+        scale = np.sqrt(np.maximum(np.diag(gram + penalty), _NO_ENERGY))
+        scaled = (gram + penalty) / np.outer(scale, scale)
+        inverse = np.linalg.pinv(scaled, rcond=_ROUNDING, hermitian=True) / np.outer(scale, scale)
         scatter = float(np.sum(rows)) / max(rows.size - len(moment), 1)
         return _Judged(_solved(gram + penalty, moment), scatter * inverse @ gram @ inverse, rows)
 
-    def told(self, best: _Tried, taken: Sequence[_Pair], tried: Sequence[_Tried]) -> Dependence:
-        """The finding, with its curve at points, beside what is taken, which comes before it."""
+    def finding(self, best: _Tried, taken: Sequence[_Pair], possible: Sequence[_Tried]) -> Dependence:
+        """The best of the possible dependences in numbers, with its curve at points.
+
+        taken : pairs whose curves were fitted with it and come before it.
+        """
         acts, variable = best.pair
         low, high = np.quantile(np.concatenate(variable.values), (_ENDS, 1 - _ENDS))
         at = np.linspace(low, high, _POINTS)
         drawn = np.concatenate([np.ones((at.size, 1)), _basis(variable, "curve").at(at)], axis=1)
         curve = best.curve
-        # Its coefficients are the constant, which comes first, and the last.
-        kept = [0, *range(curve.coefficients.size - drawn.shape[1] + 1, curve.coefficients.size)]
+        # Coefficients of the curve are the constant, which comes first, and the last ones.
+        functions = drawn.shape[1] - 1
+        kept = [0, *range(curve.coefficients.size - functions, curve.coefficients.size)]
         covariance = curve.covariance[np.ix_(kept, kept)]
         errors = np.sqrt(np.maximum(np.sum((drawn @ covariance) * drawn, axis=1), 0.0))
         shape, slope, slope_error = self._shape(best, taken)
-        also = [one for one in tried if one is not best and not _more(best, one)]
-        also.sort(key=lambda one: -one.total)
+        as_good = [other for other in possible if other is not best and not _explains_more(best, other)]
+        as_good.sort(key=lambda other: -other.total)
+        alternatives = []
+        for other in as_good[:_MOST]:
+            place, another = other.pair
+            alternatives.append(
+                Alternative(place.name, another.quantity, another.of, another.unit, self._share(other.total))
+            )
         return Dependence(
             place=acts.name,
             acts=acts.acts,
@@ -393,24 +436,21 @@ class _Regressions:
             slope=slope,
             slope_error=slope_error,
             beside=len(taken) > 0,
-            also=tuple(
-                Alternative(acts.name, other.quantity, other.of, other.unit, self._share(one.total))
-                for one in also[:_MOST]
-                for acts, other in [one.pair]
-            ),
+            also=tuple(alternatives),
         )
 
     def _share(self, energy: float) -> float:
-        """Of the error's energy above noise, 0 to 1."""
+        """Share of the error's energy above noise, 0 to 1."""
         return float(np.clip(energy / self._error, 0.0, 1.0))
 
     def _shape(self, best: _Tried, taken: Sequence[_Pair]) -> tuple[Shape, float | None, float | None]:
         """What explains nine tenths of what the curve does, with its slope or height and standard error."""
         explains = best.total - best.constant_total
         simple: Sequence[Shape] = ("line", "jump") if best.pair[1].jumps else ("line",)
-        parts = {shape: self._judge([*taken, best.pair], best.pair[0].where, shape) for shape in simple}
-        gains = {shape: float(np.sum(best.constant.left - one.left)) for shape, one in parts.items()}
-        shape = max(gains, key=lambda one: gains[one])
+        pairs = [*taken, best.pair]
+        parts = {shape: self._judge(pairs, best.pair[0].where, shape) for shape in simple}
+        gains = {shape: float(np.sum(best.constant.left - part.left)) for shape, part in parts.items()}
+        shape = max(gains, key=lambda name: gains[name])
         if gains[shape] < _SAME * explains:
             return "curve", None, None
         judged = parts[shape]
@@ -422,20 +462,21 @@ def _solved(gram: Real, moment: Real) -> Real:
     scale = np.sqrt(np.maximum(np.diag(gram), 0.0))
     scale[scale == 0] = 1.0
     scaled = gram / np.outer(scale, scale)
-    return np.asarray(np.linalg.lstsq(scaled, moment / scale, rcond=1e-13)[0] / scale)
+    return np.asarray(np.linalg.lstsq(scaled, moment / scale, rcond=_ROUNDING)[0] / scale)
 
 
 def _penalty(bases: Sequence[_Basis], energies: Sequence[Real]) -> Real:
     """(K, K) of all bases, each in proportion to the mean energy (K,) of its columns over all folds."""
     energy = np.sum(energies, axis=0)
-    found, first = np.zeros((energy.size, energy.size)), 0
+    penalty = np.zeros((energy.size, energy.size))
+    first = 0
     for basis in bases:
-        here = slice(first, first + len(basis.rough))
+        columns = slice(first, first + len(basis.rough))
         size = float(np.trace(basis.rough))
         if size > 0:
-            found[here, here] = basis.rough * (float(np.sum(energy[here])) / size)
+            penalty[columns, columns] = basis.rough * (float(np.sum(energy[columns])) / size)
         first += len(basis.rough)
-    return found
+    return penalty
 
 
 def _scatter(energies: Real, rows: Sequence[int]) -> float:
@@ -446,7 +487,7 @@ def _scatter(energies: Real, rows: Sequence[int]) -> float:
 def _are_logs(case: CaseOfMachine) -> bool:
     """Whether the records are several logs, each from its begin."""
     records = case.experiments
-    return len(records) > 1 and all(getattr(one, "first_row", 0) == 0 for one in records)
+    return len(records) > 1 and all(getattr(record, "first_row", 0) == 0 for record in records)
 
 
 def _folds(case: CaseOfMachine, records: Sequence[ForcedRecord]) -> tuple[list[Integer], bool]:
@@ -456,22 +497,26 @@ def _folds(case: CaseOfMachine, records: Sequence[ForcedRecord]) -> tuple[list[I
     """
     if _are_logs(case):
         count = min(len(records), 2 * _FOLDS)
-        return [np.full(len(one.residuals), k % count) for k, one in enumerate(records)], True
-    rows = sum(len(one.residuals) for one in records)
+        return [np.full(len(record.residuals), k % count) for k, record in enumerate(records)], True
+    lengths = [len(record.residuals) for record in records]
+    rows = sum(lengths)
+    # Two blocks of every fold, far apart.
     blocks = np.arange(rows) * (2 * _FOLDS) // rows % _FOLDS
-    ends = np.cumsum([len(one.residuals) for one in records])[:-1]
+    ends = np.cumsum(lengths)[:-1]
     return [np.asarray(part) for part in np.split(blocks, ends)], False
 
 
 def _constant(records: Sequence[ForcedRecord]) -> _Basis:
-    functions = tuple(np.ones((len(one.motion), 1)) for one in records)
+    """The basis of a constant."""
+    functions = tuple(np.ones((len(record.motion), 1)) for record in records)
     return _Basis(functions, np.zeros((1, 1)), lambda values: np.ones((values.size, 1)))
 
 
 def _basis(variable: _Variable, shape: Shape) -> _Basis:
     """A spline of a variable, beside a constant; or the variable itself ("line"), or its sign ("jump")."""
     everything = np.concatenate(variable.values)
-    low, high = float(np.min(everything)), float(np.max(everything))
+    low = float(np.min(everything))
+    high = float(np.max(everything))
     still = _STILL * max(-low, high)
 
     def jump(values: Real) -> Real:
@@ -484,15 +529,19 @@ def _basis(variable: _Variable, shape: Shape) -> _Basis:
     def curve(values: Real) -> Real:
         inside = np.clip(values, low, high)
         functions = BSpline.design_matrix(inside, knots, _DEGREE, extrapolate=True).toarray()
-        return np.concatenate([functions, jump(values)], axis=1) if variable.jumps else functions
+        if variable.jumps:
+            functions = np.concatenate([functions, jump(values)], axis=1)
+        return functions
 
     if shape == "line":
         return _Basis(tuple(v[:, None] for v in variable.values), np.zeros((1, 1)), lambda v: v[:, None])
     if shape == "jump":
         return _Basis(tuple(jump(v) for v in variable.values), np.zeros((1, 1)), jump)
-    second = np.diff(np.eye(count), 2, axis=0)
-    rough = np.zeros((count + variable.jumps, count + variable.jumps))
-    rough[:count, :count] = second.T @ second
+    # A jump is not rough: only the spline's second differences are penalised.
+    second_differences = np.diff(np.eye(count), 2, axis=0)
+    columns = count + 1 if variable.jumps else count
+    rough = np.zeros((columns, columns))
+    rough[:count, :count] = second_differences.T @ second_differences
     return _Basis(tuple(curve(v) for v in variable.values), rough, curve)
 
 
@@ -501,49 +550,60 @@ def _acting(case: CaseOfMachine, forced: MissingForces, dt_s: float) -> tuple[_A
     machine = case.machine
     names = list(machine.output_names)
     units = [case.units.get(name) or written_unit(name) for name in names]
-    motions = [record.motion for record in forced.records]
-    of_output = [
-        _moving(name, unit, [motion[:, k] for motion in motions], dt_s)
-        for k, (name, unit) in enumerate(zip(names, units, strict=True))
-    ]
     common = _common(case, dt_s)
     body = getattr(machine, "body", None)
     if body is not None:
-        inputs = [record.input for record in case.experiments]
-        called = machine.input_names or [f"input {k + 1}" for k in range(inputs[0].shape[1])]
-        place, speed = called[body.position], called[body.speed]
-        given = (
-            _Variable("position", place, written_unit(place), tuple(u[:, body.position] for u in inputs)),
-            *_moving(speed, written_unit(speed) or "m/s", [u[:, body.speed] for u in inputs], dt_s)[1:],
-        )
-        return tuple(
-            _Acts("force", "output", k, name, unit, given, common)
-            for k, (name, unit) in enumerate(zip(names, units, strict=True))
-        )
+        return _acting_on_known_motion(case, body, units, common, dt_s)
 
-    coordinates = [machine.other_coordinates(motion) for motion in motions]
+    motions = [record.motion for record in forced.records]
+    of_output = [
+        _moving(names[k], units[k], [motion[:, k] for motion in motions], dt_s) for k in range(len(names))
+    ]
+    by_record = [machine.other_coordinates(motion) for motion in motions]
     derived = tuple(
-        _Variable("position", name, written_unit(name), tuple(one[name] for one in coordinates))
-        for name in coordinates[0]
+        _Variable("position", name, written_unit(name), tuple(coordinates[name] for coordinates in by_record))
+        for name in by_record[0]
     )
-    found = []
+    acting = []
     missing = forced.share_of_places
     for at, place in enumerate(forced.places):
         if missing[at] < _LEAST_PLACE:
             continue
         own = () if place.motion is None else of_output[place.motion]
-        others = derived or tuple(
-            of_output[k][0]
-            for k, unit in enumerate(units)
-            if k != place.motion and unit in _POSITIONS and of_output[k]
-        )
-        commands = _commands(case, place.command)
-        found.append(
-            _Acts("force", "machine", at, place.name, place.unit, own, (*commands, *others, *common))
-        )
+        others = derived
+        if not others:
+            # Positions of all other outputs stand for what the machine does not compute of them.
+            others = tuple(
+                of_output[k][0]
+                for k, unit in enumerate(units)
+                if k != place.motion and unit in _POSITIONS and of_output[k]
+            )
+        tried_beside = (*_commands(case, place.command), *others, *common)
+        acting.append(_Acts("force", "machine", at, place.name, place.unit, own, tried_beside))
     for k, (name, unit) in enumerate(zip(names, units, strict=True)):
-        found.append(_Acts("reading", "output", k, name, unit, of_output[k], common))
-    return tuple(found)
+        acting.append(_Acts("reading", "output", k, name, unit, of_output[k], common))
+    return tuple(acting)
+
+
+def _acting_on_known_motion(
+    case: CaseOfMachine, body: MeasuredBody, units: Sequence[str], common: tuple[_Variable, ...], dt_s: float
+) -> tuple[_Acts, ...]:
+    """Forces as outputs of a motion that is given: each is a curve of that motion, and of what is common.
+
+    body : whose position and speed are inputs. units : of the outputs.
+    """
+    machine = case.machine
+    inputs = [record.input for record in case.experiments]
+    columns = machine.input_names or [f"input {k + 1}" for k in range(inputs[0].shape[1])]
+    place = columns[body.position]
+    speed = columns[body.speed]
+    position = _Variable("position", place, written_unit(place), tuple(u[:, body.position] for u in inputs))
+    # Speed and acceleration: the position was measured, and is not counted from the speed.
+    rates = _moving(speed, written_unit(speed) or "m/s", [u[:, body.speed] for u in inputs], dt_s)[1:]
+    return tuple(
+        _Acts("force", "output", k, name, units[k], (position, *rates), common)
+        for k, name in enumerate(machine.output_names)
+    )
 
 
 def _moving(name: str, unit: str, values: Sequence[Real], dt_s: float) -> tuple[_Variable, ...]:
@@ -553,14 +613,14 @@ def _moving(name: str, unit: str, values: Sequence[Real], dt_s: float) -> tuple[
     The position of an output that is a speed is counted from the begin of its record.
     """
     if unit in _POSITIONS:
-        found: dict[Quantity, list[Real]] = {
+        motion: dict[Quantity, list[Real]] = {
             "position": list(values),
             "speed": [_rate(v, dt_s, 1) for v in values],
             "acceleration": [_rate(v, dt_s, 2) for v in values],
         }
         base = unit
     elif unit in _SPEEDS:
-        found = {
+        motion = {
             "position": [np.cumsum(v) * dt_s for v in values],
             "speed": list(values),
             "acceleration": [_rate(v, dt_s, 1) for v in values],
@@ -568,45 +628,53 @@ def _moving(name: str, unit: str, values: Sequence[Real], dt_s: float) -> tuple[
         base = unit.removesuffix("/s")
     else:
         return (_Variable("value", name, unit, tuple(values)),)
-    of = {"position": base, "speed": f"{base}/s", "acceleration": f"{base}/s²"}
+    unit_of = {"position": base, "speed": f"{base}/s", "acceleration": f"{base}/s²"}
     return tuple(
-        _Variable(quantity, name, of[quantity] if base else "", tuple(every))
-        for quantity, every in found.items()
-        if _varies(every)
+        _Variable(quantity, name, unit_of[quantity] if base else "", tuple(signals))
+        for quantity, signals in motion.items()
+        if _varies(signals)
     )
 
 
 def _rate(values: Real, dt_s: float, order: int) -> Real:
-    """(T,) derivative of a signal, by a parabola (or cubic) through the samples about each."""
+    """(T,) derivative of a signal, by a parabola (or cubic) through the samples about each.
+
+    A second derivative takes four samples more; of a short record all of them, an odd number.
+    """
     window = min(_SMOOTHED + 4 * (order - 1), len(values) - 1 + len(values) % 2)
     return np.asarray(savgol_filter(values, window, order + 1, deriv=order, delta=dt_s))
 
 
 def _commands(case: CaseOfMachine, column: int | None) -> tuple[_Variable, ...]:
-    """The command of a place, where it varies."""
+    """The command of a place, where there is one that varies."""
     if column is None:
         return ()
     names = case.machine.input_names
     name = names[column] if column < len(names) else f"input {column + 1}"
     values = tuple(record.input[:, column] for record in case.experiments)
-    return (_Variable("command", name, written_unit(name), values),) if _varies(values) else ()
+    if not _varies(values):
+        return ()
+    return (_Variable("command", name, written_unit(name), values),)
 
 
 def _common(case: CaseOfMachine, dt_s: float) -> tuple[_Variable, ...]:
     """Time since the log began, and signals that all logs hold beside inputs and outputs."""
     records = case.experiments
     time = tuple(
-        dt_s * (getattr(one, "first_row", 0) + np.arange(len(one.output), dtype=np.float64))
-        for one in records
+        dt_s * (getattr(record, "first_row", 0) + np.arange(len(record.output), dtype=np.float64))
+        for record in records
     )
     # Of one log everything is a function of the time: none that is finer than the blocks.
     intervals = _INTERVALS_OF_TIME if _are_logs(case) else _INTERVALS
-    found = [_Variable("time", "", "s", time, intervals)]
-    held = [getattr(one, "beside", {}) for one in records]
-    for name in held[0]:
-        if all(name in one for one in held) and _varies([one[name] for one in held]):
-            found.append(_Variable("beside", name, written_unit(name), tuple(one[name] for one in held)))
-    return tuple(found)
+    variables = [_Variable("time", "", "s", time, intervals)]
+    beside = [getattr(record, "beside", {}) for record in records]
+    for name in beside[0]:
+        if not all(name in columns for columns in beside):
+            continue
+        values = tuple(columns[name] for columns in beside)
+        if _varies(values):
+            variables.append(_Variable("beside", name, written_unit(name), values))
+    return tuple(variables)
 
 
 def _varies(values: Sequence[Real]) -> bool:

@@ -44,9 +44,14 @@ _GAINS = 0.99
 # Part of the missing force, RMS, that no curve explains. Chosen: measured forces repeat to a tenth; with
 # three times as much shares of the series change by less than 0.05.
 _UNEXPLAINED = 0.05
-# Rows of one unknown force, and the most of them in a record at all places: slower than what a machine shows
-# within its own period as a rule, and a decomposition of a second at most. Chosen.
-_ROWS_PER_FORCE, _MOST_FORCES = 10, 150
+# Rows of one unknown force: slower than what a machine shows within its own period as a rule. Chosen.
+_ROWS_PER_FORCE = 10
+# Unknown forces in a record at all places, at most: their decomposition takes a second. Chosen.
+_MOST_FORCES = 150
+# Of them at each place at least: a begin and an end.
+_FEWEST_FORCES = 2
+# Part of a record in which a pulse is early: by then it has moved what is near its place. Chosen.
+_EARLY = 10
 # Directions of less than this part of the largest are rounding.
 _ALIKE = 1e-6
 # Energy over that of noise below which a direction is left as it is.
@@ -72,7 +77,7 @@ class Whitening:
     taken: Real
 
     def of(self, signals: Real) -> Real:
-        """(T, K, Y) signals without these parts."""
+        """Signals (T, K, Y) without these parts."""
         rows, count, outputs = signals.shape
         flat = np.moveaxis(signals, 1, 2).reshape(rows * outputs, count)
         flat = flat - self.basis @ (self.taken[:, None] * (self.basis.T @ flat))
@@ -87,6 +92,9 @@ class Whitening:
 @dataclass(frozen=True, eq=False)
 class ForcedRecord:
     """One record with the force that its simulation lacks.
+
+    Levels of the outputs are noise and a twentieth of the residuals' RMS together: a record is followed to
+    that.
 
     Parameters
     ----------
@@ -142,7 +150,7 @@ class MissingForces:
     def share_of_places(self) -> Real:
         """(F,) how far the missing forces of each place move the outputs, over the largest; one where there
         are none."""
-        moved = _slow_size([record.forces for record in self.records]) * _gains(self.responses)
+        moved = _slow_rms([record.forces for record in self.records]) * _gains(self.responses)
         largest = float(np.max(moved, initial=0.0))
         return np.asarray(moved / largest) if largest > 0 else np.ones(moved.size)
 
@@ -163,7 +171,7 @@ def missing_forces(case: CaseOfMachine, residuals: Mapping[str, Real]) -> Missin
 
     Parameters
     ----------
-    case : RecordedCase
+    case : CaseOfMachine
     residuals : record -> (T, Y) array
         (measured - model) / noise of every record, whichever model of the machine made them.
 
@@ -174,31 +182,36 @@ def missing_forces(case: CaseOfMachine, residuals: Mapping[str, Real]) -> Missin
         follows no better.
     """
     missed = {name: np.asarray(e, dtype=np.float64) * case.noise for name, e in residuals.items()}
-    moves = np.sqrt(np.mean(np.concatenate([*missed.values()]) ** 2, axis=0))
-    levels = np.hypot(case.noise, _FOLLOWED * moves)
-    places, responses = _responses(case, moves, levels)
+    missed_rms = np.sqrt(np.mean(np.concatenate([*missed.values()]) ** 2, axis=0))
+    levels = np.hypot(case.noise, _FOLLOWED * missed_rms)
+    places, responses = _responses(case, missed_rms, levels)
 
-    forces, beyond = dict[str, Real](), dict[str, Real]()
-    weights = {record.name: np.ones(len(record.output)) for record in case.experiments}
+    # The force of every record, and what its simulation gives beyond the linear response.
+    forces: dict[str, Real] = {}
+    nonlinear: dict[str, Real] = {}
+    weights: dict[str, Real] = {}
     for record in case.experiments:
-        weights[record.name][list(getattr(record, "missing", ()))] = 0.0
-        forces[record.name], beyond[record.name] = _force_of(
-            case, record, missed[record.name], weights[record.name], responses, levels
+        name = record.name
+        weights[name] = np.ones(len(record.output))
+        weights[name][list(getattr(record, "missing", ()))] = 0.0
+        forces[name], nonlinear[name] = _force_of(
+            case, record, missed[name], weights[name], responses, levels
         )
 
-    size = _slow_size([*forces.values()])
+    force_rms = _slow_rms([*forces.values()])
     records = []
     for record in case.experiments:
-        name, kept = record.name, weights[record.name]
-        moved = _response_to_all(responses, forces[name]) + beyond[name]
-        step = -(-len(kept) * levels.size // _MOST_VALUES)
-        looked_at = kept[::step]
-        whitening = _whitening(responses, size, looked_at, step)
-        rest = (missed[name] / levels - beyond[name])[::step] * looked_at[:, None]
+        name = record.name
+        moved = _response_to_all(responses, forces[name]) + nonlinear[name]
+        # A long record is looked at every few rows.
+        step = -(-len(record.output) * levels.size // _MOST_VALUES)
+        looked_at = weights[name][::step]
+        whitening = _whitening(responses, force_rms, looked_at, step)
+        linear_residuals = (missed[name] / levels - nonlinear[name])[::step] * looked_at[:, None]
         records.append(
             ForcedRecord(
                 name=name,
-                residuals=whitening.of(rest[:, None])[:, 0],
+                residuals=whitening.of(linear_residuals[:, None])[:, 0],
                 forces=forces[name],
                 motion=record.output - missed[name] + levels * moved,
                 weights=looked_at,
@@ -207,34 +220,39 @@ def missing_forces(case: CaseOfMachine, residuals: Mapping[str, Real]) -> Missin
                 noise_energies=(case.noise / levels) ** 2 * whitening.passes(looked_at, levels.size),
             )
         )
-    return MissingForces(places, responses, _reading_responses(case, moves, levels), tuple(records))
+    return MissingForces(places, responses, _reading_responses(case, missed_rms, levels), tuple(records))
 
 
-def _responses(case: CaseOfMachine, size: Real, levels: Real) -> tuple[tuple[ForcePlace, ...], Real]:
+def _responses(case: CaseOfMachine, missed_rms: Real, levels: Real) -> tuple[tuple[ForcePlace, ...], Real]:
     """Places that move an output, and (F, T, Y) responses over the levels to one unit over the first sample.
 
-    size (Y,): of the residuals in the outputs' units; a pulse moves the outputs about as far, so that
+    missed_rms (Y,): of the residuals in the outputs' units; a pulse moves the outputs about as far, so that
     contacts answer as they do to what is missing. The mean over some begins of the longest record stands for
     a response that depends on the pose.
     """
     longest = max(case.experiments, key=lambda record: len(record.output))
-    every = case.machine.force_places(longest.input.shape[1])
+    all_places = case.machine.force_places(longest.input.shape[1])
     rows = len(longest.output)
-    free = case.machine.pushed(longest.input, np.zeros((rows, len(every)))) if every else np.zeros((0, 0))
-    shown, responses = [], []
-    for k, place in enumerate(every):
+    if not all_places:
+        return (), np.zeros((0, rows, levels.size))
+    without_force = case.machine.pushed(longest.input, np.zeros((rows, len(all_places))))
+    places = []
+    responses = []
+    for k, place in enumerate(all_places):
 
         def moved(begin: int, pulse: float, at: int = k) -> Real:
-            forces = np.zeros((rows, len(every)))
+            """(T - begin, Y) over the levels, from a pulse in one row on."""
+            forces = np.zeros((rows, len(all_places)))
             forces[begin, at] = pulse
-            return (case.machine.pushed(longest.input, forces) - free)[begin:] / levels
+            return (case.machine.pushed(longest.input, forces) - without_force)[begin:] / levels
 
         pulse = 1.0 if place.command is None else _largest(longest.input[:, place.command])
-        first = float(np.max(np.abs(moved(0, pulse)), initial=0.0))
-        if not 0 < first < np.inf:
+        furthest = float(np.max(np.abs(moved(0, pulse)), initial=0.0))
+        if not 0 < furthest < np.inf:
             continue
-        pulse *= float(np.max(size / levels)) / first
-        total, count = np.zeros((rows, levels.size)), np.zeros((rows, 1))
+        pulse *= float(np.max(missed_rms / levels)) / furthest
+        total = np.zeros((rows, levels.size))
+        count = np.zeros((rows, 1))
         for share in _PULSES_AT:
             begin = int(share * rows)
             response = moved(begin, pulse) / pulse
@@ -243,36 +261,40 @@ def _responses(case: CaseOfMachine, size: Real, levels: Real) -> tuple[tuple[For
                 count[: rows - begin] += 1
         if np.any(total):
             motion = _moved_most(total) if place.motion is None else place.motion
-            shown.append(ForcePlace(place.name, place.unit, motion, place.command))
+            places.append(ForcePlace(place.name, place.unit, motion, place.command))
             responses.append(total / np.maximum(count, 1))
-    if not shown:
+    if not places:
         return (), np.zeros((0, rows, levels.size))
-    found = np.array(responses)
-    if any(place.motion is None for place in every):
-        shown = _paired(shown, found * levels)
-    return tuple(shown), found
+    of_places = np.array(responses)
+    if any(place.motion is None for place in all_places):
+        places = _paired(places, of_places * levels)
+    return tuple(places), of_places
 
 
-def _reading_responses(case: CaseOfMachine, size: Real, levels: Real) -> Real:
+def _reading_responses(case: CaseOfMachine, missed_rms: Real, levels: Real) -> Real:
     """(Y, T, Y) residuals over the levels where an output reads one unit more in the first row.
 
-    A simulation that is held near what was measured follows the wrong reading; others do not know of it.
+    A simulation that is held near what was measured, whose inputs hold the outputs behind the commands,
+    follows the wrong reading; others do not know of it. missed_rms (Y,): size of the wrong reading.
     """
-    machine, longest = case.machine, max(case.experiments, key=lambda record: len(record.output))
+    machine = case.machine
+    longest = max(case.experiments, key=lambda record: len(record.output))
     rows, outputs = longest.output.shape
-    found = np.zeros((outputs, rows, outputs))
-    found[:, 0] = np.eye(outputs)
+    responses = np.zeros((outputs, rows, outputs))
+    responses[:, 0] = np.eye(outputs)
     commands = len(machine.input_names)
-    if longest.input.shape[1] == commands + outputs:
-        none = np.zeros((rows, len(machine.force_places(commands))))
-        free, middle = machine.pushed(longest.input, none), rows // 2
+    is_held = longest.input.shape[1] == commands + outputs
+    if is_held:
+        no_forces = np.zeros((rows, len(machine.force_places(commands))))
+        as_read = machine.pushed(longest.input, no_forces)
+        middle = rows // 2
         for k in range(outputs):
-            read = np.array(longest.input)
-            read[middle, commands + k] += size[k]
-            moved = (machine.pushed(read, none) - free)[middle:] / size[k]
+            misread = np.array(longest.input)
+            misread[middle, commands + k] += missed_rms[k]
+            moved = (machine.pushed(misread, no_forces) - as_read)[middle:] / missed_rms[k]
             if np.all(np.isfinite(moved)):
-                found[k, : rows - middle] -= moved
-    return np.asarray(found / levels)
+                responses[k, : rows - middle] -= moved
+    return np.asarray(responses / levels)
 
 
 def _largest(signal: Real) -> float:
@@ -291,14 +313,14 @@ def _paired(places: Sequence[ForcePlace], responses: Real) -> list[ForcePlace]:
     Of joints in coordinates of their own, an inverse inertia has no permutation with a larger trace. Where
     there are fewer outputs than places, or commands that are no forces, several may share an output.
     """
-    early = max(responses.shape[1] // 10, 2)
-    begin = np.sum(responses[:, :early], axis=1)
-    whole = np.max(np.abs(responses), axis=(0, 1))
-    begin = begin / np.where(whole > 0, whole, 1.0)
-    rows, columns = linear_sum_assignment(-begin)
-    own = dict(zip(rows.tolist(), columns.tolist(), strict=True))
+    early = max(responses.shape[1] // _EARLY, 2)
+    early_motion = np.sum(responses[:, :early], axis=1)
+    largest = np.max(np.abs(responses), axis=(0, 1))
+    early_motion = early_motion / np.where(largest > 0, largest, 1.0)
+    rows, columns = linear_sum_assignment(-early_motion)
+    output_of = dict(zip(rows.tolist(), columns.tolist(), strict=True))
     return [
-        ForcePlace(place.name, place.unit, own.get(k, place.motion), place.command)
+        ForcePlace(place.name, place.unit, output_of.get(k, place.motion), place.command)
         for k, place in enumerate(places)
     ]
 
@@ -307,33 +329,42 @@ def _force_of(
     case: CaseOfMachine, record: RecordOfMachine, missed: Real, weights: Real, responses: Real, levels: Real
 ) -> tuple[Real, Real]:
     """(T, F) forces that make the simulation follow a record, and (T, Y), over the levels, what their
-    simulation gives beyond their linear response; zeros where it follows no better with them."""
+    simulation gives beyond their linear response; zeros where it follows no better with them.
+
+    missed : (T, Y) in the outputs' units. weights : (T,) zero in rows that are missing. responses : (F, T, Y)
+    over the levels (Y,).
+    """
     rows, outputs = missed.shape
-    forces, beyond = np.zeros((rows, len(responses))), np.zeros((rows, outputs))
+    forces = np.zeros((rows, len(responses)))
+    nonlinear = np.zeros((rows, outputs))
     if not len(responses):
-        return forces, beyond
+        return forces, nonlinear
     target = missed / levels * weights[:, None]
     # The RMS of what is followed: noise where the residual is small, a share of it where it is large.
     enough = _ENOUGH * np.sqrt(target.size)
-    free = case.machine.pushed(record.input, forces)
-    left, error = target, float(np.linalg.norm(target))
+    without_force = case.machine.pushed(record.input, forces)
+    left = target
+    error = float(np.linalg.norm(target))
     for _ in range(_ROUNDS):
         if error <= enough:
             break
         step = _deconvolved(left, weights, responses, enough / error)
-        before = error
+        error_before = error
+        # The first part of the step that comes nearer is taken.
         for part in _PARTS:
             trial = forces + part * step
-            pushed = (case.machine.pushed(record.input, trial) - free) / levels
-            again = target - pushed * weights[:, None]
-            reached = float(np.linalg.norm(again))
-            if reached < error:
-                forces, left, error = trial, again, reached
-                beyond = pushed - _response_to_all(responses, forces)
+            moved = (case.machine.pushed(record.input, trial) - without_force) / levels
+            left_by_trial = target - moved * weights[:, None]
+            error_of_trial = float(np.linalg.norm(left_by_trial))
+            if error_of_trial < error:
+                forces = trial
+                left = left_by_trial
+                error = error_of_trial
+                nonlinear = moved - _response_to_all(responses, forces)
                 break
-        if not error < _GAINS * before:
+        if not error < _GAINS * error_before:
             break
-    return forces, beyond
+    return forces, nonlinear
 
 
 def _deconvolved(target: Real, weights: Real, responses: Real, tolerance: float) -> Real:
@@ -345,14 +376,16 @@ def _deconvolved(target: Real, weights: Real, responses: Real, tolerance: float)
     spectra = rfft(responses[:, :rows], n, axis=1)
 
     def forward(x: Real) -> Real:
+        """Outputs of forces."""
         of_forces = rfft(x.reshape(rows, places).T, n, axis=1)
-        found = irfft(np.einsum("fw,fwy->wy", of_forces, spectra), n, axis=0)[:rows]
-        return np.asarray(found * weights[:, None]).ravel()
+        outputs_of = irfft(np.einsum("fw,fwy->wy", of_forces, spectra), n, axis=0)[:rows]
+        return np.asarray(outputs_of * weights[:, None]).ravel()
 
     def backward(y: Real) -> Real:
+        """The adjoint: forces of outputs."""
         of_outputs = rfft(y.reshape(rows, outputs) * weights[:, None], n, axis=0)
-        found = irfft(np.einsum("wy,fwy->wf", of_outputs, np.conj(spectra)), n, axis=0)[:rows]
-        return np.asarray(found).ravel()
+        forces_of = irfft(np.einsum("wy,fwy->wf", of_outputs, np.conj(spectra)), n, axis=0)[:rows]
+        return np.asarray(forces_of).ravel()
 
     # Places in units of their own: a force of one in each moves the outputs about as far.
     scale = np.tile(1 / np.sqrt(np.sum(responses**2, axis=(1, 2))), rows)
@@ -362,16 +395,16 @@ def _deconvolved(target: Real, weights: Real, responses: Real, tolerance: float)
         rmatvec=lambda y: backward(np.ravel(y)) * scale,
         dtype=np.float64,
     )
-    found = lsqr(operator, target.ravel(), atol=0.0, btol=tolerance, conlim=0.0, iter_lim=_ITERATIONS)
-    return np.asarray(found[0] * scale).reshape(rows, places)
+    solution, *_ = lsqr(operator, target.ravel(), atol=0.0, btol=tolerance, conlim=0.0, iter_lim=_ITERATIONS)
+    return np.asarray(solution * scale).reshape(rows, places)
 
 
-def _slow_size(forces: Sequence[Real]) -> Real:
+def _slow_rms(forces: Sequence[Real]) -> Real:
     """(F,) RMS of the missing forces (T, F) of all records, each as means over some rows: without the noise
     that a force of single rows holds."""
     means = []
-    for one in forces:
-        parts = np.array_split(one, max(len(one) // _ROWS_PER_FORCE, 1))
+    for of_record in forces:
+        parts = np.array_split(of_record, max(len(of_record) // _ROWS_PER_FORCE, 1))
         means += [np.mean(part, axis=0) for part in parts]
     return np.asarray(np.sqrt(np.mean(np.square(means), axis=0)))
 
@@ -381,12 +414,12 @@ def _gains(responses: Real) -> Real:
     return np.asarray(np.sqrt(np.sum(responses**2, axis=(1, 2))))
 
 
-def _whitening(responses: Real, size: Real, weights: Real, step: int) -> Whitening:
+def _whitening(responses: Real, force_rms: Real, weights: Real, step: int) -> Whitening:
     """What makes noise, beside the traces of unknown forces and of an unknown start, white.
 
     A machine that drifts integrates the smallest force: without this all of its error is drift, and no curve
     explains it. Forces that no curve explains are triangles over some rows each, independent, of a share of
-    the RMS `size` (F,) of what is missing; forces in the first rows, of any size, stand for the start. The
+    `force_rms` (F,), what is missing; forces in the first rows, of any size, stand for the start. The
     covariance of a record, beside its start, is C = I + N N', N their responses. With the singular values s
     of N and its left vectors U, C^(-1/2) = I - U (1 - (1 + s^2)^(-1/2)) U'. weights: of every `step`-th row.
     """
@@ -394,19 +427,24 @@ def _whitening(responses: Real, size: Real, weights: Real, step: int) -> Whiteni
     if not len(responses):
         return Whitening(np.zeros((len(weights) * outputs, 0)), np.zeros(0))
     rows = (len(weights) - 1) * step + 1
-    count = int(np.clip(rows // _ROWS_PER_FORCE, 2, max(_MOST_FORCES // len(responses), 2)))
+    most = max(_MOST_FORCES // len(responses), _FEWEST_FORCES)
+    count = int(np.clip(rows // _ROWS_PER_FORCE, _FEWEST_FORCES, most))
     nodes = np.linspace(0, rows - 1, count)
     triangles = np.array([np.interp(np.arange(rows), nodes, row) for row in np.eye(count)]).T
     # What is not explained moves the outputs about as far from each place as from the one that misses most.
     gains = _gains(responses)
-    unexplained = _UNEXPLAINED * float(np.max(size * gains))
+    unexplained = _UNEXPLAINED * float(np.max(force_rms * gains))
 
     def of_all(forces: Real) -> Real:
         """(T / step Y, K F) responses over their gains to forces (T, K) at every place."""
-        every = [_convolved(forces, one / gain)[::step] for one, gain in zip(responses, gains, strict=True)]
-        found = np.concatenate(every, axis=1) * weights[:, None, None]
-        return np.asarray(np.moveaxis(found, 1, 2).reshape(len(weights) * outputs, -1))
+        by_place = [
+            _convolved(forces, response / gain)[::step]
+            for response, gain in zip(responses, gains, strict=True)
+        ]
+        together = np.concatenate(by_place, axis=1) * weights[:, None, None]
+        return np.asarray(np.moveaxis(together, 1, 2).reshape(len(weights) * outputs, -1))
 
+    # Directions of the start are taken off as a whole, those of unknown forces as far as these explain them.
     of_start = of_all(np.eye(rows, _START_ROWS))
     lengths = np.maximum(np.linalg.norm(of_start, axis=0), np.finfo(float).tiny)
     start, sizes, _ = np.linalg.svd(of_start / lengths, full_matrices=False)
@@ -422,10 +460,10 @@ def _whitening(responses: Real, size: Real, weights: Real, step: int) -> Whiteni
 
 def _response_to_all(responses: Real, forces: Real) -> Real:
     """(T, Y) over the levels, of forces (T, F) at all places together."""
-    found = np.zeros((len(forces), responses.shape[2]))
+    moved = np.zeros((len(forces), responses.shape[2]))
     for k, response in enumerate(responses):
-        found += _convolved(forces[:, [k]], response)[:, 0]
-    return found
+        moved += _convolved(forces[:, [k]], response)[:, 0]
+    return moved
 
 
 def _convolved(forces: Real, response: Real) -> Real:
