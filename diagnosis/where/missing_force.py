@@ -283,7 +283,8 @@ def _reading_responses(case: CaseOfMachine, missed_rms: Real, levels: Real) -> R
     responses = np.zeros((outputs, rows, outputs))
     responses[:, 0] = np.eye(outputs)
     commands = len(machine.input_names)
-    is_held = longest.input.shape[1] == commands + outputs
+    # Of inputs that nobody has named all are commands.
+    is_held = commands > 0 and longest.input.shape[1] == commands + outputs
     if is_held:
         no_forces = np.zeros((rows, len(machine.force_places(commands))))
         as_read = machine.pushed(longest.input, no_forces)

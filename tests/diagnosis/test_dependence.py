@@ -244,3 +244,13 @@ def test_pushed_at_its_joint_a_mujoco_arm_moves_as_under_its_motor():
         by_motor -= plant.pushed(held, np.zeros((100, 1)))
         np.testing.assert_allclose(by_force, by_motor, atol=1e-12)
         assert np.max(np.abs(by_force)) > 1e-3
+
+
+def test_commands_that_nobody_named_are_no_readings():
+    """As many inputs as outputs, without names: the simulation does not read what was measured."""
+    case, left = case_of(lambda x, v, k, load: np.array([-8.0 * x[0], 0.0]))
+    unnamed = replace(case, plant=replace(case.plant, input_names=()))
+    expected, found = (missing_forces(one, left).reading_responses for one in (case, unnamed))
+    np.testing.assert_array_equal(found, expected)
+    # A wrong reading shows in its own row and output alone.
+    assert np.count_nonzero(found) == 2
