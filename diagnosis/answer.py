@@ -17,19 +17,34 @@ from ident.data.shown import Shown
 from plant.effects.search_space import Candidate
 
 Verdict = Literal["none", "effect", "unknown"]
+# "parametric": no effect, but values far outside their tolerances. "ambiguous": an effect, and another answer
+# is possible.
 DetailVerdict = Literal["none", "parametric", "effect", "ambiguous", "unknown", "not_converged"]
 # Nominal parameters as stated, re-estimated within their tolerances, effects added.
 Model = Literal["stated", "refit", "repaired"]
 
-NOISE_FLOOR = 1.0  # whitened residuals of a true model have unit variance
-# A nominal parameter that has to be off by more tolerances than this is significant by itself.
+# Whitened residuals of a true model have unit variance.
+NOISE_FLOOR = 1.0
+# A nominal parameter that has to be off by more tolerances than this is significant by itself: tolerances are
+# standard deviations, and one in 370 is further off.
 FAR_OFF = 3.0
-# Below this probability of the first answer, or with another one above that, the answer is called ambiguous.
-SURE, POSSIBLE = 0.8, 0.05
-# Shares of a range: a value this near its end is pinned there, an interval this wide says nothing.
-_PINNED, _WIDE = 1e-3, 0.9
-# Of the bootstrap of the share closed: draws, samples of a block.
-_BLOCKS, BLOCK = 2000, 50
+# Below this probability of the first answer it is called ambiguous. Chosen: one in five is a rival.
+SURE = 0.8
+# And with another answer above this one: one in twenty, the level of a usual test.
+POSSIBLE = 0.05
+# An effect more likely than not is called present.
+_PRESENT = 0.5
+# Part of a range: a value this near its end is pinned there, as steps of a fit end there.
+_PINNED = 1e-3
+# Part of a range: an interval this wide says nothing about where in it the value is. Chosen.
+_WIDE = 0.9
+# Draws of the bootstrap of the share closed: ends of a 95 % interval are known to 6 % of a deviation.
+_DRAWS = 2000
+# Samples of a block of it: longer than residuals resemble each other, as a rule. Chosen; shorter blocks make
+# an interval too narrow.
+BLOCK = 50
+# Bounds of 95 % of the draws.
+_INTERVAL = (0.025, 0.975)
 # Standard deviations by which energies exceed that of noise, or it is noise: one in a thousand records of
 # noise is above.
 _CHANCE = 3.0
@@ -272,12 +287,15 @@ class Diagnosis(Shown):
 
     @property
     def probability(self) -> float:
-        """Of the answer: the main cause where it stands alone, the whole set where there are several."""
+        """Probability of the answer: of the main cause where it stands alone, of the whole set where there
+        are several; no more than the presence of any of them."""
         if self.verdict != "effect":
             return self.probabilities[self.verdict]
-        together = self.sets[tuple(sorted(self.combination))]
-        alone = self.probabilities[self.combination[0]] if len(self.combination) == 1 else together
-        return min(alone, *map(self.presence, self.combination))
+        if len(self.combination) == 1:
+            of_answer = self.probabilities[self.combination[0]]
+        else:
+            of_answer = self.sets[tuple(sorted(self.combination))]
+        return min(of_answer, *map(self.presence, self.combination))
 
     def presence(self, name: str) -> float:
         """Probability that an effect is there at all; of "none" and "unknown" that they are the answer."""
@@ -287,7 +305,7 @@ class Diagnosis(Shown):
     def present(self) -> tuple[NamedEffect, ...]:
         """Effects that are more likely there than not, and those of the answer."""
         likely = (e for e in self.effects if e.name not in ("none", "unknown"))
-        return tuple(e for e in likely if e.presence >= 0.5 or e.name in self.combination)
+        return tuple(e for e in likely if e.presence >= _PRESENT or e.name in self.combination)
 
     @property
     def untried(self) -> dict[str, str]:
@@ -313,10 +331,16 @@ class Diagnosis(Shown):
     def perhaps(self) -> tuple[str, ...]:
         """Of `ambiguous_with`, effects that are likely beside the answer alone: one of another output cannot
         take its place."""
-        named = [name for name in self.ambiguous_with if self.combination and name not in self.beside]
-        whole = {key: p for key, p in self.sets.items() if set(self.combination) <= {*key}}
-        beside = {name: sum(p for key, p in whole.items() if name in key) for name in named}
-        return tuple(n for n, p in beside.items() if p >= POSSIBLE > self.presence(n) - p)
+        if not self.combination:
+            return ()
+        with_answer = {key: p for key, p in self.sets.items() if set(self.combination) <= set(key)}
+        perhaps = []
+        for name in self.ambiguous_with:
+            beside_answer = sum(p for key, p in with_answer.items() if name in key)
+            without_answer = self.presence(name) - beside_answer
+            if name not in self.beside and beside_answer >= POSSIBLE > without_answer:
+                perhaps.append(name)
+        return tuple(perhaps)
 
     @property
     def runner_up(self) -> str:
@@ -358,18 +382,24 @@ class Diagnosis(Shown):
         if getattr(plant, "untracked", None) is None:
             return {}
         runs = {"stated": plant.replayed(()), self.models[-1]: self.rig.replayed(self.repair)}
-        return {model: {e.name: run(e.input) for e in self.case.held_out} for model, run in runs.items()}
+        replays = {}
+        for model, run in runs.items():
+            replays[model] = {record.name: run(record.input) for record in self.case.held_out}
+        return replays
 
     @property
     def replayed(self) -> dict[str, dict[Model, float]]:
         """Output -> model -> RMS of measured less replayed, in the output's unit, all validation records."""
-        left = {
-            model: np.concatenate([e.output - runs[e.name] for e in self.case.held_out])
-            for model, runs in self.replays.items()
-        }
+        if not self.replays:
+            return {}
+        rms = {}
+        for model, runs in self.replays.items():
+            errors = np.concatenate([record.output - runs[record.name] for record in self.case.held_out])
+            rms[model] = np.sqrt(np.mean(errors**2, axis=0))
+        names = self.case.machine.output_names
         return {
-            name: {model: float(np.sqrt(np.mean(e[:, k] ** 2))) for model, e in left.items()}
-            for k, name in enumerate(self.case.machine.output_names if left else ())
+            name: {model: float(of_model[k]) for model, of_model in rms.items()}
+            for k, name in enumerate(names)
         }
 
     @property
@@ -387,8 +417,8 @@ class Diagnosis(Shown):
         }
 
     def size_of(self, residuals: Sequence[Real]) -> float:
-        """The one size of residuals (T, Y) of some records: RMS, beyond sensor noise that of the worst
-        output (`white`)."""
+        """The one size of residuals (T, Y) of some records: RMS of all outputs, or, where `white` says what
+        sensors have, that of the worst output beyond it."""
         together = np.concatenate(residuals)
         if self.white is None:
             return pooled_rms(together)
@@ -405,35 +435,52 @@ class Diagnosis(Shown):
 def best_first(
     entries: Sequence[NamedEffect], answer: str, accepted: Sequence[str]
 ) -> tuple[NamedEffect, ...]:
-    """The answer and what is accepted first, then by presence; none and unknown last unless they are it."""
-    order = {answer: -1, **{name: k for k, name in enumerate(accepted)}}
+    """The answer first, then accepted effects in their order, then others by presence; none and unknown last
+    unless they are the answer."""
+    order = {answer: -1}
+    order.update({name: k for k, name in enumerate(accepted)})
     last = {"none", "unknown"} - {answer}
 
-    def place(e: NamedEffect) -> tuple[bool, int, float, float]:
-        return e.name in last, order.get(e.name, len(order)), -e.presence, -e.probability
+    def place(effect: NamedEffect) -> tuple[bool, int, float, float]:
+        in_order = order.get(effect.name, len(order))
+        return effect.name in last, in_order, -effect.presence, -effect.probability
 
     return tuple(sorted(entries, key=place))
 
 
 def held_out_gap(case: CaseOfMachine, residuals: dict[str, Real]) -> float:
+    """RMS of the residuals (T, Y) of all validation records and outputs together, over the noise."""
     return pooled_rms(np.concatenate([residuals[e.name].ravel() for e in case.held_out]))
 
 
 def remarks(
     candidate: Candidate, coordinates: Real, intervals: Mapping[str, tuple[float, float]]
 ) -> dict[str, str]:
-    """Parameter -> what its interval does not say: pinned at an end of its range, or as wide as that."""
-    found = {}
+    """Parameter -> what its interval does not say: pinned at an end of its range, or as wide as that.
+
+    Parameters
+    ----------
+    candidate : Candidate
+    coordinates : (A,) array
+        Of its axes, as fitted.
+    intervals : parameter -> (low, high)
+        Of its values; a parameter without one has no remark.
+    """
+    remark_of = {}
     for axis, x in zip(candidate.axes, coordinates, strict=True):
         low, high = axis.box
         if axis.parameter not in intervals or not np.isfinite(high - low):
             continue
         ends = np.clip(np.sort(np.abs(intervals[axis.parameter])), axis.low, axis.high)
-        if min(x - low, high - x) < _PINNED * (high - low):
-            found[axis.parameter] = f"at the {'lower' if x - low < high - x else 'upper'} end of its range"
+        to_low = x - low
+        to_high = high - x
+        if min(to_low, to_high) < _PINNED * (high - low):
+            end = "lower" if to_low < to_high else "upper"
+            remark_of[axis.parameter] = f"at the {end} end of its range"
+        # Of an axis with both signs the interval of the size does not say how wide it is.
         elif axis.low >= 0 and axis.coordinate(ends[1]) - axis.coordinate(ends[0]) > _WIDE * (high - low):
-            found[axis.parameter] = "anywhere in its range"
-    return found
+            remark_of[axis.parameter] = "anywhere in its range"
+    return remark_of
 
 
 def left_of(
@@ -510,31 +557,52 @@ def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[
 
 def share_closed(
     case: CaseOfMachine,
-    before: dict[str, Real],
-    after: dict[str, Real],
+    before: Mapping[str, Real],
+    after: Mapping[str, Real],
     rng: np.random.Generator,
     floor: float,
 ) -> tuple[float, tuple[float, float]]:
-    """Share of the explainable held-out energy that is gone, with a block bootstrap."""
-    pairs = []
-    for experiment in case.held_out:
-        for start in range(0, len(experiment.output), BLOCK):
-            part = slice(start, start + BLOCK)
-            a, b = before[experiment.name][part], after[experiment.name][part]
-            pairs.append((float(np.sum(a**2)), float(np.sum(b**2)), a.size))
-    sums = np.array(pairs)
-    drawn = sums[rng.integers(0, len(sums), (_BLOCKS, len(sums)))].sum(axis=1)
+    """Share of the explainable energy of the validation error that is gone, with its 95 % interval.
 
-    def share(total: Real) -> Real:
-        explainable = total[..., 0] / total[..., 2] - floor**2
-        left = total[..., 1] / total[..., 2] - floor**2
+    1 - (R_after - F)/(R_before - F) with mean squares R and that of the noise F: no more than one, and below
+    zero where a model leaves more. The interval is by bootstrap over blocks of 50 samples.
+
+    Parameters
+    ----------
+    case : CaseOfMachine
+    before, after : record -> (T, Y) array
+        Residuals over the noise.
+    rng : numpy Generator
+    floor : float
+        RMS that noise and rounding leave, over the noise.
+
+    Returns
+    -------
+    share : float
+    interval : (low, high)
+        All nan without a gap beyond what the noise of so many samples makes.
+    """
+    blocks = []  # energy before, energy after, values
+    for record in case.held_out:
+        for start in range(0, len(record.output), BLOCK):
+            part = slice(start, start + BLOCK)
+            block_before = before[record.name][part]
+            block_after = after[record.name][part]
+            blocks.append((float(np.sum(block_before**2)), float(np.sum(block_after**2)), block_before.size))
+    sums = np.array(blocks)
+    total = sums.sum(axis=0)
+    drawn = sums[rng.integers(0, len(sums), (_DRAWS, len(sums)))].sum(axis=1)
+
+    def share(totals: Real) -> Real:
+        """(D,) of sums (D, 3)."""
+        explainable = totals[..., 0] / totals[..., 2] - floor**2
+        left = totals[..., 1] / totals[..., 2] - floor**2
         with np.errstate(divide="ignore", invalid="ignore"):
             # Less than noise leaves is by chance: no more than all is explained.
             return np.asarray(np.where(explainable > 0, np.minimum(1 - left / explainable, 1.0), np.nan))
 
-    # A gap that the noise of so many samples could make is none to close.
-    count = sums[:, 2].sum()
-    if sums[:, 0].sum() / count - floor**2 < _CHANCE * floor**2 * np.sqrt(2 / count):
+    gap = total[0] / total[2] - floor**2
+    if gap < _CHANCE * floor**2 * np.sqrt(2 / total[2]):
         return float("nan"), (float("nan"), float("nan"))
-    low, high = np.nanquantile(share(drawn), [0.025, 0.975])
-    return float(share(sums.sum(axis=0))), (float(low), float(high))
+    low, high = np.nanquantile(share(drawn), _INTERVAL)
+    return float(share(total)), (float(low), float(high))
