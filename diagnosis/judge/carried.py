@@ -26,6 +26,11 @@ _CLOSES = 0.05
 # Quantiles between which 95 % of the bootstrap lie.
 _INTERVAL = (0.025, 0.975)
 
+# Standard deviations of the energy of white noise by which a validation error exceeds it, or it is noise: one
+# in a thousand records of noise is above. Doubled, errors of a tenth of the noise count as none in records of
+# some thousand samples.
+_CHANCE = 3.0
+
 Names = tuple[str, ...]
 
 
@@ -54,7 +59,8 @@ def shares_of(
     Returns
     -------
     Shares
-        `carried` is empty where a time limit left no time for the parts of the repaired model.
+        `carried` is empty where a time limit left no time for the parts of the repaired model, and where the
+        nominal leaves no error beyond chance to share out.
 
     Notes
     -----
@@ -81,11 +87,23 @@ def shares_of(
 
 
 def closed_by(search: Search, explanation: Explanation, nominal: Explanation) -> float:
-    """Share of the energy of the validation error beyond noise that a set closes: 1 or less, negative where
-    it leaves more than the nominal."""
+    """Share of the energy of the validation error beyond noise that a set closes, -1 to 1.
+
+    0 where the nominal leaves no error beyond chance: there is nothing to close, and any quotient of two
+    energies about zero. Negative where the set leaves more than the nominal; -1 where it leaves twice as much
+    or more.
+    """
+    if not _has_gap(search, nominal):
+        return 0.0
     left = float(np.sum(_blocks(search, explanation)))
     before = float(np.sum(_blocks(search, nominal)))
-    return min(1 - left / before, 1.0)
+    return float(np.clip(1 - left / before, -1.0, 1.0))
+
+
+def _has_gap(search: Search, explanation: Explanation) -> bool:
+    """Whether the validation error has more energy than white noise of so many values has by chance."""
+    values = sum(residual.size for residual in explanation.held_out_residuals)
+    return float(np.sum(_blocks(search, explanation))) > _CHANCE * np.sqrt(2 * values)
 
 
 def _carried_by_each(
@@ -99,7 +117,7 @@ def _carried_by_each(
     parts = [part for count in range(len(names) + 1) for part in combinations(names, count)]
     fitted_keys = {repaired.sorted_names, *(explanation.sorted_names for explanation in search.explanations)}
     all_fitted = all(tuple(sorted(part)) in fitted_keys for part in parts)
-    if search.out_of_time and not all_fitted:
+    if (search.out_of_time and not all_fitted) or not _has_gap(search, nominal):
         return {}
 
     # A part of the model that runs away alone, far beyond what the nominal leaves, carries nothing.

@@ -23,18 +23,23 @@ _LEAST_SAMPLES = 100
 _NOISE_OF_LARGEST = 3.0
 # Samples for which the fast binary signal holds: a quarter of the sampling rate, which drives still follow.
 _FAST_HOLD = 4
-# The slow one changes at most so often in a record, and holds for five samples at least.
+# Changes of the slow one in a record at most: enough for its spectrum to be flat below them.
 _SLOW_CHANGES = 60
+# Samples for which it holds at least: more than the fast one.
 _LEAST_SLOW_HOLD = 5
-# Highest lines of the two multisines, and ends of the two chirps, over the Nyquist frequency. Chosen: a wide
-# one for delays and modes, a slow one for friction and springs.
+# Highest line of the wide multisine over the Nyquist frequency: where delays and modes show. Chosen.
 _WIDE = 0.35
+# Highest line of the slow one: where friction and springs show. Chosen.
 _SLOW = 0.06
+# End of the chirp that goes up, over the Nyquist frequency: above most modes that a log can show. Chosen.
 _CHIRP_WIDE = 0.6
+# End of the slow chirp: as the slow multisine.
 _CHIRP_SLOW = 0.05
-# Lengths of the pulses of the two doublets, and of a period of the triangle, as parts of a record.
+# The pulse of the short doublet is this part of a record: a push, as of a hand.
 _SHORT_PULSES = 40
+# That of the long one: the machine comes to its steady motion in it.
 _LONG_PULSES = 6
+# Periods of the triangle in a record: six reversals, each slow enough for friction to show.
 _TRIANGLES = 3
 # Steps of the record with rests: four heights, each with its negative.
 _STEPS = 8

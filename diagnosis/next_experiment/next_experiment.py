@@ -208,7 +208,7 @@ def pair_weights(competing: Sequence[CompetingHypothesis]) -> Real:
     products = np.array([a.probability * b.probability for a, b in combinations(competing, 2)])
     if not products.sum() > 0:
         return np.full(products.size, 1 / products.size)
-    return products / products.sum()
+    return np.asarray(products / products.sum())
 
 
 def expected_log_bayes_factor(apart: Real, weights: Real) -> tuple[float, float]:
