@@ -103,7 +103,7 @@ def closed_by(search: Search, explanation: Explanation, nominal: Explanation) ->
 def _has_gap(search: Search, explanation: Explanation) -> bool:
     """Whether the validation error has more energy than white noise of so many values has by chance."""
     values = sum(residual.size for residual in explanation.held_out_residuals)
-    return float(np.sum(_blocks(search, explanation))) > _CHANCE * np.sqrt(2 * values)
+    return bool(np.sum(_blocks(search, explanation)) > _CHANCE * np.sqrt(2 * values))
 
 
 def _carried_by_each(
