@@ -54,12 +54,6 @@ class DryFriction(NamedTuple):
     load: float = 0.0
     gap: float = 0.0
 
-    def level(self, speed: Real) -> Real:
-        """(T,) friction at speeds (T,) without load and play; at rest the most that is held either way."""
-        falling = self.coulomb + self.excess * np.exp(-np.abs(speed) / self.stribeck_velocity)
-        one_way = np.where(speed > 0, self.up, np.where(speed < 0, self.down, 0.0))
-        return np.asarray(falling + one_way)
-
 
 class SmoothForce(NamedTuple):
     """A force that is a smooth function of the body's position or speed.
@@ -140,13 +134,15 @@ class BodyForces:
         (T,) what is added to `force_without`. Nothing is held at rest: there friction may be anything up to
         its level.
         """
-        dry = np.sign(speed) * self.dry.level(speed)
+        speed = np.ascontiguousarray(speed)
+        position = np.ascontiguousarray(position)
+        dry = _friction_along(self.dry, speed)
         if self.dry.gap > 0:
             half = 0.5 * self.dry.gap
-            follower = followed(np.ascontiguousarray(position), half, float(position[0]))
+            follower = followed(position, half, float(position[0]))
             rubs = speed * (position - follower) >= _AT_END_OF_PLAY * half * np.abs(speed)
             dry = np.where(rubs, dry, 0.0)
-        smooth = _smooth_along(self.table, np.ascontiguousarray(position), np.ascontiguousarray(speed))
+        smooth = _smooth_along(self.table, position, speed)
         whole = force_without + dry - smooth
         # The commanded force is the whole one: more of it is lost where it drives than where it brakes.
         return np.asarray(whole / (1 - self.dry.load * np.sign(speed) * np.sign(whole)) - force_without)
@@ -185,6 +181,27 @@ BodyLaw = Callable[[Mapping[str, float]], BodyForces]
 
 
 @njit(cache=True)
+def friction_level(dry: DryFriction, speed: float) -> float:
+    """Level of dry friction at a speed, without load and play; at rest the most that is held either way."""
+    level = dry.coulomb + dry.excess * np.exp(-abs(speed) / dry.stribeck_velocity)
+    if speed > 0:
+        level += dry.up
+    elif speed < 0:
+        level += dry.down
+    return float(level)
+
+
+@njit(cache=True)
+def _friction_along(dry: DryFriction, speed: Real) -> Real:
+    """(T,) dry friction against a motion of these speeds (T,), with their sign; nothing at rest."""
+    friction = np.zeros(speed.size)
+    for k in range(speed.size):
+        if speed[k] != 0:
+            friction[k] = np.sign(speed[k]) * friction_level(dry, speed[k])
+    return friction
+
+
+@njit(cache=True)
 def smooth_force(table: Real, position: float, speed: float) -> float:
     """Force along positive motion, at one position and speed, of the smooth forces in a table (K, 5)."""
     total = 0.0
@@ -200,7 +217,7 @@ def smooth_force(table: Real, position: float, speed: float) -> float:
 
 @njit(cache=True)
 def _smooth_along(table: Real, position: Real, speed: Real) -> Real:
-    """(T,) the same along a motion (T,), (T,)."""
+    """(T,) force along positive motion of a table (K, 5), at positions (T,) and speeds (T,)."""
     force = np.empty(position.size)
     for k in range(position.size):
         force[k] = smooth_force(table, position[k], speed[k])

@@ -1,9 +1,11 @@
 """Forces on a joint of a MuJoCo model that MJCF has no word for.
 
-Their rows are those of any simulation (`diagnosis.machine.listed_effects`): each one with a smooth law is a
-quantity of every joint, tried by name. It stands in a model as <numeric name="JOINT.EFFECT" data="...">,
-values in the order of the row's parameters, is read from there, and acts as an applied force that is held
-over a step.
+Their rows are those of any simulation (`diagnosis.machine.listed_effects`): each one with a smooth law, or
+with dry friction in proportion to load, is a quantity of every joint, tried by name. It stands in a model as
+<numeric name="JOINT.EFFECT" data="...">, values in the order of the row's parameters, is read from there, and
+acts as an applied force, or as the joint's frictionloss, that is held over a step.
+
+Dry friction of one direction or behind a play has no row here: a frictionloss acts both ways and everywhere.
 """
 
 from __future__ import annotations
@@ -17,20 +19,36 @@ import mujoco
 import numpy as np
 
 from diagnosis.machine.around import EffectLaw
-from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothLaw, smooth_force
+from diagnosis.machine.body_forces import (
+    BodyForces,
+    DryFriction,
+    DryLaw,
+    SmoothLaw,
+    friction_level,
+    smooth_force,
+)
 from diagnosis.machine.listed_effects import KINDS, Magnitudes
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import STRIBECK, put_number
 from diagnosis.machine.plant_effect import PlantEffect, name_with_unit
 from plant.machine import OFF_AXIS
 
-# Effects that are numbers of a joint in MJCF: damping, damping[1], stiffness, stiffness[2].
-_IN_MJCF = ("viscous_friction", "quadratic_drag", "spring", "hardening_spring")
+# Effects that are numbers of a joint in MJCF: frictionloss, damping, damping[1], stiffness, stiffness[2].
+_IN_MJCF = ("coulomb_friction", "viscous_friction", "quadratic_drag", "spring", "hardening_spring")
+# Fields of dry friction that a frictionloss can be, if it changes from step to step.
+_AS_FRICTIONLOSS = {"coulomb", "excess", "stribeck_velocity", "load"}
+
+
+def _acts_on_a_joint(law: object) -> bool:
+    """Whether a force by this law of a body can be put on a joint."""
+    if isinstance(law, DryLaw):
+        return set(law.levels) <= _AS_FRICTIONLOSS
+    return isinstance(law, SmoothLaw)
+
+
 # Names of the effects that are not, last parts of the names of numbers that MuJoCo does not act on.
 FORCE_NAMES = tuple(
-    kind.name
-    for kind in KINDS.values()
-    if isinstance(kind.law.change, SmoothLaw) and kind.name not in _IN_MJCF
+    kind.name for kind in KINDS.values() if _acts_on_a_joint(kind.law.change) and kind.name not in _IN_MJCF
 )
 
 
@@ -53,7 +71,8 @@ def forces_of_joint(
     for name in FORCE_NAMES:
         kind = KINDS[name].at(magnitudes)
         # A weight turns about an axis.
-        if kind.law.change.law == OFF_AXIS and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
+        law = kind.law.change
+        if isinstance(law, SmoothLaw) and law.law == OFF_AXIS and joint.type != mujoco.mjtJoint.mjJNT_HINGE:
             continue
         number = f"{joint.name}.{name}"
         if spec.numeric(number) is not None:
@@ -116,23 +135,24 @@ def sensed_under(joints: tuple[JointForces, ...], model: Any, data: Any, control
     -------
     (N, S)
     """
-    level = np.array(model.dof_frictionloss)
-    falling = [joint for joint in joints if joint.forces.dry.excess != 0]
+    stated_level = np.array(model.dof_frictionloss)
+    dry = [(joint.dof, joint.forces.dry) for joint in joints if joint.forces.dry != DryFriction()]
     smooth = [(joint.dof, joint.position, joint.forces.table) for joint in joints if joint.forces.smooth]
-    falling_dofs = np.array([joint.dof for joint in falling], dtype=int)
-    excess = np.array([joint.forces.dry.excess for joint in falling])
-    velocity = np.array([joint.forces.dry.stribeck_velocity for joint in falling])
+    if any(friction.load != 0 for _, friction in dry):
+        # The load of a step is that of the one before; of the first one there is none yet.
+        data.ctrl[:] = control[0]
+        mujoco.mj_forward(model, data)
     readings = np.zeros((len(control), model.nsensordata))
     for k, command in enumerate(control):
-        if falling:
-            falls = np.exp(-np.abs(data.qvel[falling_dofs]) / velocity)
-            model.dof_frictionloss[falling_dofs] = level[falling_dofs] + excess * falls
+        for dof, friction in dry:
+            level = friction_level(friction, data.qvel[dof]) + friction.load * abs(data.qfrc_actuator[dof])
+            model.dof_frictionloss[dof] = stated_level[dof] + level
         for dof, position, table in smooth:
             data.qfrc_applied[dof] = smooth_force(table, data.qpos[position], data.qvel[dof])
         data.ctrl[:] = command
         mujoco.mj_step(model, data)
         readings[k] = data.sensordata
-    model.dof_frictionloss[:] = level
+    model.dof_frictionloss[:] = stated_level
     data.qfrc_applied[:] = 0.0
     return readings
 

@@ -16,6 +16,7 @@ from plant.effects import Effect
 from plant.machine import SmoothTorque
 from plant.presets import paper_link
 from plant.simulation import Simulator
+from tests.diagnosis.machines import rubbing
 
 DT_S, INERTIA = 0.01, 0.17
 # Row -> values of its parameters, and the force against positive motion at a position and a speed.
@@ -140,6 +141,28 @@ def test_on_the_hub_of_a_rig(name):
     torque = np.append(-force(middle, speed), 0.0)
     pushed = Simulator(rig).measured(["hub_angle_rad"], voltage, hub_torque_Nm=torque)[:, 0]
     assert np.linalg.norm(pushed - angle) < 3e-3 * np.linalg.norm(free - angle)
+
+
+@pytest.mark.parametrize("turning", [1.0, -1.0])
+def test_friction_in_proportion_to_load_on_a_joint_of_a_mujoco_model(turning):
+    """Its row too; a load is a step late. Measured 1.2e-3 of what it changes."""
+    mujoco = pytest.importorskip("mujoco")
+    from diagnosis.machine.mujoco_plant import MujocoArm
+
+    command, now = turning * COMMAND, 0.0
+
+    def acceleration(x, v, u):
+        nonlocal now
+        now = abs(u)
+        return u / INERTIA
+
+    truth = rubbing(acceleration, command, DT_S, lambda v: 0.15 * now / INERTIA)[:, :1]
+    log = np.column_stack([command, truth])
+    record = PlantExperiment("a", "estimation", log, truth)
+    arm = MujocoArm(mujoco.MjSpec.from_string(ROD), ("hinge",), DT_S)
+    plant = arm.plant([record], np.array([1e-4]), named=["*.load_friction"])
+    found = plant.simulator([Change("hinge.load_friction", {"share": 0.15})])(log)
+    assert np.linalg.norm(found - truth) < 4e-3 * np.linalg.norm(plant.simulator([])(log) - truth)
 
 
 _OF = {"position": "angle", "speed": "speed"}
