@@ -148,7 +148,7 @@ class Body:
 
             is_only_output = free[0].shape[1] == 1
             outputs, missed = with_forces(
-                simulate, free, command, response, forces, with_motion, alone=is_only_output
+                simulate, free, command, response, forces, with_motion, is_only_output=is_only_output
             )
             return outputs if missed < _MISSED else np.full_like(outputs, np.nan)
 

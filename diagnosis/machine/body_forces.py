@@ -73,7 +73,8 @@ class SmoothForce(NamedTuple):
     @property
     def row(self) -> tuple[float, ...]:
         """Its row (5,) of the table that compiled functions read."""
-        return (float(self.law), float(self.of == "speed"), *self._three_parameters)
+        of_speed = 1.0 if self.of == "speed" else 0.0
+        return (float(self.law), of_speed, *self._three_parameters)
 
     @property
     def wave_number(self) -> float:
@@ -95,7 +96,7 @@ class SmoothForce(NamedTuple):
 
 @dataclass(frozen=True)
 class BodyForces:
-    """All forces of some effects on one body."""
+    """The forces of several effects on one body."""
 
     dry: DryFriction = field(default_factory=DryFriction)
     smooth: tuple[SmoothForce, ...] = ()
@@ -370,7 +371,7 @@ def _slowed(
     level_back: float,
     more_at_rest: float,
 ) -> tuple[float, float]:
-    """Of a body that begins to move upwards: speed at the end, and mean dry friction.
+    """Speed at the end and mean dry friction of a body that moves upwards at the start.
 
     It slides on, or comes to rest and is held, or turns round within the part, from where the level of the
     other direction (level_back) acts.

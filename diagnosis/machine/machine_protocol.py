@@ -147,7 +147,7 @@ class RecordOfMachine(Protocol):
 
     @property
     def name(self) -> str:
-        """Of which a case has no second one."""
+        """Name of the record; no other of its case has it."""
 
     @property
     def role(self) -> Role:

@@ -207,7 +207,7 @@ class LinearBody:
         """
         head = np.concatenate([np.zeros(self.ahead), self.numerator])
         denominator = np.concatenate([[1.0], -self.poles])
-        beyond = np.asarray(simulated - scipy.signal.lfilter(head, denominator, force))
+        beside = np.asarray(simulated - scipy.signal.lfilter(head, denominator, force))
         travel = np.cumsum(simulated) * self.dt_s if self.of_speed else simulated
         parts = self.parts(forces, travel)
         if parts not in self._steps:
@@ -216,10 +216,10 @@ class LinearBody:
         of_states, of_command, of_force = self._steps[parts]
 
         # Slopes of fourth order, to go through parts of samples along cubics.
-        slopes = np.gradient(beyond)
-        slopes[2:-2] = (8 * (beyond[3:-1] - beyond[1:-3]) - beyond[4:] + beyond[:-4]) / 12
+        slopes = np.gradient(beside)
+        slopes[2:-2] = (8 * (beside[3:-1] - beside[1:-3]) - beside[4:] + beside[:-4]) / 12
         held, moment, position, speed = _through(
-            beyond,
+            beside,
             slopes,
             command,
             of_states,
@@ -238,7 +238,7 @@ class LinearBody:
         moment += self.early * held
         held[1:] += 0.5 * moment[:-1]
         held[:-1] -= 0.5 * moment[1:]
-        expected = beyond + scipy.signal.lfilter(head, denominator, command + held)
+        expected = beside + scipy.signal.lfilter(head, denominator, command + held)
         return held, speed if self.of_speed else position, expected
 
 
@@ -365,8 +365,8 @@ def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
         # Poles: each value follows from those before it.
         rows = np.unique(np.linspace(first, length - 2, _FITTED).astype(int))
         before = h[rows[:, None] - np.arange(1, order + 1)]
-        tried = np.linalg.lstsq(before * weights[rows, None], h[rows] * weights[rows], rcond=None)[0]
-        denominator = np.concatenate([[1.0], -tried])
+        trial_poles = np.linalg.lstsq(before * weights[rows, None], h[rows] * weights[rows], rcond=None)[0]
+        denominator = np.concatenate([[1.0], -trial_poles])
         roots = np.roots(denominator)
         has_no_logarithm = (roots.real <= 0) & (np.abs(roots.imag) < _REAL)
         if np.max(np.abs(roots)) > _UNSTABLE or np.any(has_no_logarithm):
@@ -374,18 +374,18 @@ def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
 
         # Numerator: responses of the poles alone, each a sample later than the one before.
         rows = np.concatenate([np.arange(ahead, first), rows])
-        alone = scipy.signal.lfilter([1.0], denominator, pulse)
-        if not np.max(np.abs(alone)) < _GROWS:
+        all_pole = scipy.signal.lfilter([1.0], denominator, pulse)
+        if not np.max(np.abs(all_pole)) < _GROWS:
             continue  # faster than any response that ends at one
         delays = range(ahead, ahead + order)
-        delayed = np.column_stack([np.concatenate([np.zeros(j), alone[: length - j]]) for j in delays])
+        delayed = np.column_stack([np.concatenate([np.zeros(j), all_pole[: length - j]]) for j in delays])
         head = np.linalg.lstsq(delayed[rows] * weights[rows, None], h[rows] * weights[rows], rcond=None)[0]
 
         # What it lacks at the very end is what a response lacks that has been cut there.
         missed = np.max((np.abs(delayed @ head - h) * weights)[ahead:-1])
         if missed < least_missed:
             least_missed = missed
-            poles = tried
+            poles = trial_poles
             numerator = np.concatenate([np.zeros(ahead), head])
         if least_missed < _EXACT:
             break
@@ -400,7 +400,7 @@ def with_forces(
     forces: BodyForces,
     placed: Callable[[Real, Real], Real],
     *,
-    alone: bool,
+    is_only_output: bool,
 ) -> tuple[Real, float]:
     """Outputs of a simulation with forces on its body.
 
@@ -416,7 +416,7 @@ def with_forces(
     forces : BodyForces
     placed : outputs (T, Y), motion (T,) -> outputs (T, Y)
         With another motion in them.
-    alone : bool
+    is_only_output : bool
         The motion is the only output.
 
     Returns
@@ -435,13 +435,13 @@ def with_forces(
         held, motion, expected = body.answer(simulated, command + held, command, forces)
         if not np.all(np.isfinite(motion)):
             return outputs, np.inf
-        if alone and error_before < np.inf and error / error_before * error < _FORETOLD:
+        if is_only_output and error_before < np.inf and error / error_before * error < _FORETOLD:
             # As much closer again, what the next simulation would say is known.
             return placed(outputs, motion), error / error_before * error
         error_before = error
         outputs, simulated = simulate(command + held)
         error = _rms(simulated - expected) / max(_rms(motion - free[1]), np.finfo(float).tiny)
-        enough = _FORETOLD if alone else _CONVERGED
+        enough = _FORETOLD if is_only_output else _CONVERGED
         gets_no_closer = 0.5 * error_before < error < _SETTLED
         if error < enough or gets_no_closer:
             break
@@ -519,7 +519,7 @@ def _solve(
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
 def _through(
-    beyond: Real,
+    beside: Real,
     slopes: Real,
     command: Real,
     step: Real,
@@ -536,7 +536,7 @@ def _through(
 ) -> tuple[Real, Real, Real, Real]:
     """Means and moments of the body forces in every sample (T,), positions and speeds (T,) with them.
 
-    beyond, slopes : (T,) position or speed beside the response to forces, and by how much it changes per
+    beside, slopes : (T,) position or speed beside the response to forces, and by how much it changes per
     sample. command : (T,). step (N, N), commanded (N,), pushed (N,) : what states, command and force make of
     the states over a part of a sample. rows : (2, N) of `LinearBody`. dry, table, rounds : of `BodyForces`.
     """
@@ -559,9 +559,9 @@ def _through(
     half_gap = 0.5 * dry.gap
     if of_speed:
         last_position = 0.0
-        last_speed = beyond[0]
+        last_speed = beside[0]
     else:
-        last_position = beyond[0]
+        last_position = beside[0]
         last_speed = slopes[0] / dt_s
     follower = last_position
     if ahead == 1:
@@ -570,8 +570,8 @@ def _through(
     for k in range(samples - ahead):
         # A cubic from sample to sample; before the first nothing is known to move.
         n = k + ahead
-        start = beyond[max(n - 1, 0)]
-        end = beyond[n]
+        start = beside[max(n - 1, 0)]
+        end = beside[n]
         rise = 0.0
         end_rise = 0.0
         if n > 0:

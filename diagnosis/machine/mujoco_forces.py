@@ -100,8 +100,8 @@ class JointForces:
 
     @classmethod
     def of_model(cls, model: Any) -> tuple[JointForces, ...]:
-        """Those of every joint that has any, of the numbers in a compiled model (MjModel)."""
-        found = []
+        """Forces of every joint that has any, from the numbers in a compiled model (MjModel)."""
+        joints = []
         for k in range(model.njnt):
             joint = model.joint(k)
             forces = BodyForces()
@@ -116,8 +116,8 @@ class JointForces:
                 names = (parameter.name for parameter in KINDS[name].parameters)
                 forces = forces + KINDS[name].law.change(dict(zip(names, values, strict=True)))
             if forces != BodyForces():
-                found.append(cls(int(joint.dofadr[0]), int(joint.qposadr[0]), forces))
-        return tuple(found)
+                joints.append(cls(int(joint.dofadr[0]), int(joint.qposadr[0]), forces))
+        return tuple(joints)
 
 
 def sensed_under(joints: tuple[JointForces, ...], model: Any, data: Any, control: Real) -> Real:
