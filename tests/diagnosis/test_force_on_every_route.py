@@ -8,8 +8,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from diagnosis import Body, Change, MeasuredBody, Plant, PlantExperiment, with_effects
+from diagnosis import (
+    Body,
+    Change,
+    MeasuredBody,
+    Plant,
+    PlantCase,
+    PlantExperiment,
+    diagnose,
+    with_effects,
+)
 from diagnosis.machine.body_forces import SmoothLaw
 from diagnosis.machine.listed_effects import KINDS
 from plant.effects import Effect
@@ -163,6 +173,82 @@ def test_friction_in_proportion_to_load_on_a_joint_of_a_mujoco_model(turning):
     plant = arm.plant([record], np.array([1e-4]), named=["*.load_friction"])
     found = plant.simulator([Change("hinge.load_friction", {"share": 0.15})])(log)
     assert np.linalg.norm(found - truth) < 4e-3 * np.linalg.norm(plant.simulator([])(log) - truth)
+
+
+def cogging_records(measured):
+    """Records of a rod with a cogging torque of 0.15 sin(7 x + 0.4) N m and damping."""
+    records = []
+    for k, role in enumerate(("estimation", "estimation", "held_out")):
+        command = np.random.default_rng(k).uniform(-1, 1, 15).repeat(20)
+        motion = moved(command, lambda x, v: 0.1 * v - 0.15 * np.sin(7 * x + 0.4))
+        records.append(
+            PlantExperiment(f"{k}", role, *measured(command, motion, np.random.default_rng(9 + k)))
+        )
+    return records
+
+
+def around_python():
+    def simulate(p, e, u):
+        """Of held commands the exact angle."""
+        time_constant = INERTIA / p["damper"]
+        pole = np.exp(-DT_S / time_constant)
+        speed = lfilter([0, (1 - pole) / p["damper"]], [1, -pole], u[:, 0])
+        slowed = time_constant * (1 - pole)
+        steps = slowed * speed + (DT_S - slowed) / p["damper"] * u[:, 0]
+        return np.cumsum(np.append(0.0, steps[:-1]))[:, None]
+
+    records = cogging_records(lambda u, m, rng: (u[:, None], m[:, :1] + 1e-4 * rng.standard_normal((300, 1))))
+    plant = Plant(simulate, {"damper": 0.1}, {"damper": 0.2}, ("x_rad",), np.array([1e-4]), model_error=0.05)
+    names = ["cogging", "viscous_friction", "coulomb_friction", "spring"]
+    return with_effects(plant, names, records, dt_s=DT_S, body=Body("x_rad")), records
+
+
+def in_a_measured_motion():
+    def simulate(p, e, u):
+        return INERTIA * np.gradient(u[:, 1:], DT_S, axis=0) + p["damper"] * u[:, 1:]
+
+    def measured(u, m, rng):
+        x, v = m.T
+        torque = INERTIA * np.gradient(v, DT_S) + 0.1 * v - 0.15 * np.sin(7 * x + 0.4)
+        return m, torque[:, None] + 0.01 * rng.standard_normal((300, 1))
+
+    records = cogging_records(measured)
+    plant = Plant(simulate, {"damper": 0.1}, {"damper": 0.2}, ("T_Nm",), np.array([0.01]), model_error=0.02)
+    names = ["cogging", "viscous_friction", "coulomb_friction", "spring"]
+    return with_effects(plant, names, records, dt_s=DT_S, body=MeasuredBody(0, 1)), records
+
+
+def on_a_mujoco_joint():
+    mujoco = pytest.importorskip("mujoco")
+    from diagnosis.machine.mujoco_plant import MujocoArm
+
+    def measured(u, m, rng):
+        angle = m[:, :1] + 1e-4 * rng.standard_normal((300, 1))
+        return np.column_stack([u, angle]), angle
+
+    records = cogging_records(measured)
+    damped = ROD.replace('axis="0 0 1"', 'axis="0 0 1" damping="0.1"')
+    arm = MujocoArm(mujoco.MjSpec.from_string(damped), ("hinge",), DT_S)
+    return arm.plant(records, np.array([1e-4]), model_error=0.02, named=["hinge.cogging"]), records
+
+
+@pytest.mark.parametrize(
+    "route",
+    [
+        pytest.param(around_python, marks=pytest.mark.slow),
+        in_a_measured_motion,
+        pytest.param(on_a_mujoco_joint, marks=pytest.mark.long),
+    ],
+)
+def test_cogging_is_diagnosed_with_its_size(route):
+    plant, records = route()
+    found = diagnose(PlantCase("rod", plant, tuple(records)))
+    (name,) = found.combination
+    assert name.rpartition(".")[2] == "cogging"
+    amplitude, wave_number, phase = found.repair[0].values.values()
+    assert amplitude == pytest.approx(0.15, rel=0.05)
+    assert wave_number == pytest.approx(7.0, rel=0.01)
+    assert phase == pytest.approx(0.4, abs=0.05)
 
 
 _OF = {"position": "angle", "speed": "speed"}
