@@ -397,7 +397,7 @@ def _said_of_values(plant: Plant, changed: Mapping[str, Any]) -> list[str]:
 
 
 def _said_of_delays(model: Any) -> list[str]:
-    """Lines for the head of a repaired file: what has to be filled in before a replay, of a compiled model."""
+    """Lines for the head of a repaired file: what a replay of the compiled model has to fill in before."""
     lines = []
     for kind, history in (("Ctrl", model.actuator_history), ("Sensor", model.sensor_history)):
         late = np.flatnonzero(history[:, 0])
