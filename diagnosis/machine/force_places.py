@@ -33,15 +33,15 @@ class ForcePlace:
 
 @dataclass(frozen=True, eq=False)
 class ForcedSimulation:
-    """A simulation with forces of its own at some places, beside its commands.
+    """A simulation that takes forces at some places beside its commands.
 
     Parameters
     ----------
-    places : tuple of ForcePlace
-        (F,) places, in the order of the columns of the forces.
+    places : (F,) tuple of ForcePlace
+        In the order of the columns of the forces.
     simulate : callable
         (parameters, inputs (T, U), forces (T, F) in the places' units) -> outputs (T, Y) as measured,
-        without noise. Forces are held over each sample.
+        without noise. Parameters is name -> value; forces are held over each sample.
     """
 
     places: tuple[ForcePlace, ...]
