@@ -8,7 +8,8 @@ that the spec does not have is an AttributeError. Lengths are in m, angles in ra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any
 
 import mujoco
@@ -71,6 +72,17 @@ def put_compiled(spec: Any, model: Any) -> None:
         # A damping ratio stands in the spec as a positive number where the compiled damping is negative.
         if actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE:
             actuator.biasprm = model.actuator_biasprm[k]
+
+
+def free_name(part: str, what: str, find: Callable[[str], Any]) -> str:
+    """Name for what is added to a part: "PART WHAT"; "PART 2 WHAT" and so on where the model has that.
+
+    A repaired file has such parts, and may be repaired again. find : name -> part of a spec of the kind that
+    is added, None where there is none.
+    """
+    if find(f"{part} {what}") is None:
+        return f"{part} {what}"
+    return next(name for name in (f"{part} {k} {what}" for k in count(2)) if find(name) is None)
 
 
 def put_component(part: Any, attribute: str, place: int, value: float) -> None:
@@ -223,7 +235,7 @@ def put_shape(name: str, i: int, j: int, spec: Any, value: float) -> None:
 
 def put_payload(name: str, position_m: tuple[float, ...], spec: Any, mass_kg: float) -> None:
     """Add a point mass at a position (3,) of a body, in the body's frame."""
-    load = spec.body(name).add_body(name=f"{name} payload", pos=position_m)
+    load = spec.body(name).add_body(name=free_name(name, "payload", spec.body), pos=position_m)
     load.explicitinertial = True
     load.mass = mass_kg
     load.ipos = np.zeros(3)
@@ -233,9 +245,8 @@ def put_payload(name: str, position_m: tuple[float, ...], spec: Any, mass_kg: fl
 def _joint_behind(name: str, what: str, spec: Any) -> Any:
     """A second joint "NAME WHAT" on the axis of the first; the armature stays at the first, the motor."""
     joint = spec.joint(name)
-    return joint.parent.add_joint(
-        PLAIN.default, name=f"{name} {what}", type=joint.type, axis=joint.axis, pos=joint.pos
-    )
+    added = free_name(name, what, spec.joint)
+    return joint.parent.add_joint(PLAIN.default, name=added, type=joint.type, axis=joint.axis, pos=joint.pos)
 
 
 def put_backlash(name: str, spec: Any, gap: float) -> None:

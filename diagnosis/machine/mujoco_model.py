@@ -166,8 +166,15 @@ class MujocoModel:
         steps = int(np.ceil(self.dt_s / spec.option.timestep - _WHOLE_STEPS))
         spec.option.timestep = self.dt_s / max(steps, 1)
         for kind, parts in (("body", spec.bodies), ("joint", spec.joints), ("actuator", spec.actuators)):
+            taken = {part.name for part in parts}
             for k, part in enumerate(parts):
-                part.name = part.name or f"{kind}{k}"
+                if part.name:
+                    continue
+                name = f"{kind}{k}"
+                while name in taken:
+                    name = f"{name}_"
+                taken.add(name)
+                part.name = name
         if not spec.actuators:
             raise ValueError("the model has no actuator")
 

@@ -171,6 +171,10 @@ class MujocoArm(MujocoModel):
         _note_what_is_ignored(spec)
         for e in records:
             data = plant.simulation.began(model, e.input)
+            # A file that was repaired before may have a start of this record.
+            present = spec.key(f"start of {e.name}")
+            if present is not None:
+                spec.delete(present)
             spec.add_key(name=f"start of {e.name}", qpos=data.qpos, qvel=data.qvel, act=data.act)
         spec.compile()
         _point_to_assets(spec, folder)

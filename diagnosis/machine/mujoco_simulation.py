@@ -24,6 +24,7 @@ from diagnosis.machine.mujoco_edits import (
     DEAD_ZONE,
     ELASTIC,
     PLAIN,
+    free_name,
     put_component,
     put_gain,
 )
@@ -352,7 +353,8 @@ class MujocoSimulation:
         """
         omega = self.arm.tracking_rad_s
         for joint in self.arm.tracked:
-            actuator = spec.add_actuator(PLAIN.default, name=f"tracking {joint.name}", target=joint.name)
+            name = free_name(f"tracking {joint.name}", "spring", spec.actuator)
+            actuator = spec.add_actuator(PLAIN.default, name=name, target=joint.name)
             actuator.trntype = mujoco.mjtTrn.mjTRN_JOINT
             actuator.gear = np.eye(6)[0]
             actuator.gaintype = mujoco.mjtGain.mjGAIN_FIXED

@@ -426,6 +426,55 @@ def test_the_repaired_file_does_in_mujoco_what_the_diagnosis_simulated():
     assert arm_of(text).number("hinge.offset", 0.0) == pytest.approx(0.1)
 
 
+REPAIRS = {
+    "backlash": Change("hinge.backlash", {"gap_rad": 0.02}),
+    "spring": Change("hinge.elastic", {"stiffness_Nm_rad": 60.0, "damping_ratio": 0.1}),
+    "payload": Change("rod.payload", {"mass_kg": 0.2}),
+    "lag": Change("motor.lag", {"time_constant_s": 0.05}),
+    "offset": Change("hinge.sensor_offset", {"offset": 0.1}),
+}
+
+
+@pytest.mark.parametrize("first", REPAIRS)
+def test_a_repaired_file_can_be_diagnosed_and_repaired_again_with_the_same_logs(first):
+    torque = steps()
+    angle = turned(torque)
+    record = PlantExperiment("one", "held_out", np.column_stack([torque, angle]), angle[:, None])
+    plant = rod().plant((record,), np.array([1e-4]), named=["*"])
+    again = arm_of(rod().repaired(plant, plant, (REPAIRS[first],), (record,)))
+    plant = again.plant((record,), np.array([1e-4]), named=["*"])
+    for second in ("backlash", "spring", "payload"):
+        text = again.repaired(plant, plant, (REPAIRS[second],), (record,))
+        model = mujoco.MjModel.from_xml_string(text)
+        kept = again.nominal
+        assert model.nkey == 1
+        assert (model.njnt - kept.njnt, model.nbody - kept.nbody) == (
+            (0, 1) if second == "payload" else (1, 0)
+        )
+
+
+FIXED = '<body name="body2"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
+TURNS = '<joint name="joint1" axis="0 1 0" armature="0.1"/>'
+
+
+@pytest.mark.parametrize(
+    ("named", "unnamed"),
+    [
+        ('<body name="rod">', f"{FIXED}<body>"),
+        ('<joint name="hinge"', f"{TURNS}<joint"),
+        ('<motor name="motor"', '<motor name="actuator1" joint="hinge"/><motor'),
+    ],
+)
+def test_parts_without_a_name_get_one_that_no_other_has(named, unnamed):
+    text = ROD.replace(named, unnamed)
+    if "joint1" in unnamed:
+        text = text.replace('joint="hinge"', 'joint="joint1"')
+    arm = arm_of(text, ())
+    names = [part.name for part in (*arm.spec.bodies, *arm.spec.joints, *arm.spec.actuators)]
+    assert all(names)
+    assert len(set(names)) == len(names)
+
+
 @pytest.mark.parametrize(
     ("xml", "outputs", "complaint"),
     [
@@ -561,9 +610,9 @@ def test_what_an_edit_adds_takes_nothing_from_the_default_class():
     <general gear="7" ctrlrange="-1 1" forcerange="-2 2"/></default>"""
     arm = replace(link(PLAIN, rest=rest)[0], tracking_rad_s=3.0)
     model, _ = edited(arm, "hinge.backlash", 0.02)
-    assert model.actuator("tracking hinge").gear[0] == 1.0
-    assert not model.actuator("tracking hinge").ctrllimited[0]
-    assert not model.actuator("tracking hinge").forcelimited[0]
+    assert model.actuator("tracking hinge spring").gear[0] == 1.0
+    assert not model.actuator("tracking hinge spring").ctrllimited[0]
+    assert not model.actuator("tracking hinge spring").forcelimited[0]
     joint = model.joint("hinge backlash")
     assert joint.damping[0] == joint.armature[0] == joint.frictionloss[0] == joint.stiffness[0] == 0
     np.testing.assert_allclose(joint.range, [-0.01, 0.01])
