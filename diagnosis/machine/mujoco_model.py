@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 import mujoco
 import numpy as np
 
+from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import LAGS, put_compiled
 
 # Longest model file that is searched for the files it names; chosen, a hundred times any model of a robot.
@@ -243,6 +244,21 @@ class MujocoModel:
                 joints.append(TrackedJoint(column, sensor.objname, inertia))
         return tuple(joints)
 
+    def joint_positions(self, outputs: Real) -> Real:
+        """(T, J) positions [rad or m] of the tracked joints behind their readings in outputs (T, Y).
+
+        A reading is gain value + offset, where the file has numbers of a sensor.
+        """
+        positions = np.zeros((len(outputs), len(self.tracked)))
+        for j, joint in enumerate(self.tracked):
+            gain, offset = self.gain_and_offset(self.outputs[joint.column])
+            positions[:, j] = (outputs[:, joint.column] - offset) / gain
+        return positions
+
+    def gain_and_offset(self, output: str) -> tuple[float, float]:
+        """Gain and offset of the sensor of an output as the file states them; 1 and 0 where it does not."""
+        return self.number(f"{output}.gain", 1.0), self.number(f"{output}.offset", 0.0)
+
     @property
     def measured_joints(self) -> set[str]:
         """Names of the joints of which some quantity (position, speed, force) is an output."""
@@ -272,8 +288,8 @@ class MujocoModel:
     def reaches(self) -> dict[str, tuple[float, str]]:
         """Command of a servo, or output of a measured joint -> its largest size, and its unit.
 
-        That is the end of the joint's range. Of a joint without one it is infinite, but for a joint that a
-        servo turns: that goes no more than once round.
+        That is the end of the joint's range, of an output as its sensor reads it. Of a joint without one it
+        is infinite, but for a joint that a servo turns: that goes no more than once round.
         """
         # A servo's force is kp (command - position): its bias by the position is the gain with a minus.
         joint_of_servo = {}
@@ -286,10 +302,14 @@ class MujocoModel:
         for name, joint in {**joint_of_servo, **joint_of_output}.items():
             if joint not in units:
                 continue
-            end = float(np.max(np.abs(self.nominal.joint(joint).range)))
-            if not end:
+            limits = np.array(self.nominal.joint(joint).range)
+            if not np.any(limits):
                 end = _WHOLE_TURN_RAD if joint in joint_of_servo.values() else np.inf
-            reaches[name] = (end, units[joint])
+                limits = np.array([-end, end])
+            if name in joint_of_output:
+                gain, offset = self.gain_and_offset(name)
+                limits = gain * limits + offset
+            reaches[name] = (float(np.max(np.abs(limits))), units[joint])
         return reaches
 
     def number(self, name: str, without: float) -> float:

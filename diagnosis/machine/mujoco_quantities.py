@@ -497,11 +497,11 @@ class Quantities:
     def _of_sensor(self, output: str, swing: float) -> Iterator[PlantEffect]:
         """Gain, offset and delay of the sensor of an output; swing: range of its readings in the records."""
         sensor = self.model.spec.sensor(output)
-        gain = self.model.number(f"{output}.gain", 1.0)
+        gain, offset = self.model.gain_and_offset(output)
         yield _quantity(f"{output}.sensor_gain", gain, partial(put_number, f"{output}.gain"))
         yield _quantity(
             f"{output}.sensor_offset",
-            self.model.number(f"{output}.offset", 0.0),
+            offset,
             partial(put_number, f"{output}.offset"),
             _size("offset", "output").at(Magnitudes(output=swing)),
             signed=True,
@@ -563,11 +563,10 @@ class Quantities:
         joints = [model.joint(joint.name) for joint in self.model.tracked]
         position_places = [joint.qposadr[0] for joint in joints]
         dofs = [joint.dofadr[0] for joint in joints]
-        columns = [joint.column for joint in self.model.tracked]
 
         records = []
         for e in self.experiments:
-            positions = e.output[:, columns]
+            positions = self.model.joint_positions(e.output)
             speeds = savgol_filter(positions, _SMOOTHED_SAMPLES, 2, deriv=1, delta=self.model.dt_s, axis=0)
             joint_forces = np.zeros((len(positions), model.nv))
             actuator_forces = np.zeros((len(positions), model.nu))

@@ -319,9 +319,9 @@ class MujocoSimulation:
         bodies = [body for body in range(1, model.nbody) if model.body_weldid[body]]
         first_site = {int(model.site_bodyid[site]): site for site in reversed(range(model.nsite))}
         frames = []
-        for row in outputs:
-            for joint in self.arm.tracked:
-                data.joint(joint.name).qpos[0] = row[joint.column]
+        for positions in self.arm.joint_positions(outputs):
+            for joint, position in zip(self.arm.tracked, positions, strict=True):
+                data.joint(joint.name).qpos[0] = position
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             lines = []

@@ -56,6 +56,41 @@ def test_a_stick_figure_stands_where_its_joint_says():
     np.testing.assert_allclose(lines[:, -1, 0], 0 * tips, atol=1e-12)
 
 
+@pytest.mark.parametrize("sensor", [(1.0, 0.0), (1000.0, 0.0), (1.0, 0.7), (-180 / np.pi, 30.0)])
+def test_a_joint_is_where_its_sensor_says_whatever_the_sensor_s_gain_and_offset(sensor):
+    """What is made of its motion: ranges of effects, the tracking, a stick figure, the reach of a reading."""
+    gain, offset = sensor
+    numbers = (
+        f'<custom><numeric name="hinge.gain" data="{gain}"/><numeric name="hinge.offset" data="{offset}"/>'
+    )
+    text = ROD.replace("<custom>", numbers).replace('damping="0.2"', 'damping="0.2" range="-90 170"')
+    arm = arm_of(text)
+    plain = arm_of(text.replace(numbers, "<custom>"))
+    torque = steps()
+    angle = turned(torque)[:, None]
+    reading = gain * angle + offset
+
+    def recorded(y):
+        return [PlantExperiment("one", "estimation", np.column_stack([torque, y]), y)]
+
+    np.testing.assert_allclose(
+        mujoco_quantities.Quantities(arm, recorded(reading)).motions["hinge"],
+        mujoco_quantities.Quantities(plain, recorded(angle)).motions["hinge"],
+        rtol=1e-9,
+    )
+    assert arm.tracking(recorded(reading)) == pytest.approx(plain.tracking(recorded(angle)))
+    noise = np.array([1e-4])
+    lines, expected = (
+        one.plant(recorded(y), abs(y[-1] - y[0]) / abs(angle[-1] - angle[0]) * noise).untracked.stick_figure(
+            y[:9]
+        )
+        for one, y in ((arm, reading), (plain, angle))
+    )
+    np.testing.assert_allclose(lines, expected, atol=1e-9)
+    ends = gain * np.deg2rad([-90, 170]) + offset
+    assert arm.reaches["hinge"][0] == pytest.approx(np.max(np.abs(ends)))
+
+
 @pytest.mark.long
 def test_a_force_limit_that_is_stated_wrong_is_named():
     limit, stated = 0.7, 0.35
