@@ -97,7 +97,7 @@ class Equations:
 
     def position_row(self, direction: Real) -> Real:
         """Row (2N,) that gives the displacement along a direction (N,) from the state."""
-        return np.pad(direction, (0, direction.size))
+        return np.concatenate([direction, np.zeros(direction.size)])
 
 
 def default_n_modes(rig: Rig) -> int:

@@ -384,16 +384,21 @@ class _Builder:
 
     def _column(self, direction: Real) -> Real:
         """State derivative (N,) by a unit generalised force along a direction (n,) of `plant.modal`."""
-        mechanical = self.equations.input_column(direction)
-        return np.pad(mechanical, (0, self.n_states - mechanical.size))
+        column = np.zeros(self.n_states)
+        column[: 2 * self.n_coordinates] = self.equations.input_column(direction)
+        return column
 
     def _position(self, direction: Real) -> Real:
         """Row (N,) that gives the displacement along a direction (n,) from the state."""
-        return np.pad(direction, (0, self.n_states - direction.size))
+        row = np.zeros(self.n_states)
+        row[: self.n_coordinates] = direction
+        return row
 
     def _speed(self, direction: Real) -> Real:
         """Row (N,) that gives the speed along a direction (n,) from the state."""
-        return np.pad(direction, (direction.size, self.n_states - 2 * direction.size))
+        row = np.zeros(self.n_states)
+        row[self.n_coordinates : 2 * self.n_coordinates] = direction
+        return row
 
     def _motor_column(self) -> Real:
         """State derivative (N,) by one volt at the motor."""

@@ -205,8 +205,10 @@ class NormalEquations:
         Records that were linearised.
     deviations : (P,) array
         Where they were.
+    shared : (N, P + A + Z) array
+        Derivatives by deviations, coordinates and zeros.
     weighted_shared : (N, P + A + Z) array
-        Derivatives by deviations, coordinates and zeros, times the weights.
+        These times the weights.
     weighted_states : tuple of (T Y, S) arrays
         Derivatives by the states of every record, times the weights.
     hessian : (M, M) array
@@ -215,6 +217,7 @@ class NormalEquations:
 
     records: RecordsToFit
     deviations: Real
+    shared: Real
     weighted_shared: Real
     weighted_states: tuple[Real, ...]
     hessian: Real
@@ -258,7 +261,7 @@ class NormalEquations:
         hessian[range(P), range(P)] += prior_curvature(deviations)
         zeros = range(jacobian.shape[1], n_shared)
         hessian[zeros, zeros] += 1 / records.zero_spread**2
-        return cls(records, deviations, weighted_shared, tuple(weighted_states), hessian)
+        return cls(records, deviations, shared, weighted_shared, tuple(weighted_states), hessian)
 
     def gradient(self, start: FittedStart, e: Real) -> Real:
         """(M,) gradient of the loss where coefficients e (N,) are left from a start."""
@@ -569,8 +572,7 @@ def follow_linearly(records: RecordsToFit, around: Fit, e: Real, start: FittedSt
     step[:P] = np.clip(step[:P], -LARGEST_STEP, LARGEST_STEP)
 
     first_state = step.size - start.states.size
-    shared = np.column_stack([around.jacobian, around.start_columns.zeros])
-    followed = e + shared @ step[:first_state]
+    followed = e + normal.shared @ step[:first_state]
     for r, part in enumerate(records.record_slices):
         rows = slice(first_state + r * n_states, first_state + (r + 1) * n_states)
         followed[part] += around.start_columns.states[r] @ step[rows]

@@ -231,8 +231,7 @@ def _harmonic_points(records: RecordsToFit, around: Fit, candidate: Candidate) -
     H = normal.hessian
     g = normal.gradient(around.start, around.residual_coefficients)
     factor = cho_factor(H + np.diag(_RIDGE * np.diag(H) + _SMALLEST_CURVATURE))
-    shared = np.column_stack([around.jacobian, around.start_columns.zeros])
-    n_shared = shared.shape[1]
+    n_shared = normal.shared.shape[1]
     n_states = around.start.states.shape[1]
 
     amplitude_axis = candidate.axes[0]
@@ -267,7 +266,7 @@ def _harmonic_points(records: RecordsToFit, around: Fit, candidate: Candidate) -
         # Schur complement: curvature (L, 2, 2) and slope (L, 2) by both parts of the torque, once all else
         # has followed.
         cross = np.empty((g.size, columns.shape[1]))
-        cross[:n_shared] = shared.T @ weighted
+        cross[:n_shared] = normal.shared.T @ weighted
         for r, part in enumerate(records.record_slices):
             rows = slice(n_shared + r * n_states, n_shared + (r + 1) * n_states)
             cross[rows] = around.start_columns.states[r].T @ weighted[part]
