@@ -21,6 +21,8 @@ from plant.effects import EFFECTS
 
 # By how much two correct solvers of such an effect differ, RMS in noise deviations: scale of a half-normal
 # prior. Two independent solvers of backlash differ by 0.2; matrix exponentials and smooth forces by far less.
+# Doubled, no answer of four cases moved (backlash, a short record, nothing, an unlisted cause; `python -m
+# benchmarks.frozen_answers --only exact --change`).
 DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probability of sets by their number of effects; it is shared equally among the sets of that number.
 # One missing effect is what a user looks for most often, one gap in four has none of the listed ones.
@@ -30,13 +32,13 @@ _PRIOR_OF_MORE = 1e-3
 # Prior probability of a cause beyond the list: what the numbers of effects above leave.
 PRIOR_UNKNOWN = 0.1
 # How probable a cause beyond the list that looks like an effect is, as a share of the effect itself. Chosen:
-# neither may be ruled out by the prior. Counted rates replace it where there are some
-# (`judge/look_alikes.toml`, `benchmarks/look_alikes.py`).
+# neither may be ruled out by the prior. `benchmarks/look_alikes.py` counts how often one is named for the
+# other.
 UNLISTED = 1 / 3
 # Prior probabilities of one effect, of several, and of a cause beyond the list.
 PRIORS = (_PRIOR_OF_COUNT[1], _PRIOR_OF_COUNT[2] + _PRIOR_OF_COUNT[3], PRIOR_UNKNOWN)
 # Log odds of an unknown cause beside a set of effects against that set alone: as those of an unknown cause
-# against no effect at all.
+# against no effect at all. Twice the odds take 0.04 off the probability of a backlash, nothing elsewhere.
 _LOG_UNKNOWN_BESIDE = float(np.log(PRIOR_UNKNOWN / _PRIOR_OF_COUNT[0]))
 # Beyond so many deviations of their prior, what is left is no disagreement of solvers: 3 in 1000 are.
 _LARGEST_DISAGREEMENT = 3.0
@@ -212,9 +214,7 @@ class Probabilities:
             sets[names] = probability
         return Probabilities(cause, sets, {**self.presence, name: certain})
 
-    def with_untried(
-        self, untried: Mapping[str, str], priors: tuple[float, float, float] = PRIORS, *, larger: bool
-    ) -> Probabilities:
+    def with_untried(self, untried: Mapping[str, str], *, larger: bool) -> Probabilities:
         """Probabilities once unknown is shared with effects that were not tried.
 
         What no candidate explains may be one that was not tried, or a larger set where none was tried. The
@@ -224,8 +224,6 @@ class Probabilities:
         ----------
         untried : mapping
             Effects that were not tried -> what they need; where empty, all listed effects share equally.
-        priors : tuple
-            Prior probabilities of one effect, of several, and of a cause beyond the list.
         larger : bool
             No set of several effects was tried; else those were whose members were tried, taken as pairs.
         """
@@ -234,7 +232,7 @@ class Probabilities:
         listed = dict.fromkeys([*presence, *untried])
         tried_share = 1 - len(untried) / len(listed)
         tried_share_of_sets = 0.0 if larger else tried_share**2
-        prior_one, prior_several, prior_beyond = priors
+        prior_one, prior_several, prior_beyond = PRIORS
         prior_missed = prior_one * (1 - tried_share) + prior_several * (1 - tried_share_of_sets)
         moved = cause["unknown"] * prior_missed / (prior_missed + prior_beyond)
 

@@ -7,6 +7,9 @@ least squares). Derivatives by difference quotients; those by starts from the li
 Letters of the shapes: N coefficients of R records with T samples of Y outputs each; P deviations of nominal
 values, A coordinates of all candidates in a row, Z zeros of sensors, S states at the start of a record. M is
 P + A + Z + R S, the unknowns in that order.
+
+Steps, dampings and limits only say how an end is reached: each step and limit doubled changed what is left of
+six cases by 0.6 % at most (`python -m benchmarks.frozen_answers --change`).
 """
 
 from __future__ import annotations

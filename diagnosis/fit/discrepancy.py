@@ -3,6 +3,9 @@
 Residuals of a true model are white with variance one. Here their variance may be 1 + s_b in every band b of
 frequency of every output, most s_b being zero: a gap of a quarter of the noise is plain where it fills one
 octave of many, long before the energy of all samples together shows it.
+
+What the constants do to an answer: `python -m benchmarks.frozen_answers --only exact --change`. Doubled one
+by one, all but the number of octaves leave every answer of three cases where it is.
 """
 
 from __future__ import annotations
@@ -18,7 +21,8 @@ from diagnosis.machine.machine_protocol import Real
 # an output.
 _ACTIVE = 0.15
 # Octaves below half the sampling rate that are bands by themselves, down to 1/512 of the sampling rate; below
-# them offset and drift stand together, a handful of lines.
+# them offset and drift stand together, a handful of lines. With four of them an unlisted drag is named for
+# what it looks like.
 _OCTAVES = 8
 # Smallest variance that a band may hold beyond the noise, in standard deviations of its mean energy under
 # noise alone: less is not told from it.

@@ -1,6 +1,9 @@
 """What residuals cost: white noise of known size here, levels that nobody knows in `diagnosis.fit.levels`.
 
 A fit sees residuals as coefficients e (N,), record after record; all the rest of it is the same for both.
+
+The log odds below are steps on the usual scales, far apart on purpose: each of them doubled moved a
+probability of six cases by 0.012 at most (`python -m benchmarks.frozen_answers --change`).
 """
 
 from __future__ import annotations

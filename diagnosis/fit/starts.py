@@ -26,17 +26,18 @@ _ZEROS_AROUND = 6
 # Cycles of a torque per turn of the hub that are tried: quarters below 12, where a swing of a turn or two
 # tells them apart, whole numbers (slots, teeth) above. Those outside a candidate's range are left out.
 _CYCLES = np.concatenate([np.arange(1.0, 12, 0.25), np.arange(12, 80.5, 1.0)])
-# Highest frequency of a torque over time, Hz: that of the mains, with a margin. Chosen; doubled, no answer of
-# `benchmarks.frozen_answers` with a rig moved.
+# Highest frequency of a torque over time, Hz: that of the mains, with a margin. Doubled, no answer of three
+# exact cases moved (`python -m benchmarks.frozen_answers --change`).
 _HIGHEST_HZ = 60.0
 # Highest frequency over the sampling rate: a little below Nyquist, where a held input is hardly one.
 _HIGHEST_SHARE = 0.45
 # Distance of two frequencies in lines of the longest record: the gain is a squared sinc of it, and at 0.2
-# lines off the best it has lost an eighth.
+# lines off the best it has lost an eighth. Doubled, none of these moved.
 _LINE_SPACING = 0.4
 # Lines whose responses are transformed together: memory for their columns, nothing else.
 _LINES_AT_ONCE = 16
 # Starts nearer than this in every coordinate count as one: of a logarithm (35 %), or radians (17 degrees).
+# Doubled, no answer of six cases moved.
 _APART = 0.3
 # Frequencies of a long record are as many as its samples. Where they are more than this a cheap gain chooses
 # which of them are fitted. Chosen: time alone depends on it.
