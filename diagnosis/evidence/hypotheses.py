@@ -196,7 +196,7 @@ class Probabilities:
         Parameters
         ----------
         name : str
-            The effect; sets that have it already stay as they are.
+            The effect, listed or not; a set that has it already is the same set.
         leads : bool
             It explains more than whatever else there is, and takes the place of every other main cause.
         """
@@ -205,13 +205,15 @@ class Probabilities:
         if leads:
             cause = {**dict.fromkeys(cause, 0.0), "unknown": cause["unknown"], name: certain}
         else:
-            cause[name] += cause["none"]
+            cause[name] = cause.get(name, 0.0) + cause["none"]
             cause["none"] = 0.0
-        sets = {}
+        # Sets with the effect and without it become one.
+        sets: dict[tuple[str, ...], float] = {}
         for names, probability in self.sets.items():
+            certain_names = names
             if names != _UNKNOWN:
-                names = tuple(sorted((*names, name)))
-            sets[names] = probability
+                certain_names = tuple(sorted({*names, name}))
+            sets[certain_names] = sets.get(certain_names, 0.0) + probability
         return Probabilities(cause, sets, {**self.presence, name: certain})
 
     def with_untried(self, untried: Mapping[str, str], *, larger: bool) -> Probabilities:

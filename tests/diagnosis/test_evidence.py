@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from diagnosis.evidence.hypotheses import Hypothesis, log_evidence, log_prior, probabilities
+from diagnosis.evidence.hypotheses import Hypothesis, Probabilities, log_evidence, log_prior, probabilities
 from diagnosis.fit.discrepancy import discrepancy
 from plant import EFFECTS
 from plant.effects.search_space import Axis, Candidate
@@ -87,6 +87,22 @@ def test_probabilities_sum_to_one_and_prefer_what_explains_the_records():
     assert total["tip_payload"] > 0.9
     without = probabilities([bad, nothing]).cause
     assert without["unknown"] > 0.99
+
+
+@pytest.mark.parametrize("leads", [True, False])
+@pytest.mark.parametrize("name", ["rounding", "drag"])
+def test_a_certain_effect_is_counted_once(name, leads):
+    """Whether it was among the sets before, or listed at all."""
+    sets = {(): 0.3, ("rounding",): 0.2, ("drag", "rounding"): 0.1, ("drag",): 0.3, ("unknown",): 0.1}
+    cause = {"none": 0.3, "drag": 0.6, "unknown": 0.1}
+    certain = Probabilities(cause, sets, {"drag": 0.4}).with_certain_effect(name, leads=leads)
+    both = tuple(sorted({"drag", "rounding"}))
+    assert certain.sets.keys() == {(name,), both, ("unknown",)}
+    assert certain.sets[("unknown",)] == 0.1
+    assert sum(certain.sets.values()) == pytest.approx(1.0)
+    assert sum(certain.cause.values()) == pytest.approx(1.0)
+    assert certain.presence[name] == pytest.approx(0.9)
+    assert certain.cause["none"] == 0.0
 
 
 def _fit_with(residuals, effect):
