@@ -274,11 +274,17 @@ class Plant:
         return self.units.get(name, "") or written_unit(name)
 
     def simulator(self, effects: Sequence[Change]) -> Callable[..., Real]:
-        """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number."""
+        """Inputs (T, U) -> outputs (T, Y); where a trial of a fit runs away, a large finite number.
+
+        Further arguments: states (S,) and zeros (Z,) at the start, and `first_row` of the log that the record
+        is a part of. Neglected: a simulation is not told it, so that what drifts begins anew with every part.
+        """
         runaway = RUNAWAY * self.noise
         at_rest = self.simulated(effects)
 
-        def outputs(inputs: Real, states: Real | None = None, zeros: Real | None = None) -> Real:
+        def outputs(
+            inputs: Real, states: Real | None = None, zeros: Real | None = None, first_row: int = 0
+        ) -> Real:
             run = self.simulated(effects, states) if self.start and states is not None else at_rest
             try:
                 with np.errstate(all="ignore"):  # of a trial that runs away

@@ -277,6 +277,47 @@ def test_a_diagnosis_takes_one_thread_of_linear_algebra():
     assert seen == {1}
 
 
+def _from_state(parameters, effects, inputs, start):
+    """A shaft that turns at the start: the speed decays, and follows the voltage (T, 1)."""
+    decay = np.exp(-DT_S / parameters["time_constant_s"])
+    driven = _motor(inputs[:, 0].copy(), *parameters.values())
+    return driven + start["speed_rad_s"] * decay ** np.arange(len(inputs))[:, None]
+
+
+@pytest.mark.parametrize(
+    ("rests_between", "model_error"),
+    [(True, 0.0), (True, 0.05), (False, 0.05)],
+    ids=["known noise", "beside a model error", "a start that nobody knows"],
+)
+def test_the_last_part_of_a_single_log_validates(rests_between, model_error):
+    """Its first row is not the log's, which a simulation of one's own is not told."""
+    rng = np.random.default_rng(11)
+    samples, cut = 600, 400
+    voltage = rng.uniform(-8.0, 8.0, samples // 20).repeat(20)
+    if rests_between:
+        voltage[cut - 200 : cut] = 0.0
+    acting = np.sign(voltage) * np.maximum(np.abs(voltage) - 2.0, 0.0)
+    speed = _motor(acting, 0.2, 10.0) + 0.05 * rng.standard_normal((samples, 1))
+    records = (
+        PlantExperiment("first", "estimation", voltage[:cut, None], speed[:cut]),
+        PlantExperiment("last", "held_out", voltage[cut:, None], speed[cut:], first_row=cut),
+    )
+    values = {"time_constant_s": 0.2, "gain_rad_Vs": 10.0}
+    plant = Plant(
+        _shaft if rests_between else _from_state,
+        values,
+        dict.fromkeys(values, 0.02),
+        ("speed_rad_s",),
+        np.array([0.05]),
+        model_error=model_error,
+        start={} if rests_between else {"speed_rad_s": 50.0},
+    )
+    plant = with_effects(plant, ["actuator_dead_zone", "input_offset"], records, dt_s=DT_S)
+    answer = diagnose(PlantCase("one log", plant, records))
+    assert answer.combination == ("actuator_dead_zone",)
+    assert answer.gap_after < 0.1 * answer.gap_before
+
+
 def test_an_effect_is_exchanged_for_its_twin():
     """Where a command keeps its sign a dead zone is an offset: the one extended must not win by that."""
     search = Search(_pumped(), lambda share, words: None)
