@@ -88,15 +88,16 @@ def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch,
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 3, 6])
 def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed):
+    """Where contacts switch, coarse difference quotients lead to the amplitude."""
     table = draw_rig(np.random.default_rng(seed))
     sine = {"amplitude_Nm": 0.03, "frequency_Hz": 0.56, "phase_rad": 4.6}
     effects = [{"name": "backlash", "gap_rad": 0.03}, {"name": "periodic_disturbance", **sine}]
     records = [(role, effects, 8, 0.25) for role in ("estimation", "held_out")]
     case = simulated_case(tmp_path, table, records, np.random.default_rng(seed))
     listed = {c.effect: c for c in case.machine.candidates(case.experiments)}
-    sets = [listed["backlash"], listed["periodic_disturbance"]]
+    pair = [listed["backlash"], listed["periodic_disturbance"]]
     start = np.array([np.log(0.0295), np.log(0.036), 0.56, 4.6])
-    end = descend_to_end(ResidualModel(case), sets, start, np.zeros(0))
+    end = descend_to_end(ResidualModel(case), pair, start, np.zeros(0))
     assert end.cost < end.residual_coefficients.size + 4 * np.sqrt(2 * end.residual_coefficients.size)
     assert end.candidates[1].parameters(end.coordinates_of(1))["amplitude_Nm"] == pytest.approx(
         0.03, rel=0.01
@@ -104,6 +105,7 @@ def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed)
 
 
 def _records(rng):
+    """Two estimation records (60, 2) of nothing but noise."""
     return [
         Experiment(name, "estimation", rng.standard_normal(60), rng.standard_normal((60, 2)))
         for name in ("a", "b")
@@ -119,14 +121,14 @@ NOISE = np.array([0.1, 0.3])
     ids=["white", "levels"],
 )
 def test_a_descent_may_stand_before_either_likelihood(likelihood):
-    """What it takes for granted: weights are the slope of the loss over e, `changed` that of `seen`, and
-    `unseen` its inverse."""
+    """What it takes for granted: weights are the slope of the loss over e, `linearised` that of
+    `to_coefficients`, and `to_residuals` its inverse."""
     rng = np.random.default_rng(1)
     residuals = [rng.standard_normal((60, 2)) for _ in range(2)]
     e = np.concatenate([likelihood.to_coefficients(r) for r in residuals])
-    way = rng.standard_normal(e.size)
-    slope = (likelihood.loss(e + 1e-5 * way) - likelihood.loss(e - 1e-5 * way)) / 2e-5
-    assert slope == pytest.approx(likelihood.weights(e) * e @ way, rel=1e-6)
+    direction = rng.standard_normal(e.size)
+    slope = (likelihood.loss(e + 1e-5 * direction) - likelihood.loss(e - 1e-5 * direction)) / 2e-5
+    assert slope == pytest.approx(likelihood.weights(e) * e @ direction, rel=1e-6)
     np.testing.assert_allclose(likelihood.to_residuals(e[:120], 2), residuals[0], atol=1e-12)
     change = rng.standard_normal((60, 2))
     moved = likelihood.to_coefficients(residuals[0] + change) - likelihood.to_coefficients(residuals[0])

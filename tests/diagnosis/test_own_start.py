@@ -10,29 +10,35 @@ from diagnosis.fit.records import FittedStart, Records
 from diagnosis.search.search import Search
 from diagnosis.search.settled import fit_record_starts
 
-DT_S, SAMPLES, NOISE_RAD = 0.02, 500, 1e-3
+DT_S = 0.02
+SAMPLES = 500
+NOISE_RAD = 1e-3
 
 
 @njit
 def _leapfrog(torque, inertia, damping, weight, cubic, angle, speed):
-    found, h = np.zeros((torque.size, 1)), DT_S / 8
+    """Angle (T, 1) of a pendulum with a hardening spring, from an angle and a speed."""
+    angles = np.zeros((torque.size, 1))
+    h = DT_S / 8
     slow = h / 2 * damping / inertia
     for k in range(torque.size):
-        found[k] = angle
+        angles[k] = angle
         for _ in range(8):
             angle += h / 2 * speed
             pull = torque[k] - weight * np.sin(angle) - cubic * angle**3
             speed = (speed * (1 - slow) + h * pull / inertia) / (1 + slow)
             angle += h / 2 * speed
-    return found
+    return angles
 
 
 def _pendulum(parameters, effects, inputs, start):
+    """The simulation that the user brings."""
     cubic = effects.get("hardening_spring", {}).get("cubic_Nm_rad3", 0.0)
     return _leapfrog(inputs[:, 0].copy(), *parameters.values(), cubic, *start.values())
 
 
 def _record(name, role, angle_rad, speed_rad_s, seed):
+    """A record of the truth from a start, with a spring of 0.4 N m/rad^3 and noise."""
     rng = np.random.default_rng(seed)
     torque = rng.choice([-0.6, 0.6], SAMPLES // 25).repeat(25)
 
@@ -44,16 +50,16 @@ def _record(name, role, angle_rad, speed_rad_s, seed):
 
     times = np.arange(SAMPLES) * DT_S
     span = (0.0, times[-1])
-    found = solve_ivp(rate, span, [angle_rad, speed_rad_s], t_eval=times, max_step=DT_S / 4, rtol=1e-8)
-    output = found.y[:1].T + NOISE_RAD * rng.standard_normal((SAMPLES, 1))
+    solution = solve_ivp(rate, span, [angle_rad, speed_rad_s], t_eval=times, max_step=DT_S / 4, rtol=1e-8)
+    output = solution.y[:1].T + NOISE_RAD * rng.standard_normal((SAMPLES, 1))
     return PlantExperiment(name, role, torque[:, None], output)
 
 
 def test_starts_of_records_are_fitted_and_the_spring_is_found():
-    started = ((0.5, 2.0), (-0.4, 0.0), (0.3, -3.0))
+    starts = ((0.5, 2.0), (-0.4, 0.0), (0.3, -3.0))
     roles = ("estimation", "estimation", "held_out")
     records = tuple(
-        _record(f"r{k}", role, *start, k) for k, (role, start) in enumerate(zip(roles, started, strict=True))
+        _record(f"r{k}", role, *start, k) for k, (role, start) in enumerate(zip(roles, starts, strict=True))
     )
     plant = Plant(
         _pendulum,
@@ -65,29 +71,31 @@ def test_starts_of_records_are_fitted_and_the_spring_is_found():
         model_error=0.05,
         start={"angle_rad": 1.0, "speed_rad_s": 5.0},
     )
-    found = diagnose(PlantCase("pendulum", plant, records))
-    assert found.combination == ("hardening_spring",)
-    (spring,) = [e for e in found.effects if e.name == "hardening_spring"]
+    answer = diagnose(PlantCase("pendulum", plant, records))
+    assert answer.combination == ("hardening_spring",)
+    (spring,) = [e for e in answer.effects if e.name == "hardening_spring"]
     low, high = spring.intervals["cubic_Nm_rad3"]
     assert low < 0.4 < high
     assert abs(spring.parameters["cubic_Nm_rad3"] / 0.4 - 1) < 0.15
-    assert found.gap_closed > 0.95
+    assert answer.gap_closed > 0.95
 
 
 @njit
 def _rubbing(dry, angle, speed):
     """The pendulum without a motor; dry friction takes off what it can, so that it truly sticks."""
-    found, h = np.zeros((SAMPLES, 1)), DT_S / 20
+    angles = np.zeros((SAMPLES, 1))
+    h = DT_S / 20
     for k in range(SAMPLES):
-        found[k] = angle
+        angles[k] = angle
         for _ in range(20):
             free = speed - h * (np.sin(angle) + 0.05 * speed) / 0.1
             speed = np.sign(free) * max(abs(free) - h * dry / 0.1, 0.0)
             angle += h * speed
-    return found
+    return angles
 
 
 def _held_plant(simulation, effect):
+    """A pendulum that starts anywhere, with one listed effect of a size between 1e-3 and 1."""
     return Plant(
         simulation, {"weight_Nm": 1.0}, {}, ("angle_rad",), np.array([NOISE_RAD]),
         (PlantEffect(effect, (EffectParameter("size", 1e-3, 1.0),)),), model_error=0.05,
@@ -100,16 +108,16 @@ def test_a_start_is_found_where_friction_holds_the_first_guess():
     plant = _held_plant(
         lambda p, effects, inputs, start: _rubbing(0.03, *start.values())[: len(inputs)], "drag"
     )
-    begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
+    true_starts = np.array([[1.1, 0.3], [-0.6, -4.0]])
     still = np.zeros((SAMPLES, 1))
     records = tuple(
         PlantExperiment(role, role, still, _rubbing(0.03, *state))
-        for role, state in zip(("estimation", "held_out"), begun, strict=True)
+        for role, state in zip(("estimation", "held_out"), true_starts, strict=True)
     )
     case = PlantCase("rubs", plant, records)
     fitted = Records(case, case.experiments)
     start, left = fit_record_starts(fitted, np.zeros(0), (), fitted.guessed_start())
-    np.testing.assert_allclose(start.states, begun, atol=0.01)
+    np.testing.assert_allclose(start.states, true_starts, atol=0.01)
     assert np.all(fitted.rms_shares(fitted.residuals_from(left)) < 0.01)
 
 
@@ -120,10 +128,10 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
         return _rubbing(effects.get("dry", {}).get("size", 0.0), *start.values())[: len(inputs)]
 
     plant = _held_plant(simulate, "dry")
-    begun = np.array([[1.1, 0.3], [-0.6, -4.0]])
+    true_starts = np.array([[1.1, 0.3], [-0.6, -4.0]])
     still = np.zeros((SAMPLES, 1))
     records = tuple(
-        PlantExperiment(f"r{k}", role, still, _rubbing(0.1, *begun[k % 2]))
+        PlantExperiment(f"r{k}", role, still, _rubbing(0.1, *true_starts[k % 2]))
         for k, role in enumerate(("estimation", "estimation", "held_out"))
     )
     search = Search(PlantCase("rubs", plant, records), lambda share, words: None)
@@ -132,7 +140,7 @@ def test_a_set_is_descended_on_from_starts_sought_with_its_effects():
     stuck = descend(search.records, (dry,), np.zeros(0), np.log([0.1]), held, iterations=3)
     assert abs(stuck.start.states[0, 0] - 1.1) > 0.5
     again = search.restarted(stuck)
-    np.testing.assert_allclose(again.start.states, begun, atol=0.01)
+    np.testing.assert_allclose(again.start.states, true_starts, atol=0.01)
     assert again.loss < 0.1 * stuck.loss
     # Nothing to gain: the same.
     assert search.restarted(again) is again
