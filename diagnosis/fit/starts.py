@@ -289,7 +289,7 @@ def _harmonic_points(records: RecordsToFit, around: Fit, candidate: Candidate) -
 
 
 def _loudest_lines(records: RecordsToFit, around: Fit, lines: Real, response: Real, dt_s: float) -> Real:
-    """Those of evenly spaced frequencies at which a torque would take most from what is left.
+    """The lines of evenly spaced ones at which a torque would take most from what is left.
 
     The response to a sine is taken to be settled, so that the gain is |correlation|^2 over |transfer|^2, by a
     chirp z transform over the lines.

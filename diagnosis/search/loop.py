@@ -52,7 +52,7 @@ class OutOfTimeError(BaseException):
 
 
 class SearchLoop(ABC, Generic[E]):
-    """All that was fitted to the records of a case.
+    """Everything that was fitted to the records of a case.
 
     Attributes
     ----------
@@ -301,22 +301,23 @@ class SearchLoop(ABC, Generic[E]):
         for k, name in enumerate(explanation.names):
             if name not in sought:
                 continue
-            others = {c.effect: c.kind.contains for c in explanation.fit.candidates if c.effect != name}
+            # The other effects of the set, and what each of them contains.
+            remaining = {c.effect: c.kind.contains for c in explanation.fit.candidates if c.effect != name}
             for rival in list(best.values()):
                 # A rival is a part of the set with one new effect in the place of this one.
                 new_names = set(rival.names) - set(explanation.names)
                 shared = set(rival.names) - new_names
                 part = best.get(tuple(sorted({*shared, name})))
-                if len(new_names) != 1 or not shared <= others.keys() or part is None:
+                if len(new_names) != 1 or not shared <= remaining.keys() or part is None:
                     continue
                 (new,) = (c for c in rival.fit.candidates if c.effect in new_names)
-                exchanged_set = tuple(sorted((*others, new.effect)))
-                is_contained = new.effect in others.values() or new.kind.contains in others
+                exchanged_set = tuple(sorted((*remaining, new.effect)))
+                is_contained = new.effect in remaining.values() or new.kind.contains in remaining
                 is_unlikely = rival.log_evidence < part.log_evidence - DECISIVE
                 if exchanged_set in best or is_contained or is_unlikely:
                     continue
 
-                without = best.get(tuple(sorted(others))) or self.without_effect(explanation, k)
+                without = best.get(tuple(sorted(remaining))) or self.without_effect(explanation, k)
                 around = without.fit
                 if self._is_known(*exchanged_set, around.loss, explanation.log_evidence, rival.log_evidence):
                     continue
@@ -332,11 +333,11 @@ class SearchLoop(ABC, Generic[E]):
     def without_effect(self, explanation: E, k: int) -> E:
         """The best explanation by the same effects but the k-th, fitted from here if it was not before."""
         fit = explanation.fit
-        kept = [j for j in range(len(fit.candidates)) if j != k]
-        candidates = tuple(fit.candidates[j] for j in kept)
+        kept_places = [j for j in range(len(fit.candidates)) if j != k]
+        candidates = tuple(fit.candidates[j] for j in kept_places)
         sorted_names = tuple(sorted(candidate.effect for candidate in candidates))
         if candidates and not self._is_known(*explanation.names, explanation.log_evidence, k):
-            coordinates = np.concatenate([fit.coordinates_of(j) for j in kept])
+            coordinates = np.concatenate([fit.coordinates_of(j) for j in kept_places])
             self.add(descend(self.records, candidates, fit.deviations, coordinates, fit.start))
         return self._best_of_set(sorted_names)
 

@@ -91,7 +91,10 @@ class FromPoints(Move):
 
     @classmethod
     def proposed(cls, search: SearchLoop[Any]) -> list[FromPoints]:
-        """Of many candidates those whose starts leave least; the others are still tried beside these."""
+        """One for every candidate with start points; of many, for those whose starts leave least.
+
+        The others are still tried beside these.
+        """
         ranked = sorted(search.start_points, key=lambda pair: pair[1][0].loss)
         return [cls(candidate, points) for candidate, points in ranked[:_MOST_DESCENDED]]
 
@@ -124,10 +127,11 @@ def descend_from_best(
     nominal_jacobian : (N, P) array
         Derivatives by the nominal values near the points.
     """
-    most = FOLLOWED_SETS if _has_free_zero(search, candidate) else FOLLOWED_COSTLY
+    # Zeros all around a turn have more ends.
+    most_points = FOLLOWED_SETS if _has_free_zero(search, candidate) else FOLLOWED_COSTLY
     chosen = [points[0]]
     for point in points[1:]:
-        if len(chosen) == most or point.loss > search.nominal_alone.fit.loss + WORTH_IT:
+        if len(chosen) == most_points or point.loss > search.nominal_alone.fit.loss + WORTH_IT:
             break
         if all(point.far_from(other) for other in chosen):
             chosen.append(point)
@@ -279,8 +283,8 @@ class BesideSet(Move):
         if search.case.machine.weighing.stated and not search.unexplained:
             least = ranked[0].log_evidence - DECISIVE
             parents = [explanation for explanation in parents if explanation.log_evidence > least]
-        most = FOLLOWED_EFFECTS if count == 2 else FOLLOWED_SETS
-        return [cls(parent.fit, most) for parent in parents]
+        most_effects = FOLLOWED_EFFECTS if count == 2 else FOLLOWED_SETS
+        return [cls(parent.fit, most_effects) for parent in parents]
 
     def apply(self, search: SearchLoop[Any]) -> None:
         """Descend from the best points of the most promising effects, and add the ends."""
@@ -584,9 +588,9 @@ class LookAlike(Move):
         likeliest = list(best.values())[:FOLLOWED_EFFECTS]
         for kind in LOOK_ALIKES.values():
             with_effect = [e for e in likeliest if kind.look_alike_of in e.names][:FOLLOWED_SETS]
-            alone = best.get((str(kind.look_alike_of),))
-            if alone is not None and alone not in with_effect:
-                with_effect.append(alone)
+            effect_alone = best.get((str(kind.look_alike_of),))
+            if effect_alone is not None and effect_alone not in with_effect:
+                with_effect.append(effect_alone)
             for explanation in with_effect:
                 yield cls(explanation.fit, kind)
 

@@ -44,7 +44,7 @@ _SOUGHT_IN_ANY_CASE = 3
 
 
 class Search(SearchLoop[Explanation]):
-    """All that was fitted to a case beside a model error.
+    """Everything that was fitted to a case beside a model error.
 
     Attributes
     ----------
@@ -145,9 +145,9 @@ class Search(SearchLoop[Explanation]):
 
         The best points and, because beside another effect any size may be right, some of the others.
         """
-        others = points[FOLLOWED_SETS:]
-        every = max(1, len(others) // FOLLOWED_SETS)
-        simulated = [*points[:FOLLOWED_SETS], *others[::every]]
+        worse_points = points[FOLLOWED_SETS:]
+        every = max(1, len(worse_points) // FOLLOWED_SETS)
+        simulated = [*points[:FOLLOWED_SETS], *worse_points[::every]]
         return candidate, beside(self.records, parent, candidate, simulated)
 
     def polish(self, fit: Fit, rank: int, around: Fit) -> Fit:
