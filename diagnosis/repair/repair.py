@@ -276,8 +276,10 @@ class Repairs(Generic[E]):
         return min(ends, key=lambda tried: tried.loss)
 
     def _smallest_set(self, named: Collection[str]) -> Trial[E]:
-        """The set with most of the named effects, of those that predict as well as the best; of several the one
-        with fewest effects, then the likeliest."""
+        """The set with most of the named effects, of those that predict as well as the best.
+
+        Of several the one with fewest effects, then the likeliest.
+        """
         best = min(self.trials, key=lambda trial: trial.error.rms)
         uninteresting = self.search.uninteresting_energy
         as_good = [trial for trial in self.trials if trial.error.as_good_as(best.error, uninteresting)]
