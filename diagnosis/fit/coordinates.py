@@ -135,17 +135,18 @@ def parameter_intervals(
     Returns
     -------
     dict
-        Parameter -> (low, high) in its unit. A phase may leave its range: the interval contains the estimate.
+        Parameter -> (low, high) in its unit. An angle may leave its range, around the estimate.
     """
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     drawn = coordinates + rng.standard_normal((MONTE_CARLO_DRAWS, coordinates.size)) @ root.T
     drawn_parameters = [candidate.parameters(draw) for draw in np.clip(drawn, *candidate.box)]
+    angles = {axis.parameter for axis in candidate.axes if axis.scale == "angle"}
     intervals = {}
     for name, estimate in candidate.parameters(coordinates).items():
         deviations = np.array([parameters[name] for parameters in drawn_parameters]) - estimate
-        if name == "phase_rad":
-            # The nearest turn: a phase just below a whole turn is near one just above 0.
+        if name in angles:
+            # The nearest turn: an angle just below the end of its range is near one just above its begin.
             deviations = np.mod(deviations + np.pi, 2 * np.pi) - np.pi
         below, above = np.quantile(deviations, _INTERVAL_QUANTILES)
         intervals[name] = (float(estimate + below), float(estimate + above))

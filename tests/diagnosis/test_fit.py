@@ -5,11 +5,13 @@ import pytest
 
 from diagnosis import Experiment, ResidualModel
 from diagnosis.fit import starts as starts_module
-from diagnosis.fit.coordinates import widening_tolerance
+from diagnosis.fit.coordinates import parameter_intervals, widening_tolerance
 from diagnosis.fit.levels import Levels
 from diagnosis.fit.likelihood import White
 from diagnosis.fit.starts import points_of
 from diagnosis.search.white import descend_to_end
+from plant import EFFECTS
+from plant.effects.search_space import Axis, Candidate, log_axis
 from tests.diagnosis.recorded import simulated_case
 from validation.blind.rigs import draw_rig, draw_tolerances, stated
 
@@ -133,6 +135,31 @@ def test_a_descent_may_stand_before_either_likelihood(likelihood):
     change = rng.standard_normal((60, 2))
     moved = likelihood.to_coefficients(residuals[0] + change) - likelihood.to_coefficients(residuals[0])
     np.testing.assert_allclose(likelihood.linearised(change).ravel(), moved, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("effect", "size", "angle", "low"),
+    [
+        ("gravity", "acceleration_m_s2", "direction_rad", -np.pi),
+        ("torque_ripple", "amplitude_Nm", "phase_rad", 0.0),
+        ("periodic_disturbance", "amplitude_Nm", "phase_rad", 0.0),
+    ],
+)
+def test_an_angle_near_the_end_of_its_range_has_a_narrow_interval(effect, size, angle, low):
+    """Draws beyond the end come back at the begin, a turn away: they are as near all the same."""
+    axes = [log_axis(size, 0.01, 10.0), Axis(angle, "angle", low, low + 2 * np.pi, 1e-4)]
+    coordinates = [0.0, low + 2 * np.pi - 0.02]
+    if effect == "torque_ripple":
+        axes.insert(1, Axis("cycles_per_rev", "linear", 2.0, 80.0, 1e-4))
+        coordinates.insert(1, 12.0)
+    if effect == "periodic_disturbance":
+        axes.insert(1, Axis("frequency_Hz", "linear", 0.1, 60.0, 1e-4))
+        coordinates.insert(1, 7.0)
+    candidate = Candidate(EFFECTS[effect], tuple(axes), ())
+    spread = np.array([0.1] * (len(axes) - 1) + [0.05])
+    rng = np.random.default_rng(0)
+    interval = parameter_intervals(candidate, np.array(coordinates), np.diag(spread**2), rng)[angle]
+    assert interval == pytest.approx((coordinates[-1] - 0.098, coordinates[-1] + 0.098), abs=0.015)
 
 
 @pytest.mark.parametrize(("known", "blamed"), [(0.1, None), (10.0, 0)])
