@@ -32,8 +32,7 @@ _PRIOR_OF_MORE = 1e-3
 # Prior probability of a cause beyond the list: what the numbers of effects above leave.
 PRIOR_UNKNOWN = 0.1
 # How probable a cause beyond the list that looks like an effect is, as a share of the effect itself. Chosen:
-# neither may be ruled out by the prior. `benchmarks/look_alikes.py` counts how often one is named for the
-# other.
+# neither may be ruled out by the prior.
 UNLISTED = 1 / 3
 # Prior probabilities of one effect, of several, and of a cause beyond the list.
 PRIORS = (_PRIOR_OF_COUNT[1], _PRIOR_OF_COUNT[2] + _PRIOR_OF_COUNT[3], PRIOR_UNKNOWN)
