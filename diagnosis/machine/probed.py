@@ -38,6 +38,8 @@ _RESTS = 1e-3
 _MOVES = 0.01
 # Share of the motion that a simulation with its own step must leave for others to be tried.
 _FOLLOWS_BADLY = 0.5
+# Relative difference of two steps that are the same: clocks of loggers are off by less.
+_SAME_STEP = 1e-3
 # What another step leaves at most, as a share of what the best sizes would.
 _FAR_BETTER = 0.5
 
@@ -164,12 +166,19 @@ def doubtful_columns(case: PlantCase) -> tuple[str, ...]:
                 f"{name} moves {times:.3g} times as far as in the simulation: is its column {unit}?"
             )
 
-    # A simulation that is held near its record follows it with any step.
-    if not case.plant.untracked:
+    # A simulation that is held near its record follows it with any step, and one whose step is that of the
+    # time stamps follows it badly for another reason.
+    if not case.plant.untracked and not _steps_as_sampled(case.plant):
         # What the best sizes would leave of the motion is no question of steps.
         left_by_sizes = np.sqrt(np.mean(np.maximum(1 - np.diagonal(correlation[0]) ** 2, 0)))
         doubts += _other_step(case, float(left_by_sizes))
     return tuple(doubts)
+
+
+def _steps_as_sampled(plant: Plant) -> bool:
+    """Whether a simulation says that its step is the sampling period, as an FMU's is and a file may say."""
+    step_s = getattr(plant.simulation, "dt_s", None)
+    return step_s is not None and abs(step_s - plant.dt_s) < _SAME_STEP * plant.dt_s
 
 
 def _last_half(signals: Real) -> Real:

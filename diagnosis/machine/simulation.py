@@ -26,6 +26,8 @@ from diagnosis.machine.with_effects import with_effects
 USUAL_TOLERANCE = 0.05
 # What a Python file must define.
 _DEFINED = ("simulate", "PARAMETERS", "INPUTS", "OUTPUTS")
+# What a file calls the step of its simulation, as far as it is a number of seconds.
+_STEP_NAMES = ("DT_S", "dt_s", "DT", "dt", "TS", "Ts", "STEP_S", "step_s")
 
 
 @runtime_checkable
@@ -71,6 +73,7 @@ class PythonFile:
     likes.
 
     simulate : (parameters, effects, inputs (T, U)) -> outputs (T, Y).
+    dt_s : the step that the file names (DT_S, dt, ...), whether of a sample or of a part of it; None: none.
     """
 
     simulate: Any
@@ -79,6 +82,7 @@ class PythonFile:
     effects: tuple[PlantEffect, ...]
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    dt_s: float | None = None
 
     @classmethod
     def read(cls, path: Path) -> PythonFile:
@@ -109,6 +113,7 @@ class PythonFile:
             tuple(defined.get("EFFECTS", ())),
             _names(defined["INPUTS"]),
             _names(defined["OUTPUTS"]),
+            _named_step(defined),
         )
 
     @property
@@ -121,6 +126,15 @@ class PythonFile:
     ) -> Real:
         """Outputs as the file's function gives them; `Plant` checks their shape and says where it fails."""
         return self.simulate(parameters, effects, inputs)  # type: ignore[no-any-return]
+
+
+def _named_step(defined: Mapping[str, Any]) -> float | None:
+    """The first number that a file calls a step, in seconds; None where it has none."""
+    for name in _STEP_NAMES:
+        value = defined.get(name)
+        if isinstance(value, float | int) and not isinstance(value, bool) and value > 0:
+            return float(value)
+    return None
 
 
 def _names(names: str | Sequence[str]) -> tuple[str, ...]:

@@ -244,6 +244,25 @@ def test_a_step_that_is_not_that_of_the_log_is_doubted(simulated, recorded, said
 
 
 @pytest.mark.parametrize(
+    ("stated_s", "is_doubted"), [(None, True), (0.01, False), (0.010001, False), (0.001, True)]
+)
+def test_a_step_that_the_simulation_says_itself_is_not_doubted(stated_s, is_doubted):
+    """What it follows badly is then the machine, whatever another step would do."""
+
+    class Stepping:
+        dt_s = stated_s
+
+        def __call__(self, parameters, effects, inputs):
+            return _swings(0.001)(inputs)
+
+    u = np.random.default_rng(3).uniform(-1, 1, 60).repeat(15)[:, None]
+    record = PlantExperiment("log", "estimation", u, _swings(0.01)(u))
+    plant = replace(PLANT, simulation=Stepping(), dt_s=0.01)
+    found = doubtful_columns(SimpleNamespace(plant=plant, estimation=[record], outputs=("y",)))
+    assert bool(found) == is_doubted
+
+
+@pytest.mark.parametrize(
     "given",
     [lambda y: y[:, 0], lambda y: y[:, 0].tolist(), lambda y: y.tolist(), lambda y: pd.Series(y[:, 0])],
 )
@@ -258,7 +277,7 @@ def test_one_output_is_a_column_in_whatever_form(given):
 
 def test_exchanged_columns_are_doubted():
     moves = np.cumsum(np.random.default_rng(4).standard_normal((400, 2)), axis=0)
-    given = {"untracked": 0, "body": None}
+    given = {"untracked": 0, "body": None, "simulation": None}
     plant = SimpleNamespace(replayed=lambda effects: lambda u: np.resize(moves, (len(u), 2)), **given)
 
     def doubts(measured):

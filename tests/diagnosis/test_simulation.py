@@ -123,3 +123,18 @@ def test_a_python_file_that_is_none_is_refused_in_one_line(tmp_path, text, messa
     (tmp_path / "carriage.py").write_text(text)
     with pytest.raises(ValueError, match=message):
         PythonFile.read(tmp_path / "carriage.py")
+
+
+@pytest.mark.parametrize(
+    ("line", "dt_s"),
+    [
+        ("", None),
+        ("DT = 0.02", 0.02),
+        ("dt, N = 0.001, 20", 0.001),
+        ("Ts = 'auto'", None),
+        ("DT_S = True", None),
+    ],
+)
+def test_a_file_may_name_its_step(tmp_path, line, dt_s):
+    (tmp_path / "carriage.py").write_text(f"{PYTHON}\n{line}\n")
+    assert PythonFile.read(tmp_path / "carriage.py").dt_s == dt_s
