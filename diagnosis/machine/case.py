@@ -77,9 +77,22 @@ class Experiment:
             lock(self, "readings")
         if self.voltage_V.ndim != 1:
             raise ValueError(f"experiment {self.name}: voltage_V must be (T,); got {self.voltage_V.shape}")
-        if self.reference_rad is not None and self.reference_rad.shape != self.voltage_V.shape:
-            raise ValueError(f"experiment {self.name}: reference_rad must be (T,) like voltage_V")
         check_record(self, self.outputs)
+        signals = dict(self.beside)
+        if self.reference_rad is not None:
+            signals["reference_rad"] = self.reference_rad
+        for name, signal in signals.items():
+            if np.shape(signal) != self.voltage_V.shape or not np.all(np.isfinite(signal)):
+                raise ValueError(
+                    f"experiment {self.name}: {name} must be finite and ({self.voltage_V.size},) like "
+                    f"voltage_V; got {np.shape(signal)}"
+                )
+        outside = [row for row in self.missing if not 0 <= row < self.voltage_V.size]
+        if outside:
+            raise ValueError(
+                f"experiment {self.name}: row {outside[0]} is missing, but rows are 0 to "
+                f"{self.voltage_V.size - 1}"
+            )
 
     @property
     def input(self) -> Real:

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.mujoco_edits import LAGS, put_compiled
+from diagnosis.machine.mujoco_edits import DEAD_ZONE, LAGS, STRIBECK, put_compiled
 
 # Longest model file that is searched for the files it names; chosen, a hundred times any model of a robot.
 # Longer ones are left to MuJoCo unsearched.
@@ -147,7 +147,7 @@ class MujocoModel:
     ------
     ValueError
         One line: no actuator, an output that is not there or has several numbers, a joint on a body that
-        flies, or a model that does not compile.
+        flies, a <numeric> that is read here and cannot be so, or a model that does not compile.
     """
 
     spec: Any
@@ -178,6 +178,7 @@ class MujocoModel:
                 part.name = name
         if not spec.actuators:
             raise ValueError("the model has no actuator")
+        self._refuse_numbers()
 
         for name in self.outputs:
             if spec.sensor(name) is None:
@@ -189,6 +190,34 @@ class MujocoModel:
             if size != 1:
                 raise ValueError(f"sensor {name} has {size} numbers, expected one")
         put_compiled(spec, model)
+
+    def _refuse_numbers(self) -> None:
+        """Raises ValueError, one line, where a <numeric> that is read here cannot be what it is."""
+        expected = {}
+        for numeric in self.spec.numerics:
+            if numeric.name.startswith("tolerance."):
+                expected[numeric.name] = "zero or more"
+        for output in self.outputs:
+            expected[f"{output}.gain"] = "not zero"
+            expected[f"{output}.offset"] = "finite"
+        for actuator in self.inputs:
+            expected[f"{actuator}.{DEAD_ZONE}"] = "zero or more"
+        for name, what in expected.items():
+            value = self.number(name, 1.0)
+            too_small = (what == "zero or more" and value < 0) or (what == "not zero" and value == 0)
+            if too_small or not np.isfinite(value):
+                raise ValueError(f'the model\'s <numeric name="{name}"> is {value:g}; it must be {what}')
+        for joint in self.spec.joints:
+            numeric = self.spec.numeric(f"{joint.name}.{STRIBECK}")
+            if numeric is None:
+                continue
+            values = np.array(numeric.data)
+            if values.size != 2 or not np.all(np.isfinite(values)) or not values[1] > 0:
+                listed = " ".join(f"{value:g}" for value in values)
+                raise ValueError(
+                    f'the model\'s <numeric name="{numeric.name}"> is {listed}; it must be a force and a speed '
+                    "above zero"
+                )
 
     def _add_sensor(self, output: str) -> None:
         """Add a sensor of the position of a joint, called as the output. Raises ValueError: no such joint."""

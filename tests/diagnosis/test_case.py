@@ -25,6 +25,14 @@ def _case(*experiments, rig=None):
         ({"output": np.zeros((50, 2))}, "dead"),
         ({"output": np.ones((49, 2))}, r"\(T, U\)"),
         ({"voltage_V": np.ones((50, 1))}, r"\(T,\)"),
+        (
+            {"reference_rad": np.zeros(49)},
+            r"reference_rad must be finite and \(50,\) like voltage_V; got \(49,\)",
+        ),
+        ({"reference_rad": np.full(50, np.nan)}, "reference_rad must be finite"),
+        ({"beside": {"load_kg": np.zeros(51)}}, r"load_kg must be finite and \(50,\)"),
+        ({"beside": {"load_kg": np.full(50, np.inf)}}, "load_kg must be finite"),
+        ({"missing": (3, 50)}, "row 50 is missing, but rows are 0 to 49"),
     ],
 )
 def test_experiments_that_cannot_be_used_are_refused(changes, message):

@@ -488,6 +488,24 @@ def test_a_repaired_file_can_be_diagnosed_and_repaired_again_with_the_same_logs(
         )
 
 
+@pytest.mark.parametrize(
+    ("number", "value", "complaint"),
+    [
+        ("hinge.gain", "0", "is 0; it must be not zero"),
+        ("motor.dead_zone", "-0.1", "is -0.1; it must be zero or more"),
+        ("tolerance.hinge.damping", "-0.2", "is -0.2; it must be zero or more"),
+        ("hinge.stribeck", "0.3", "is 0.3; it must be a force and a speed above zero"),
+        ("hinge.stribeck", "0.3 0", "is 0.3 0; it must be a force and a speed above zero"),
+    ],
+)
+def test_a_number_of_the_file_that_cannot_be_so_is_refused_in_one_line(number, value, complaint):
+    """It was read, divided by or taken for less than nothing, and the answer was of another machine."""
+    text = ROD.replace("<custom>", f'<custom><numeric name="{number}" data="{value}"/>')
+    said = f'the model\'s <numeric name="{number}"> {complaint}'
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+        arm_of(text)
+
+
 FIXED = '<body name="body2"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/></body>'
 TURNS = '<joint name="joint1" axis="0 1 0" armature="0.1"/>'
 
