@@ -215,8 +215,8 @@ class MujocoModel:
             if values.size != 2 or not np.all(np.isfinite(values)) or not values[1] > 0:
                 listed = " ".join(f"{value:g}" for value in values)
                 raise ValueError(
-                    f'the model\'s <numeric name="{numeric.name}"> is {listed}; it must be a force and a speed '
-                    "above zero"
+                    f'the model\'s <numeric name="{numeric.name}"> is {listed}; it must be a force and a '
+                    "speed above zero"
                 )
 
     def _add_sensor(self, output: str) -> None:
