@@ -41,10 +41,11 @@ _TIP: Output = "tip_m"
 _ACCELERATION: Output = "tip_acceleration_m_s2"
 # Modes of the link that may still swing when a record starts; higher ones are damped out. Chosen.
 _START_MODES = 2
-# How far anything may be from rest when a record starts (standard deviations): hub speed, deflections of
-# modes [sqrt(kg) m] and their rates. Chosen wide; a small machine does not reach them.
+# Standard deviation of the hub's speed when a record starts. Chosen wide; a small machine does not reach it.
 _START_SPEED_RAD_S = 5.0
+# The same of the deflections of modes [sqrt(kg) m].
 _START_DEFLECTION = 1.0
+# The same of their rates [sqrt(kg) m/s].
 _START_RATE = 20.0
 # Hub speeds that are tried as a start beside contacts that switch: in free play the hub drifts until it
 # touches, however slowly it did at first. Seven each way, from one that takes ten seconds through a gap of

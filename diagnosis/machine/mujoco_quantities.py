@@ -155,9 +155,9 @@ _SENSOR_DELAY_SAMPLES = (0.02, 100.0)
 _SENSOR_DELAY_STARTS_SAMPLES = (0.2, 10.0)
 # Usual range of a size in multiples of its magnitude: below a ten thousandth it is next to nothing.
 _SPAN = (1e-4, 1.0)
-# First and last start of a search for a size, in multiples of its magnitude, and how many there are: most
-# missing effects are small, and a search finds its way over a factor of three.
+# First and last start of a search for a size, in multiples of its magnitude: most missing effects are small.
 _STARTS = (3e-3, 0.6)
+# Starts between these: a search finds its way over a factor of three.
 _START_COUNT = 6
 # The last start is no larger than this share of the range: beyond it a descent meets the end first.
 _LAST_START = 0.6

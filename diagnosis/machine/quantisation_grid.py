@@ -31,9 +31,9 @@ _MANY_VALUES = 10
 _READINGS_OF_EACH = 20
 # Least standard deviation of rounding, step / sqrt(12), over the noise: less widens it by half a per cent.
 _NOTICEABLE = 0.1
-# First reach of the fit of a step, in steps, and the factor by which it grows: a step that is off by 1e-4
-# slips a cell only beyond 5000 of them, so that each fit is exact enough for the next.
+# First reach of the fit of a step, in steps: one that is off by 1e-4 slips a cell only beyond 5000 of them.
 _FIRST_REACH = 8.0
+# Factor by which the reach grows: each fit is exact enough for the next.
 _REACH_GROWS = 2.0
 # Largest log of a ratio of probabilities that is taken as below one, so that log(1 - ratio) is a number.
 _JUST_BELOW_ONE = -1e-300
