@@ -128,28 +128,28 @@ class _Prediction:
         return self.log_density + self.allowed_gain
 
 
-def _prediction(model: ResidualModel, end: Fit) -> _Prediction:
+def _prediction(model: ResidualModel, fit: Fit) -> _Prediction:
     """What validation records say of the end of a fit."""
     case = model.case
     outputs = case.noise.size
     estimation_samples = [len(record.output) for record in case.estimation]
     validation_samples = [len(record.output) for record in case.held_out]
-    fitted, _ = without_drift(end.residual_coefficients, solver_spread(model, end))
-    unpredicted, log_density = _unpredicted(model, end)
+    fitted, _ = without_drift(fit.residual_coefficients, solver_spread(model, fit))
+    unpredicted, log_density = _unpredicted(model, fit)
     before = discrepancy(fitted, estimation_samples, outputs)
     after = discrepancy(
         np.concatenate([fitted, unpredicted]), [*estimation_samples, *validation_samples], outputs
     )
-    allowed_gain = disagreement_gain(end, after) - disagreement_gain(end, before)
-    return _Prediction(log_density, allowed_gain, _unknown_odds(end, after) - _unknown_odds(end, before))
+    allowed_gain = disagreement_gain(fit, after) - disagreement_gain(fit, before)
+    return _Prediction(log_density, allowed_gain, _unknown_odds(fit, after) - _unknown_odds(fit, before))
 
 
-def _unknown_odds(end: Fit, left: Discrepancy) -> float:
+def _unknown_odds(fit: Fit, left: Discrepancy) -> float:
     """Log odds of an unknown cause for what is left, beyond the disagreement of correct solvers."""
-    return left.log_gain_some - disagreement_gain(end, left)
+    return left.log_gain_some - disagreement_gain(fit, left)
 
 
-def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
+def _unpredicted(model: ResidualModel, fit: Fit) -> tuple[Real, float]:
     """Validation residuals without what the fitted values' uncertainty may do to them, and their log density.
 
     Returns
@@ -167,40 +167,40 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     solvers disagree about.
     """
     held_out = model.case.held_out
-    residuals = model.of(end.deviations, end.effects, held_out)
-    if not end.jacobian.shape[1]:
+    residuals = model.of(fit.deviations, fit.effects, held_out)
+    if not fit.jacobian.shape[1]:
         return residuals, -0.5 * float(residuals @ residuals)
-    step_sizes = steps_of(end.candidates)
+    step_sizes = steps_of(fit.candidates)
     by_deviations = difference_quotients(
-        lambda deviations: model.of(deviations, end.effects, held_out),
-        end.deviations,
+        lambda deviations: model.of(deviations, fit.effects, held_out),
+        fit.deviations,
         residuals,
-        np.full(end.deviations.size, step_sizes[0]),
+        np.full(fit.deviations.size, step_sizes[0]),
     )
     by_coordinates = difference_quotients(
-        lambda coordinates: model.of(end.deviations, effects_at(end.candidates, coordinates), held_out),
-        end.coordinates,
+        lambda coordinates: model.of(fit.deviations, effects_at(fit.candidates, coordinates), held_out),
+        fit.coordinates,
         residuals,
         step_sizes[1],
-        bounds_of(end.candidates)[1],
+        bounds_of(fit.candidates)[1],
     )
     J = np.hstack([by_deviations, by_coordinates])
 
-    spread = solver_spread(model, end, held_out)
+    spread = solver_spread(model, fit, held_out)
     narrowed, drift = without_drift(residuals, spread)
     log_density = drift.log_gain + 0.5 * float(narrowed @ narrowed - residuals @ residuals)
     if drift.size > 0:
         residuals = narrowed
         J = J / np.sqrt(1.0 + spread)[:, None]
 
-    H = end.hessian
+    H = fit.hessian
     scale = np.sqrt(np.maximum(np.diag(H), _LEAST_CURVATURE))
     H = H + _DAMPING * np.diag(scale**2)
     hessian_of_both = H + J.T @ J
     gradient = J.T @ residuals
     step = np.asarray(-np.linalg.solve(hessian_of_both, gradient))
     # A value that would leave its range stays where it is.
-    free = np.flatnonzero(_inside(end, step))
+    free = np.flatnonzero(_inside(fit, step))
     step = np.zeros(step.size)
     step[free] = -np.linalg.solve(hessian_of_both[np.ix_(free, free)], gradient[free])
 
@@ -211,10 +211,10 @@ def _unpredicted(model: ResidualModel, end: Fit) -> tuple[Real, float]:
     return np.asarray(residuals + J @ step), log_density - 0.5 * (quadratic + log_determinant)
 
 
-def _inside(end: Fit, step: Real) -> npt.NDArray[np.bool_]:
+def _inside(fit: Fit, step: Real) -> npt.NDArray[np.bool_]:
     """(P + A,) which unknowns stay in their ranges after a step (P + A,): P deviations always do, of A
     coordinates those within the bounds of their effects."""
-    P = end.deviations.size
-    coordinates = end.coordinates + step[P:]
-    low, high = bounds_of(end.candidates)
+    P = fit.deviations.size
+    coordinates = fit.coordinates + step[P:]
+    low, high = bounds_of(fit.candidates)
     return np.concatenate([np.ones(P, dtype=bool), (low <= coordinates) & (coordinates <= high)])

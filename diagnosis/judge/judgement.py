@@ -152,12 +152,12 @@ class Judge(ABC, Generic[E]):
         """Where an effect is fitted best; None where no size of it was worth a fit."""
 
     @abstractmethod
-    def covariance(self, fit: E, k: int) -> tuple[Real, Real]:
+    def covariance(self, explanation: E, k: int) -> tuple[Real, Real]:
         """Covariances of a fit: (M, M) of all its unknowns as far as the records tell, and (A, A) of the
         coordinates of its k-th effect from all sources."""
 
     @abstractmethod
-    def explains(self, fit: E, name: str, gap_after: float) -> tuple[float, float, float]:
+    def explains(self, explanation: E, name: str, gap_after: float) -> tuple[float, float, float]:
         """Share of the validation error that an effect explains, with the ends of a 95 % interval; NaN where
         nothing is known (`NamedEffect.explains`). gap_after: RMS that the fit leaves, in noise deviations."""
 
@@ -259,8 +259,8 @@ class Judge(ABC, Generic[E]):
             untried=self.judgement.untried.get(name, ""),
         )
         rounding = self.judgement.rounding
-        fit = self.holding(name)
-        if fit is None:
+        explanation = self.holding(name)
+        if explanation is None:
             if rounding is None or name != rounding.name:
                 return entry
             return replace(
@@ -270,21 +270,23 @@ class Judge(ABC, Generic[E]):
                 gap_after=held_out_gap(case, residuals_after),
             )
 
-        place = fit.names.index(name)
-        candidate = fit.fit.candidates[place]
-        coordinates = fit.fit.coordinates_of(place)
-        by_records, covariance = self.covariance(fit, place)
+        place = explanation.names.index(name)
+        candidate = explanation.fit.candidates[place]
+        coordinates = explanation.fit.coordinates_of(place)
+        by_records, covariance = self.covariance(explanation, place)
         intervals = parameter_intervals(candidate, coordinates, covariance, rng)
-        gap_after = held_out_gap(case, self.search.whitened_residuals(fit, case.held_out))
+        gap_after = held_out_gap(case, self.search.whitened_residuals(explanation, case.held_out))
         # The nominal value whose uncertainty widens the interval of the effect's size most.
-        first_row = fit.fit.unknowns_of(place).start
-        value = widening_tolerance(by_records, fit.fit.deviations.size, first_row, float(covariance[0, 0]))
+        first_row = explanation.fit.unknowns_of(place).start
+        value = widening_tolerance(
+            by_records, explanation.fit.deviations.size, first_row, float(covariance[0, 0])
+        )
         return replace(
             entry,
             parameters=candidate.parameters(coordinates),
             intervals=intervals,
             gap_after=gap_after,
-            explains=self.explains(fit, name, gap_after),
+            explains=self.explains(explanation, name, gap_after),
             remarks=remarks(candidate, coordinates, intervals),
             widened_by="" if value is None else self.search.records.nominal.keys[value],
         )

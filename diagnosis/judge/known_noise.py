@@ -174,7 +174,7 @@ class KnownNoise(Judge[Hypothesis]):
         holding = [h for h in self.found if h.is_answer and name in h.names]
         return max(holding, key=lambda h: h.log_weight, default=None)
 
-    def covariance(self, fit: Hypothesis, k: int) -> tuple[Real, Real]:
+    def covariance(self, explanation: Hypothesis, k: int) -> tuple[Real, Real]:
         """See `Judge.covariance`.
 
         Notes
@@ -182,17 +182,17 @@ class KnownNoise(Judge[Hypothesis]):
         What is left beyond the noise widens intervals in proportion. So does what solvers disagree about
         where contacts switch: that is correlated over a record, so that its whole length counts as one value.
         """
-        end = fit.fit
+        fit = explanation.fit
         mean_samples = float(np.mean([len(record.output) for record in self.search.case.estimation]))
-        disagreement = _HALF_NORMAL_MEDIAN * DISAGREEMENT["non-smooth"] if end.non_smooth else 0.0
-        widening = max(1.0, end.rms**2) * (1 + disagreement**2 * mean_samples)
-        covariance = widening * np.asarray(np.linalg.pinv(end.hessian, hermitian=True), dtype=np.float64)
-        return covariance, covariance[end.unknowns_of(k), end.unknowns_of(k)]
+        disagreement = _HALF_NORMAL_MEDIAN * DISAGREEMENT["non-smooth"] if fit.non_smooth else 0.0
+        widening = max(1.0, fit.rms**2) * (1 + disagreement**2 * mean_samples)
+        covariance = widening * np.asarray(np.linalg.pinv(fit.hessian, hermitian=True), dtype=np.float64)
+        return covariance, covariance[fit.unknowns_of(k), fit.unknowns_of(k)]
 
-    def explains(self, fit: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
+    def explains(self, explanation: Hypothesis, name: str, gap_after: float) -> tuple[float, float, float]:
         """See `Judge.explains`: without an interval, and NaN where the set without the effect was not
         fitted."""
-        other_names = {other for other in fit.names if other != name}
+        other_names = {other for other in explanation.names if other != name}
         gap_without = self.gap_refit
         if other_names:
             fitted = [h for h in self.found if h.is_answer and set(h.names) == other_names]

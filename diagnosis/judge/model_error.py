@@ -159,30 +159,30 @@ class BesideModelError(Judge[Explanation]):
     def holding(self, name: str) -> Explanation | None:
         """See `Judge.holding`: the repaired model, then the most probable set, then the likeliest one."""
         judged = [judged_set.explanation for judged_set in self.judgement.judged]
-        for fit in (self.repaired, *judged, *self.sets.values()):
-            if name in fit.names:
-                return fit
+        for explanation in (self.repaired, *judged, *self.sets.values()):
+            if name in explanation.names:
+                return explanation
         return None
 
-    def covariance(self, fit: Explanation, k: int) -> tuple[Real, Real]:
+    def covariance(self, explanation: Explanation, k: int) -> tuple[Real, Real]:
         """See `Judge.covariance`: imperfections of the model that may act as the effect does widen it."""
-        end = fit.fit
-        inverse = np.linalg.pinv(end.normal_equations(self.search.records).hessian, hermitian=True)
+        fit = explanation.fit
+        inverse = np.linalg.pinv(fit.normal_equations(self.search.records).hessian, hermitian=True)
         by_records = TEMPER * np.asarray(inverse, dtype=np.float64)
-        without = best_without(self.sets, fit, fit.names[k])
+        without = best_without(self.sets, explanation, explanation.names[k])
         imperfections = LITTLE * self.search.case.machine.weighing.model_error
-        share = max(share_beside(without, fit), imperfections)
-        changes = [_size(end.candidates[k], i, x) for i, x in enumerate(end.coordinates_of(k))]
+        share = max(share_beside(without, explanation), imperfections)
+        changes = [_size(fit.candidates[k], i, x) for i, x in enumerate(fit.coordinates_of(k))]
         sizes = imperfections / share * np.array(changes)
-        return by_records, by_records[end.unknowns_of(k), end.unknowns_of(k)] + np.outer(sizes, sizes)
+        return by_records, by_records[fit.unknowns_of(k), fit.unknowns_of(k)] + np.outer(sizes, sizes)
 
-    def explains(self, fit: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
+    def explains(self, explanation: Explanation, name: str, gap_after: float) -> tuple[float, float, float]:
         """See `Judge.explains`: as the repaired model shares it out, or by this fit alone."""
         carried = self.shares.carried.get(name)
         if carried is not None:
             return carried
-        without = best_without(self.sets, fit, name)
-        closed = closed_by(self.search, fit, self.refit) - closed_by(self.search, without, self.refit)
+        without = best_without(self.sets, explanation, name)
+        closed = closed_by(self.search, explanation, self.refit) - closed_by(self.search, without, self.refit)
         return float(np.clip(closed, 0.0, 1.0)), float("nan"), float("nan")
 
 
@@ -212,15 +212,15 @@ def _competing(search: Search, judgement: JudgedSets) -> tuple[CompetingHypothes
     return tuple(
         fitted_hypothesis(
             records.nominal,
-            end.candidates,
-            end.deviations,
-            end.coordinates,
-            end.precision(records) / TEMPER,
+            fit.candidates,
+            fit.deviations,
+            fit.coordinates,
+            fit.precision(records) / TEMPER,
             judgement.probability(key),
             noise,
             key,
         )
-        for key, end in list(contradicting.items())[:MOST_COMPETING]
+        for key, fit in list(contradicting.items())[:MOST_COMPETING]
     )
 
 

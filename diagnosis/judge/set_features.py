@@ -255,12 +255,12 @@ def is_none_but_by_name(search: Search, explanation: Explanation, place: int) ->
     place : int
         Of the effect among its names.
     """
-    end = explanation.fit
+    fit = explanation.fit
     records = search.records
-    if end.candidates[place].at_edge(end.coordinates_of(place)):
+    if fit.candidates[place].at_edge(fit.coordinates_of(place)):
         return 1.0
-    first_column = end.deviations.size + sum(len(c.axes) for c in end.candidates[:place])
-    by_size = end.jacobian[:, first_column]
+    first_column = fit.deviations.size + sum(len(c.axes) for c in fit.candidates[:place])
+    by_size = fit.jacobian[:, first_column]
     outputs = search.case.noise.size
     added = [-records.likelihood.to_residuals(by_size[part], outputs) for part in records.record_slices]
     constants = np.array([np.mean(signal, axis=0) for signal in added])
@@ -333,9 +333,9 @@ def _tolerances_off(search: Search, explanation: Explanation, place: int) -> flo
     None for effects that change no stated value, and for values without a tolerance: none of theirs is there
     to imitate what the effect does.
     """
-    end = explanation.fit
+    fit = explanation.fit
     machine = search.case.machine
-    kind = end.candidates[place].kind
+    kind = fit.candidates[place].kind
     key = kind.multiplies or kind.adds_to
     if key is None or key not in machine.tolerances:
         return None
@@ -343,9 +343,9 @@ def _tolerances_off(search: Search, explanation: Explanation, place: int) -> flo
     if not stated > 0:
         return None
     tolerance = machine.tolerances[key]
-    deviation = float(end.deviations[search.records.nominal.keys.index(key)])
+    deviation = float(fit.deviations[search.records.nominal.keys.index(key)])
     value = stated * np.exp(tolerance * deviation)
-    size = next(iter(end.effects[place].parameters().values()))
+    size = next(iter(fit.effects[place].parameters().values()))
     value = value * size if kind.multiplies else value + size
     return abs(float(value / stated) - 1) / tolerance
 
