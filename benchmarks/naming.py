@@ -354,7 +354,7 @@ def calibration_picture(outcomes: Sequence[Outcome], path: Path) -> None:
 
     They are those of Clopper and Pearson. Neglected: presences of one case are no independent trials.
     """
-    answers = [(each.judgement, each.is_right) for each in outcomes]
+    answers = [(each.said, each.is_right) for each in outcomes]
     presences = [
         (probability, name in each.case.present)
         for each in outcomes

@@ -430,16 +430,16 @@ def table(rows: Mapping[str, Sequence[Outcome]]) -> list[str]:
             f"{np.mean([each.cause_loss for each in outcomes]):.3f}",
             str(sum(each.is_right for each in outcomes)),
             str(sum(each.is_exact for each in outcomes)),
-            str(sum(each.judgement > SURE and not each.is_right for each in outcomes)),
+            str(sum(each.said > SURE and not each.is_right for each in outcomes)),
         ]
         for low, high in SAID:
             within = [
-                each for each in outcomes if low <= each.judgement < high or each.judgement == high == 1
+                each for each in outcomes if low <= each.said < high or each.said == high == 1
             ]
             if not within:
                 line.append("-")
                 continue
-            said = np.mean([each.judgement for each in within])
+            said = np.mean([each.said for each in within])
             right = np.mean([each.is_right for each in within])
             line.append(f"{len(within)}, {said:.2f}, {right:.2f}")
         lines.append(line)
