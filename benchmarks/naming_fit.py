@@ -433,9 +433,7 @@ def table(rows: Mapping[str, Sequence[Outcome]]) -> list[str]:
             str(sum(each.said > SURE and not each.is_right for each in outcomes)),
         ]
         for low, high in SAID:
-            within = [
-                each for each in outcomes if low <= each.said < high or each.said == high == 1
-            ]
+            within = [each for each in outcomes if low <= each.said < high or each.said == high == 1]
             if not within:
                 line.append("-")
                 continue

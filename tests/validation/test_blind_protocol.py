@@ -282,7 +282,7 @@ _ATTEMPTS = {
     "interpreter": "interpreters.create()",
 }
 _TRIED = """
-import concurrent.futures, multiprocessing, os, pathlib, shutil, socket, sqlite3, subprocess, sys
+import concurrent.futures, multiprocessing, os, pathlib, shutil, socket, sqlite3, subprocess, sys, tempfile
 try:
     import _xxsubinterpreters as interpreters
 except ImportError:
@@ -299,6 +299,8 @@ if __name__ == "__main__":
             print("refused", error)
         else:
             print("DONE", attempt, done)
+    # Compilers keep what they compiled by way of an unnamed file.
+    tempfile.TemporaryFile(dir=beside).close()
     beside.joinpath("own.txt").write_text("what is not below the directory stays open")
     assert os.listdir(beside) == ["own.txt"]
 """

@@ -99,6 +99,14 @@ def keep_out(directory: Path) -> None:
             if (about.st_dev, about.st_ino) in linked:
                 raise PermissionError("a link to a file of a blind run: sealed")
 
+    def reads_only(arguments: tuple[Any, ...]) -> bool:
+        """Whether a file or a directory (path, mode, flags) is opened for reading alone.
+
+        A directory that is opened for writing is where an unnamed file is made (O_TMPFILE), as compilers do
+        that keep what they compiled: no descriptor of a directory comes of it.
+        """
+        return arguments[2] & (os.O_WRONLY | os.O_RDWR) == 0
+
     def watch(event: str, arguments: tuple[Any, ...]) -> None:
         if event in _PROCESS_EVENTS:
             raise PermissionError("a blind diagnosis starts no processes")
@@ -110,7 +118,7 @@ def keep_out(directory: Path) -> None:
                 continue
             named = os.fsdecode(argument)
             if named and "\0" not in named:  # else it is no path
-                refuse_path(os.path.realpath(named), opens=event == "open")
+                refuse_path(os.path.realpath(named), opens=event == "open" and reads_only(arguments))
 
     def fork_exec(*_: object) -> NoReturn:
         raise PermissionError("a blind diagnosis starts no processes")
