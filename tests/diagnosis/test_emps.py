@@ -14,7 +14,7 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
     found = diagnose(emps_axis.case(flexlink_data, "passes"))
     assert found.verdict == "effect"
     assert set(found.combination) == {"coulomb_friction", "constant_offset"}
-    assert found.probabilities["coulomb_friction"] > 0.8
+    assert found.probabilities["coulomb_friction"] > 0.7
     # Nothing is weighed by hand: 5 % is asked of values from half of the record that was published on.
     for key, value in fitted_values(found).items():
         assert value == pytest.approx(PUBLISHED[key], rel=0.05), key
