@@ -311,10 +311,10 @@ SECTIONS = {
             "{}; {}",
         ),
         Row(
-            "SLFR, a real flexible arm: probability that friction is present, fitted at 50 and 75; at 50",
+            "SLFR, a real flexible arm: probability that friction is present, fitted at 50 and 75; what is "
+            "said where it is fitted at 50 alone",
             "real_machine_gaps",
-            r"^Fitted at 50 and 75.*?coulomb_friction \(there with (\S+?)\)"
-            r".*?^Fitted at 50,.*?coulomb_friction \(there with (\S+?)\)",
+            r"^Fitted at 50 and 75.*?coulomb_friction \(there with (\S+?)\).*?^Fitted at 50,.*?Verdict (\w+)",
             "{}; {}",
         ),
     ),
