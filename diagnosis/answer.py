@@ -345,8 +345,8 @@ class Diagnosis(Shown):
     @property
     def runner_up(self) -> str:
         """The likeliest answer beside the accepted ones."""
-        others = [name for name in self.probabilities if name not in self.combination]
-        return max((self.presence(name), name) for name in others)[1]
+        other_answers = [name for name in self.probabilities if name not in self.combination]
+        return max((self.presence(name), name) for name in other_answers)[1]
 
     @property
     def residuals(self) -> dict[Model, dict[str, Real]]:
@@ -520,8 +520,10 @@ def left_of(
 
 def _beyond(mean_square: Real, white: Real | float, samples: int) -> Real:
     """(Y,) RMS beyond white noise of this variance; 0 where the noise of so many samples could make it."""
-    beyond = mean_square - white
-    return np.sqrt(np.where(beyond > _CHANCE * white * np.sqrt(2 / samples), beyond, 0.0))
+    left_beyond_noise = mean_square - white
+    return np.sqrt(
+        np.where(left_beyond_noise > _CHANCE * white * np.sqrt(2 / samples), left_beyond_noise, 0.0)
+    )
 
 
 def completeness_of(case: CaseOfMachine, probability: float, residuals: Mapping[str, Real]) -> Completeness:

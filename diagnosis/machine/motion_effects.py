@@ -287,9 +287,9 @@ class PulseResponse:
                 "friction and springs need a force that moves the body at once; the simulated motion follows "
                 "the stated input later, or its steps are too coarse for a pulse of one sample"
             )
-        kept = np.abs(speed) > _FORGOTTEN * largest
-        kept |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
-        length = int(np.flatnonzero(kept)[-1]) + 1
+        is_remembered = np.abs(speed) > _FORGOTTEN * largest
+        is_remembered |= np.abs(position) > _FORGOTTEN * np.max(np.abs(position))
+        length = int(np.flatnonzero(is_remembered)[-1]) + 1
         position = position[:length]
         speed = speed[:length]
         poles, head = _filter(speed if of_speed else position, ahead)

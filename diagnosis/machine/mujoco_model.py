@@ -225,8 +225,8 @@ class MujocoModel:
         if self.spec.joint(joint) is None:
             joint = output.removeprefix("joint ")
         if self.spec.joint(joint) is None:
-            there = [part.name for part in (*self.spec.joints, *self.spec.sensors) if part.name]
-            raise ValueError(f"no joint or sensor is called {output!r}; there are {', '.join(there)}")
+            present_names = [part.name for part in (*self.spec.joints, *self.spec.sensors) if part.name]
+            raise ValueError(f"no joint or sensor is called {output!r}; there are {', '.join(present_names)}")
         self.spec.add_sensor(
             name=output,
             type=_SENSORS.mjSENS_JOINTPOS,

@@ -314,12 +314,12 @@ class _Visibility:
         """
         size, *further = effect.parameters
         # A large size changes most if the effect grows with it, else a small one.
-        most = -1 if effect.grows else 0
-        values = {size.name: size.starts[most]}
+        start_place = -1 if effect.grows else 0
+        values = {size.name: size.starts[start_place]}
         if at_its_least:
             values[size.name] = size.low if effect.grows else size.high
         for parameter in further:
-            values[parameter.name] = parameter.starts[most]
+            values[parameter.name] = parameter.starts[start_place]
         return self._change({}, {effect.name: values})
 
     def _change(self, parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> float:
@@ -379,13 +379,13 @@ def _point_to_assets(spec: Any, folder: Path | None) -> None:
         # A model that is no file says nothing about where its assets are.
         if not spec.modelfiledir:
             continue
-        there = Path(spec.modelfiledir, getattr(spec, attribute)).resolve()
-        path = str(there)
+        absolute_path = Path(spec.modelfiledir, getattr(spec, attribute)).resolve()
+        path = str(absolute_path)
         if folder is not None:
             try:
-                path = os.path.relpath(there, folder.resolve())
+                path = os.path.relpath(absolute_path, folder.resolve())
             except ValueError:  # on another drive
-                path = str(there)
+                path = str(absolute_path)
         setattr(spec, attribute, Path(path).as_posix())
 
 

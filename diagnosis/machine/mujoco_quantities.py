@@ -296,13 +296,18 @@ class Quantities:
         # is at most one over a step. Half of that is a start as well.
         softest = force / travel
         stiffest = motor * load / inertia / step_s**2
-        most = stiffest / softest
-        if most > 2:
+        largest_ratio = stiffest / softest
+        if largest_ratio > 2:
             yield _quantity(
                 f"{name}.{ELASTIC}",
                 0.0,
                 partial(put_spring, name, load),
-                _size(f"stiffness_{units.force}_{units.position}", softest, (1.0, most), (1.0, 0.5 * most)),
+                _size(
+                    f"stiffness_{units.force}_{units.position}",
+                    softest,
+                    (1.0, largest_ratio),
+                    (1.0, 0.5 * largest_ratio),
+                ),
                 _DAMPING_RATIO,
                 grows=False,
                 group="joint",

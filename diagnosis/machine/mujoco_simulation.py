@@ -166,19 +166,19 @@ class MujocoSimulation:
     @property
     def parameters(self) -> dict[str, float]:
         """Name -> value that the model has, of what may be wrong."""
-        return {name: one.stated for name, one in self.quantities.items() if one.stated != 0.0}
+        return {name: quantity.stated for name, quantity in self.quantities.items() if quantity.stated != 0.0}
 
     @property
     def tolerances(self) -> dict[str, float]:
         """Parameter -> relative standard deviation, of those for which the file has a number."""
-        stated = {one.name: float(one.data[0]) for one in self.arm.spec.numerics}
+        stated = {quantity.name: float(quantity.data[0]) for quantity in self.arm.spec.numerics}
         names = {name: f"tolerance.{name}" for name in self.parameters}
         return {name: stated[number] for name, number in names.items() if number in stated}
 
     @property
     def effects(self) -> tuple[PlantEffect, ...]:
         """Quantities that the model has none of."""
-        return tuple(one for one in self.quantities.values() if one.stated == 0.0)
+        return tuple(quantity for quantity in self.quantities.values() if quantity.stated == 0.0)
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -199,11 +199,11 @@ def _refuse_exchange(compare: _Comparison, given_order: Sequence[int]) -> None:
 
 def _refuse_values(case: Case) -> None:
     """Raises ValueError for a value of the rig that no link has, or a signal that is in no SI unit."""
-    for key, (least, most) in _RANGES.items():
+    for key, (lowest, highest) in _RANGES.items():
         value = case.rig.value(key)
-        if not least <= value <= most:
+        if not lowest <= value <= highest:
             raise ValueError(
-                f"rig file: {key} is {value:g}; expected {least:g} to {most:g}, in the unit of its name"
+                f"rig file: {key} is {value:g}; expected {lowest:g} to {highest:g}, in the unit of its name"
             )
     for e in case.experiments:
         for name, signal in zip(("voltage_V", *e.outputs), (e.voltage_V, *e.output.T), strict=True):

@@ -119,13 +119,13 @@ def competing_hypotheses(
     most_probable_first = sorted(
         best, key=lambda key: (sets.get(key, 0.0), best[key].log_weight), reverse=True
     )
-    kept: list[tuple[str, ...]] = []
+    kept_hypotheses: list[tuple[str, ...]] = []
     for key in most_probable_first:
-        if len(kept) == at_most or (len(kept) >= 2 and sets.get(key, 0.0) < _SURVIVES):
+        if len(kept_hypotheses) == at_most or (len(kept_hypotheses) >= 2 and sets.get(key, 0.0) < _SURVIVES):
             break
-        if not any(_name_the_same(key, other) for other in kept):
-            kept.append(key)
-    return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept)
+        if not any(_name_the_same(key, other) for other in kept_hypotheses):
+            kept_hypotheses.append(key)
+    return tuple(competing_hypothesis(case, best[key].fit, sets.get(key, 0.0)) for key in kept_hypotheses)
 
 
 def _name_the_same(key: tuple[str, ...], other: tuple[str, ...]) -> bool:

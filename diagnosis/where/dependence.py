@@ -231,15 +231,15 @@ def _preferred(possible: Sequence[_Tried]) -> _Tried:
     An error of a reading has to explain more than a force does, beyond two standard errors: a machine that
     follows stiffly shows the one as the other, and forces are what machines have.
     """
-    most = max(possible, key=lambda dependence: dependence.total)
+    best_dependence = max(possible, key=lambda dependence: dependence.total)
     as_good_forces = [
         dependence
         for dependence in possible
-        if dependence.pair[0].acts == "force" and not _explains_more(most, dependence)
+        if dependence.pair[0].acts == "force" and not _explains_more(best_dependence, dependence)
     ]
-    if most.pair[0].acts == "reading" and as_good_forces:
+    if best_dependence.pair[0].acts == "reading" and as_good_forces:
         return max(as_good_forces, key=lambda dependence: dependence.total)
-    return most
+    return best_dependence
 
 
 def _explains_more(first: _Tried, second: _Tried) -> bool:
@@ -406,8 +406,8 @@ class _Regressions:
         curve = best.curve
         # Coefficients of the curve are the constant, which comes first, and the last ones.
         functions = drawn.shape[1] - 1
-        kept = [0, *range(curve.coefficients.size - functions, curve.coefficients.size)]
-        covariance = curve.covariance[np.ix_(kept, kept)]
+        columns = [0, *range(curve.coefficients.size - functions, curve.coefficients.size)]
+        covariance = curve.covariance[np.ix_(columns, columns)]
         errors = np.sqrt(np.maximum(np.sum((drawn @ covariance) * drawn, axis=1), 0.0))
         shape, slope, slope_error = self._shape(best, taken)
         as_good = [other for other in possible if other is not best and not _explains_more(best, other)]
@@ -427,7 +427,7 @@ class _Regressions:
             own=variable in acts.own,
             value_unit=acts.unit,
             centres=tuple(at.tolist()),
-            values=tuple((drawn @ curve.coefficients[kept]).tolist()),
+            values=tuple((drawn @ curve.coefficients[columns]).tolist()),
             standard_errors=tuple(errors.tolist()),
             share=self._share(best.total),
             constant_share=self._share(best.constant_total),

@@ -453,9 +453,9 @@ def _whitening(responses: Real, force_rms: Real, weights: Real, step: int) -> Wh
     of_forces = unexplained * of_all(triangles)
     of_forces -= start @ (start.T @ of_forces)
     energies, turned = np.linalg.eigh(of_forces.T @ of_forces)
-    kept = energies > max(_NOTHING, _ALIKE**2 * float(energies[-1]))
-    basis = of_forces @ (turned[:, kept] / np.sqrt(energies[kept]))
-    taken = 1 - 1 / np.sqrt(1 + energies[kept])
+    is_visible = energies > max(_NOTHING, _ALIKE**2 * float(energies[-1]))
+    basis = of_forces @ (turned[:, is_visible] / np.sqrt(energies[is_visible]))
+    taken = 1 - 1 / np.sqrt(1 + energies[is_visible])
     return Whitening(np.concatenate([start, basis], axis=1), np.append(np.ones(start.shape[1]), taken))
 
 

@@ -217,7 +217,7 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
     length = min(experiment.voltage_V.size for experiment in chosen)
     e = np.stack([residuals[experiment.name][:length] for experiment in chosen])  # (n, T, Y)
     # The first sign is fixed: turning all of them changes nothing.
-    signs = np.array([(1.0, *others) for others in product((1.0, -1.0), repeat=n - 1)])
+    signs = np.array([(1.0, *other_signs) for other_signs in product((1.0, -1.0), repeat=n - 1)])
     findings = []
     for s, sensor in enumerate(sensors_of(case)):
         # Energy of the mean, over all choices of signs, from the products of the experiments.

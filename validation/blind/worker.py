@@ -105,7 +105,7 @@ def keep_out(directory: Path) -> None:
         A directory that is opened for writing is where an unnamed file is made (O_TMPFILE), as compilers do
         that keep what they compiled: no descriptor of a directory comes of it.
         """
-        return arguments[2] & (os.O_WRONLY | os.O_RDWR) == 0
+        return bool(arguments[2] & (os.O_WRONLY | os.O_RDWR) == 0)
 
     def watch(event: str, arguments: tuple[Any, ...]) -> None:
         if event in _PROCESS_EVENTS:
