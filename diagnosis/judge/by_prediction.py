@@ -16,7 +16,7 @@ from diagnosis.evidence.hypotheses import PRIORS
 # that as not: the best stand-in of five unlisted causes of labelled cases had .7, documented effects of
 # measured and of made machines had .85 and more.
 _STANDS_IN = 0.9
-# Width of that, in natural logarithms: from .85 to .7 the probability falls from about .5 to .3.
+# Width of that, in natural logarithms: from .85 to .7 the probability falls from .45 to .30. Chosen.
 _STANDS_IN_WIDTH = 0.3
 # Prior probability that what acts like an effect of the list is one, not a cause beyond it.
 _LISTED = PRIORS[0] / (PRIORS[0] + PRIORS[2])

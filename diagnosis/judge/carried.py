@@ -20,8 +20,8 @@ from diagnosis.search.loop import FOLLOWED_SETS
 from diagnosis.search.search import Search
 
 # Share of the validation error that a further effect has to close for a set with it to be listed among the
-# sets that close much; for a third effect twice that, as any third number closes something. Chosen; with
-# twice as much the list of partial answers loses its weakest line, and nothing else reads it.
+# sets that close much; for a third effect twice that, as any third number closes something. Chosen;
+# only the list of partial answers reads it.
 _CLOSES = 0.05
 # Quantiles between which 95 % of the bootstrap lie.
 _INTERVAL = (0.025, 0.975)

@@ -20,8 +20,8 @@ from diagnosis.machine.machine_protocol import Real
 from diagnosis.search.search import Search
 
 # Share of the stated model error that is little: validation records of which an effect changes less say
-# nothing about it, and one standard deviation of it may act as an effect does. Chosen; of 40 made cases none
-# changed its answer between a half and twice of it.
+# nothing about it, and one standard deviation of it may act as an effect does. Set by eye on made cases,
+# where dry friction and cogging of the background added to what was found; twice of it is not measured.
 LITTLE = 0.25
 # Features are logarithms of ratios; a ratio beyond this one says no more than that it is large (or small).
 _LOG_RATIO_LIMIT = 3.0

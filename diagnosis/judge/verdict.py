@@ -20,10 +20,11 @@ from diagnosis.machine.rounding import Rounding, rounding_effect
 from diagnosis.search.loop import FOLLOWED_SETS
 from diagnosis.search.search import Search
 
-# Sets less probable than this are not looked at: a hundred of them would add a tenth to no effect.
+# Sets less probable than this, over the most probable one, are not looked at: a hundred of them could add a
+# tenth to the presence of an effect.
 _NEGLIGIBLE = 1e-3
-# Width, in natural logarithms, of what solver and start add to what is left: 6 %, the spread of a share
-# between solvers of the labelled cases. With twice as much, completeness moves by .01.
+# Width, in natural logarithms, of what solver and start add to what is left: 6 %. Chosen; with one record
+# it is the whole width of the completeness.
 _SOLVER_WIDTH = 0.06
 # Share of the motion that is nothing.
 _NOTHING = 1e-4

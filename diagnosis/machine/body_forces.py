@@ -10,7 +10,7 @@ else is a smooth force, a law of `plant.force_laws` with its parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -175,10 +175,6 @@ class SmoothLaw:
     def __call__(self, values: Mapping[str, float]) -> BodyForces:
         sizes = tuple(float(values[name]) for name in self.parameters)
         return BodyForces(smooth=(SmoothForce(self.law, self.of, sizes),))
-
-
-# What an effect's values make of a body's forces.
-BodyLaw = Callable[[Mapping[str, float]], BodyForces]
 
 
 @njit(cache=True)

@@ -145,8 +145,8 @@ _LAG = _sized("time_constant_s", 2e-3, 200.0, 0.02, 40.0, 10, "dt_s")
 _GAIN = EffectParameter("relative_error", 1e-4, 0.95, (0.02, 0.1, 0.3, 0.7))
 _SHARE = EffectParameter("coulomb_share", 0.0, 0.98, (0.5, 0.8), "linear")
 _VISCOUS = _sized("coefficient", 1e-5, 30.0, 1e-4, 3.0, 8, "force/speed")
-# Amplitude that every wave number is tried with, a sixth of the largest force: of eight generated rods seven
-# were named, with a third of it five.
+# Amplitude that every wave number is tried with, a sixth of the largest force. Chosen on a few generated rods
+# that no command keeps: a third of it found fewer.
 _RIPPLE = _sized("amplitude", 1e-5, 1.0, 0.15, 0.15, 1, "force")
 # Of an angle in radians a wave number is cycles per turn. From a sixth of a period to the largest position
 # on, since less is a spring. Starts are a quarter of a period apart there, up to forty radians: more take

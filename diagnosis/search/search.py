@@ -192,10 +192,6 @@ class Search(SearchLoop[Explanation]):
         )
         return float(np.sqrt(np.max(changed / motion)))
 
-    def descended_to_end(self, explanation: Explanation) -> Explanation:
-        """The explanation after a fine descent from where it is, added to all others."""
-        return self.add(explanation.fit.continued(self.records, **FINE))
-
     def at_stated_values(self, explanation: Explanation | None = None) -> Explanation:
         """An explanation (default: no effect) with nominal values as stated, effects as they are.
 

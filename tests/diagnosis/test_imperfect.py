@@ -724,7 +724,6 @@ def _searched(sets, step_m=0.0, acts=1.0, stated=None, turned_rad=0.0):
         out_of_time=False,
         held_out_share_of=lambda whole, k: acts,
         with_only=lambda names, whole: found[frozenset(names)],
-        descended_to_end=lambda explanation: explanation,
     )
 
 

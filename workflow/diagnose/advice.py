@@ -160,13 +160,16 @@ def _separate(found: Diagnosis, coming: Following) -> Iterator[str]:
     best = _of_excitation(proposal)
     if not proposal.separates:
         most = max(pair.standard_deviations for pair in proposal.separations)
-        nothing = (
-            f"None of {len(proposal.considered)} simulated experiments separates these answers: the best,"
-            f" {best}, does by {number(most, 2)} standard deviations at most."
-        )
+        count = len(proposal.considered)
+        at_most = f"the best, {best}, does by {number(most, 2)} standard deviations at most."
         if proposal.decided:
-            yield f"No further experiment is needed: the records already decide for {first}. {nothing}"
+            rivals = listing([rival.name for rival in coming.competing[1:]])
+            yield (
+                f"No further experiment is needed: the records already decide for {first}. Of {count}"
+                f" simulated experiments none would set it apart from {rivals}: {at_most}"
+            )
         else:
+            nothing = f"None of {count} simulated experiments separates these answers: {at_most}"
             yield f"Check the machine before you record again. {nothing}{left_open}"
             yield from _checks(found, "Check")
         return
