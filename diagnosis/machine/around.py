@@ -123,11 +123,11 @@ class Body:
 
         def simulated(inputs: Real) -> Real:
             # The response to a pulse is taken with the other inputs held at their first row.
-            others = np.array(inputs[:1], dtype=np.float64)
-            others[:, force_at] = 0.0
+            held = np.array(inputs[:1], dtype=np.float64)
+            held[:, force_at] = 0.0
             response, sign = self._pulse_responses.value(
-                (started.key, len(inputs), others.tobytes()),
-                lambda: self._response(started.at_rest, others, len(inputs)),
+                (started.key, len(inputs), held.tobytes()),
+                lambda: self._response(started.at_rest, held, len(inputs)),
             )
 
             def simulate(force: Real) -> tuple[Real, Real]:

@@ -213,13 +213,13 @@ def _alike(columns: Mapping[str, Real]) -> tuple[Alike, ...]:
     gram = whole @ whole.T
     groups = list[Alike]()
     for j in range(len(names)):
-        others = [k for k in range(len(names)) if k != j]
+        candidates = [k for k in range(len(names)) if k != j]
         # Beside a group there may be another one without the candidate that did most in it.
-        while others:
-            chosen, left = _replacing(gram, j, others)
+        while candidates:
+            chosen, left = _replacing(gram, j, candidates)
             if left > _ALIKE:
                 break
-            others.remove(chosen[0])
+            candidates.remove(chosen[0])
             group = {names[k] for k in (j, *chosen)}
             if not any(set(known.names) <= group for known in groups):
                 groups = [known for known in groups if not group < set(known.names)]

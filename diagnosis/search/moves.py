@@ -255,12 +255,12 @@ class BesideSet(Move):
     ----------
     parent : Fit
         The set.
-    most : int
+    most_effects : int
         Further effects that are descended on.
     """
 
     parent: Fit
-    most: int
+    most_effects: int
 
     @property
     def what(self) -> str:
@@ -293,12 +293,12 @@ class BesideSet(Move):
         # Effects that multiply a nominal value are all tried where one is pulled far, of a long list some.
         most_with_pulled = len(points)
         if len(search.start_points) > _MOST_DESCENDED:
-            most_with_pulled = FOLLOWED_COSTLY * self.most
+            most_with_pulled = FOLLOWED_COSTLY * self.most_effects
         values_are_pulled = np.any(np.abs(parent.deviations) > EDGE)
         chosen: dict[tuple[str, float], tuple[Candidate, StartPoint]] = {}
         for candidate, point in points:
             is_pulled = candidate.kind.multiplies is not None and values_are_pulled
-            if len(chosen) < self.most or (is_pulled and len(chosen) < most_with_pulled):
+            if len(chosen) < self.most_effects or (is_pulled and len(chosen) < most_with_pulled):
                 # Beside contacts that switch, and values pulled far, the one side may look better and the
                 # other be so.
                 side = candidate.axes[0].low if parent.non_smooth or is_pulled else 0.0

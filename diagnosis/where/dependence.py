@@ -107,8 +107,8 @@ class _Acts:
     """What depends on a variable: a force at a place of the machine, or the error of an output's reading.
 
     through, at : whether it goes through the machine's response at its place `at`, or through the reading of
-        output `at`. name, unit : of the place or output, and of the force or reading. own : the motion of the
-        place itself. others : all else that is tried.
+        output `at`. name, unit : of the place or output, and of the force or reading. of_place : the motion
+        of the place itself. of_others : all else that is tried.
     """
 
     acts: Literal["force", "reading"]
@@ -116,13 +116,13 @@ class _Acts:
     at: int
     name: str
     unit: str
-    own: tuple[_Variable, ...]
-    others: tuple[_Variable, ...]
+    of_place: tuple[_Variable, ...]
+    of_others: tuple[_Variable, ...]
 
     @property
     def variables(self) -> tuple[_Variable, ...]:
         """Everything that is tried for it."""
-        return (*self.own, *self.others)
+        return (*self.of_place, *self.of_others)
 
     @property
     def where(self) -> tuple[str, int]:
@@ -424,7 +424,7 @@ class _Regressions:
             quantity=variable.quantity,
             of=variable.of,
             unit=variable.unit,
-            own=variable in acts.own,
+            own=variable in acts.of_place,
             value_unit=acts.unit,
             centres=tuple(at.tolist()),
             values=tuple((drawn @ curve.coefficients[columns]).tolist()),
@@ -569,17 +569,17 @@ def _acting(case: CaseOfMachine, forced: MissingForces, dt_s: float) -> tuple[_A
     for at, place in enumerate(forced.places):
         if missing[at] < _LEAST_PLACE:
             continue
-        own = () if place.motion is None else of_output[place.motion]
-        others = derived
-        if not others:
+        of_place = () if place.motion is None else of_output[place.motion]
+        positions = derived
+        if not positions:
             # Positions of all other outputs stand for what the machine does not compute of them.
-            others = tuple(
+            positions = tuple(
                 of_output[k][0]
                 for k, unit in enumerate(units)
                 if k != place.motion and unit in _POSITIONS and of_output[k]
             )
-        tried_beside = (*_commands(case, place.command), *others, *common)
-        acting.append(_Acts("force", "machine", at, place.name, place.unit, own, tried_beside))
+        tried_beside = (*_commands(case, place.command), *positions, *common)
+        acting.append(_Acts("force", "machine", at, place.name, place.unit, of_place, tried_beside))
     for k, (name, unit) in enumerate(zip(names, units, strict=True)):
         acting.append(_Acts("reading", "output", k, name, unit, of_output[k], common))
     return tuple(acting)

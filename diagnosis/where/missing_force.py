@@ -428,8 +428,8 @@ def _whitening(responses: Real, force_rms: Real, weights: Real, step: int) -> Wh
     if not len(responses):
         return Whitening(np.zeros((len(weights) * outputs, 0)), np.zeros(0))
     rows = (len(weights) - 1) * step + 1
-    most = max(_MOST_FORCES // len(responses), _FEWEST_FORCES)
-    count = int(np.clip(rows // _ROWS_PER_FORCE, _FEWEST_FORCES, most))
+    most_forces = max(_MOST_FORCES // len(responses), _FEWEST_FORCES)
+    count = int(np.clip(rows // _ROWS_PER_FORCE, _FEWEST_FORCES, most_forces))
     nodes = np.linspace(0, rows - 1, count)
     triangles = np.array([np.interp(np.arange(rows), nodes, row) for row in np.eye(count)]).T
     # What is not explained moves the outputs about as far from each place as from the one that misses most.
