@@ -14,6 +14,7 @@ the first ones of a series are a sample of it.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ import mujoco
 import numpy as np
 from numba import njit
 from scipy.signal import butter, sosfilt
+from scipy.stats import norm
 
 from benchmarks.harness import Print, main, timed
 from diagnosis import PlantCase, PlantExperiment, diagnose
@@ -348,79 +350,144 @@ def _by_equations(number: int) -> bool:
     return number % 2 == 1 and DRIVES[number // 2 % 3] != "servo"
 
 
+# Half a 95 % interval of a normal error, in standard deviations.
+NORMAL_HALF_WIDTH = float(norm.ppf(0.975))
+# Median size of a normal error, in standard deviations.
+NORMAL_MEDIAN_SIZE = float(norm.ppf(0.75))
+# A wrong answer above this was sure.
+SURE = 0.8
+
+
 @dataclass(frozen=True)
 class Answer:
-    """Of one case. off: relative error of the size where it is named; covers: its interval holds the truth;
-    sure: a wrong answer of more than 80 %, a wrong partner counted."""
+    """How one case was answered.
+
+    Attributes
+    ----------
+    line : str
+        For the table.
+    integrator : str
+        Of the machine.
+    is_none : bool
+        Nothing is there.
+    first : bool
+        The effect that is there is the first answer.
+    exact : bool
+        The accepted set is what is there.
+    error : float
+        Relative error of the size, where the effect is named; else nan.
+    covers : bool
+        The 95 % interval of its size holds the truth.
+    standard_errors : float
+        The error in standard deviations as the interval states them; nan without an interval.
+    is_sure_and_wrong : bool
+        A wrong answer of more than 80 %, a wrong partner counted.
+    cpu_s : float
+    """
 
     line: str
     integrator: str
-    none: bool
+    is_none: bool
     first: bool
     exact: bool
-    off: float
+    error: float
     covers: bool
-    sure: bool
+    standard_errors: float
+    is_sure_and_wrong: bool
     cpu_s: float
 
 
 def answer(number: int, seed: int) -> Answer:
+    """Make a case, diagnose it, and compare."""
     truth, case = case_of(number, seed)
-    found, cpu_s = timed(partial(diagnose, case))
-    values = dict(found.rig.parameters)
-    for change in found.repair:
+    diagnosis, cpu_s = timed(partial(diagnose, case))
+    is_none = truth.effect == "none"
+    first = diagnosis.effects[0].name == truth.name
+    exact = diagnosis.combination == (truth.name,)
+    if is_none:
+        exact = diagnosis.verdict == "none"
+
+    # Sizes of the repaired machine: stated values, multiplied or added to.
+    values = dict(diagnosis.rig.parameters)
+    for change in diagnosis.repair:
         size = next(iter(change.values.values()))
         key = change.id.removeprefix("wrong_")
         values[key] = values[key] * size if key in values else size
-    none, key = truth.effect == "none", truth.name.removeprefix("wrong_")
-    first = found.effects[0].name == truth.name
-    exact = found.verdict == "none" if none else found.combination == (truth.name,)
-    off = abs(values.get(key, 0.0)) / truth.value - 1
+    key = truth.name.removeprefix("wrong_")
+    error = math.nan
     covers = False
-    for low, high in found.effects[0].intervals.values() if first and not none else ():
-        stated = case.plant.parameters.get(key, 1.0)
-        covers = min(abs(low), abs(high)) * stated <= truth.value <= max(abs(low), abs(high)) * stated
+    standard_errors = math.nan
+    size_in_words = ""
+    if not is_none:
+        estimate = abs(values.get(key, 0.0))
+        error = abs(estimate / truth.value - 1)
+        size_in_words = f"{truth.value:.4g}, found {100 * (estimate / truth.value - 1):+.1f} %"
+    if first and not is_none and diagnosis.effects[0].intervals:
+        interval = next(iter(diagnosis.effects[0].intervals.values()))
+        # A wrong stated value has a ratio.
+        low, high = sorted(abs(end) * case.plant.parameters.get(key, 1.0) for end in interval)
+        covers = low <= truth.value <= high
+        standard_errors = error * truth.value / ((high - low) / 2) * NORMAL_HALF_WIDTH
+        if covers:
+            size_in_words += " (in its interval)"
+
     source = "equations" if _by_equations(number) else "MuJoCo"
-    size = (
-        "" if none else f"{truth.value:.4g}, found {100 * off:+.1f} %{' (in its interval)' if covers else ''}"
-    )
+    said = ", ".join(diagnosis.combination) or diagnosis.verdict
     line = (
         f"{number:3d} {source:9s} {truth.integrator:12s} {truth.drive:5s} "
-        f"{'moving' if truth.moving else 'rest':6s} "
-        f"{truth.n} {truth.name:26s} {size:42s} -> {', '.join(found.combination) or found.verdict} "
-        f"{found.probability:.3f} (gap {found.gap_refit:.1f} to {found.gap_after:.1f}, {cpu_s:.0f} s)"
+        f"{'moving' if truth.moving else 'rest':6s} {truth.n} {truth.name:26s} {size_in_words:42s} -> {said} "
+        f"{diagnosis.probability:.3f} (gap {diagnosis.gap_refit:.1f} to {diagnosis.gap_after:.1f}, "
+        f"{cpu_s:.0f} s)"
     )
-    sure = not exact and found.probability > 0.8 and found.verdict != "unknown"
-    return Answer(line, truth.integrator, none, first, exact, abs(off), covers, sure, cpu_s)
+    is_sure = diagnosis.probability > SURE and diagnosis.verdict != "unknown"
+    return Answer(
+        line,
+        truth.integrator,
+        is_none,
+        first,
+        exact,
+        error,
+        covers,
+        standard_errors,
+        is_sure and not exact,
+        cpu_s,
+    )
 
 
 def run(out: Print, *, seed: int = 15, first: int = 0, cases: int = 80, jobs: int = 2) -> None:
+    """Diagnose cases in an order that is drawn, so that the first ones are a sample of all; tell."""
     order = np.random.default_rng(seed).permutation(2 * len(KINDS)).tolist()
     numbers = order[first : first + cases]
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        answers = []
+        answers: list[Answer] = []
         try:
-            for one in pool.map(answer, numbers, [seed] * len(numbers)):
-                out(one.line)
-                answers.append(one)
+            for each in pool.map(answer, numbers, [seed] * len(numbers)):
+                out(each.line)
+                answers.append(each)
         except KeyboardInterrupt:  # what there is counts
             pool.shutdown(wait=False, cancel_futures=True)
-    effects = [one for one in answers if not one.none]
-    named = [one for one in effects if one.first]
+
+    effects = [each for each in answers if not each.is_none]
+    named = [each for each in effects if each.first]
     out()
     for name in (*INTEGRATORS, "all"):
-        here = [one for one in effects if name in (one.integrator, "all")]
-        out(
-            f"{name:12s} exact {sum(one.exact for one in here)}, first {sum(one.first for one in here)} of "
-            f"{len(here)}"
-        )
-    alarms = [one for one in answers if one.none and not one.exact]
+        here = [each for each in effects if name in (each.integrator, "all")]
+        exact = sum(each.exact for each in here)
+        first_right = sum(each.first for each in here)
+        out(f"{name:12s} exact {exact}, first {first_right} of {len(here)}")
+    alarms = [each for each in answers if each.is_none and not each.exact]
     out(f"first answer right: {len(named)} of {len(effects)}")
     out(f"false alarms: {len(alarms)} of {len(answers) - len(effects)}")
-    out(f"size of those named first: median error {100 * float(np.median([o.off for o in named])):.1f} %")
-    out(f"interval holds the truth: {sum(one.covers for one in named)} of {len(named)}")
-    out(f"sure and wrong: {sum(one.sure for one in answers)} of {len(answers)}")
-    out(f"CPU: median {float(np.median([one.cpu_s for one in answers])):.0f} s")
+    if named:
+        out(
+            f"size of those named first: median error {100 * np.median([each.error for each in named]):.1f} %"
+        )
+        out(f"interval holds the truth: {sum(each.covers for each in named)} of {len(named)}")
+        # The spread is the median of the sizes in that of a standard normal error.
+        spread = np.nanmedian([each.standard_errors for each in named]) / NORMAL_MEDIAN_SIZE
+        out(f"interval width over the spread of the errors: {1 / spread:.2f}")
+    out(f"sure and wrong: {sum(each.is_sure_and_wrong for each in answers)} of {len(answers)}")
+    out(f"CPU: median {np.median([each.cpu_s for each in answers]):.0f} s")
 
 
 if __name__ == "__main__":

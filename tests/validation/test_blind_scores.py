@@ -153,6 +153,27 @@ def test_phases_are_compared_the_short_way_round():
     assert rows["parameter error"]["p90"] < 0.05
 
 
+def test_intervals_of_normal_errors_are_as_wide_as_the_errors_spread():
+    rng = np.random.default_rng(6)
+    for stated_over_true in (1.0, 3.0):
+        said, true = [], []
+        for k in range(400):
+            deviation = rng.uniform(0.01, 0.2)
+            estimate = 1.0 + deviation * rng.normal()
+            answer = _said(str(k), "effect", [("gravity", 0.9)])
+            half_width = 1.96 * stated_over_true * deviation
+            answer["effects"][0]["parameters"] = {"acceleration_m_s2": estimate}
+            answer["effects"][0]["intervals"] = {
+                "acceleration_m_s2": [estimate - half_width, estimate + half_width]
+            }
+            said.append(answer)
+            true.append(_true(str(k), "effect", [GRAVITY]))
+        rows = scores(said, true)["table"]["all"]
+        ratio = rows["95 % intervals, width over spread of errors"]["value"]
+        # A median of 400 normal sizes is uncertain by 6 %.
+        assert ratio == pytest.approx(stated_over_true, rel=0.18)
+
+
 def test_a_calibrated_answer_has_little_calibration_error():
     rng = np.random.default_rng(5)
     said, true = [], []

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import binomtest
+from scipy.stats import binomtest, norm
 
 from plant.effects import EFFECTS
 
@@ -39,7 +39,7 @@ def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str
     accepted: the effects that were; answer: these, or the verdict. probability: of the first answer; a
     document that gives none for it is taken to be sure. first_is_right: the word is; with several effects,
     any of them. all_right: verdict and exact set. top_1, top_2: the true effect is among the first answers.
-    errors, covered: of every parameter of an effect that was rightly accepted, see `_off`.
+    errors, covered, standard_errors: of every parameter of an effect that was rightly accepted, see `_off`.
     """
     names = [str(effect["name"]) for effect in true.get("effects", ())]
     kind = str(true["verdict"])
@@ -85,6 +85,11 @@ def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str
         ],
         "covered": [
             _inside(key, value, estimate, interval)
+            for key, value, effect, estimate in matches
+            if (interval := (effect.get("intervals") or {}).get(key)) is not None and None not in interval
+        ],
+        "standard_errors": [
+            _standard_error(key, value, estimate, interval)
             for key, value, effect, estimate in matches
             if (interval := (effect.get("intervals") or {}).get(key)) is not None and None not in interval
         ],
@@ -162,6 +167,7 @@ def _rows(cases: pd.DataFrame) -> dict[str, Any]:
         "two effects, first is one of them": _share(several.first_is_right),
         "verdict and set right, every case": _share(cases.all_right),
         "95 % intervals cover": _share(chain(*listed.covered)),
+        "95 % intervals, width over spread of errors": _width_over_spread(chain(*listed.standard_errors)),
         "confident and wrong (p > 0.8)": _share((cases.probability > CONFIDENT) & ~cases.first_is_right),
         "parameter error": _spread(chain(*listed.errors)),
         "parameter error, ratio >= 3": _spread(chain(*clear.errors)),
@@ -206,6 +212,22 @@ def _error(key: str, value: float, estimate: float) -> float:
 def _inside(key: str, value: float, estimate: float, interval: Sequence[float]) -> bool:
     low, high = (_off(key, estimate, float(end)) for end in interval)
     return low <= _off(key, estimate, value) <= high
+
+
+def _standard_error(key: str, value: float, estimate: float, interval: Sequence[float]) -> float:
+    """Error in standard deviations as a 95 % interval states them; infinite for an interval without width."""
+    half_width = abs(_off(key, float(interval[0]), float(interval[1]))) / 2
+    return abs(_off(key, value, estimate)) / half_width * norm.ppf(0.975) if half_width else math.inf
+
+
+def _width_over_spread(standard_errors: Iterable[float]) -> dict[str, Any]:
+    """How many times wider intervals are than errors spread: 1 for a normal error that is stated rightly.
+
+    The spread is the median of the sizes, in that of a standard normal error (.674).
+    """
+    sizes = list(standard_errors)
+    typical = float(np.median(sizes)) if sizes else math.nan
+    return {"value": norm.ppf(0.75) / typical if typical else math.inf, "count": len(sizes)}
 
 
 def _closed(said: Document, true: Document) -> float | None:
