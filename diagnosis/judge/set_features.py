@@ -71,7 +71,7 @@ class EffectFeatures:
         Of the motion, what the effect carries.
     interests : float
         Probability that the effect is one that interests: it carries more than the stated model error, or it
-        is a stated value that is far off.
+        is a stated value that is far off. Where nobody has stated a model error every size interests.
     by_name : float
         Probability that it is that effect only by its name: the records do not show what makes it this one.
     features : (6,) tuple of float
@@ -193,7 +193,7 @@ def features_of_effects(
     effects = []
     for place, name in enumerate(explanation.names):
         share = shares[name]
-        interests = _exceeds(share, weighing.model_error)
+        interests = _exceeds(share, weighing.model_error) if weighing.stated else 1.0
         by_name = is_none_but_by_name(search, explanation, place)
         tolerances_off = _tolerances_off(search, explanation, place)
         if tolerances_off is None:

@@ -82,14 +82,15 @@ def all_of(model):
 def test_the_fit_recovers_the_coefficients_that_drew_the_truth():
     rng = np.random.default_rng(1)
     cases = [drawn_case(rng) for _ in range(3000)]
-    found = fitted(cases)
+    # The share of unlisted causes as it was drawn: another one is another truth.
+    found = fitted(cases, unlisted_share=None)
 
     def rms_error(model):
         return np.sqrt(np.mean((all_of(model) - all_of(TRUTH)) ** 2))
 
     # 3000 cases tell a coefficient to about .15.
     assert rms_error(found) < 0.25 < 0.5 < rms_error(start_model())
-    data = TrainingData(cases)
+    data = TrainingData(cases, unlisted_share=None)
     assert data.loss(found) < data.loss(TRUTH) + 1e-3 < data.loss(start_model())
 
 
@@ -116,6 +117,16 @@ def test_kinds_of_machines_count_the_same_however_many_cases_they_have():
     assert together == pytest.approx((TrainingData(few).loss(TRUTH) + TrainingData(many).loss(TRUTH)) / 2)
     with pytest.raises(ValueError, match="no cases to fit to"):
         fitted([])
+
+
+def test_more_cases_with_unlisted_causes_make_them_no_more_probable():
+    rng = np.random.default_rng(4)
+    cases = [drawn_case(rng) for _ in range(40)]
+    unlisted = [case for case in cases if case.has_unlisted]
+    assert 0 < len(unlisted) < len(cases)
+    assert TrainingData([*cases, *unlisted]).loss(TRUTH) == pytest.approx(TrainingData(cases).loss(TRUTH))
+    as_made = [TrainingData(each, None).loss(TRUTH) for each in (cases, [*cases, *unlisted])]
+    assert as_made[0] != pytest.approx(as_made[1])
 
 
 def test_stored_coefficients_have_the_features_of_the_judge_and_come_back(monkeypatch, tmp_path):
