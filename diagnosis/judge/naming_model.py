@@ -1,6 +1,6 @@
 """From what fitted sets of effects leave to probabilities: a small model fitted to diagnoses of known truth.
 
-Three logistic forms with eleven coefficients stand between what a search has fitted and what is said:
+Three logistic forms with ten coefficients stand between what a search has fitted and what is said:
 
 - A set of effects S has the probability exp(f(S) . a + log prior(S)), normalised over the fitted sets
   (conditional logit, McFadden 1974), mixed with the share of the repairs that are this set.
@@ -48,7 +48,7 @@ class NamingModel:
     ----------
     of_set : (3,) array
         a, in the order of `SET_FEATURES`.
-    of_effect : (6,) array
+    of_effect : (5,) array
         b, in the order of `EFFECT_FEATURES`.
     of_rest : (2,) array
         c, in the order of `REST_FEATURES`.

@@ -48,7 +48,6 @@ _CONSTANT = 1e-3
 SET_FEATURES = ("log_evidence_behind", "evidence_behind", "left_beyond_model_error")
 EFFECT_FEATURES = (
     "added",
-    "added_share_to_model_error",
     "added_share_to_left",
     "value",
     "value_beside_left",
@@ -74,7 +73,7 @@ class EffectFeatures:
         is a stated value that is far off. Where nobody has stated a model error every size interests.
     by_name : float
         Probability that it is that effect only by its name: the records do not show what makes it this one.
-    features : (6,) tuple of float
+    features : (5,) tuple of float
         In the order of `EFFECT_FEATURES`. An effect that is added and a stated value that is wrong have
         features of their own, zero for the other kind.
     """
@@ -197,13 +196,12 @@ def features_of_effects(
         by_name = is_none_but_by_name(search, explanation, place)
         tolerances_off = _tolerances_off(search, explanation, place)
         if tolerances_off is None:
-            to_model_error = _log_ratio(share, weighing.model_error, _LOG_RATIO_LIMIT)
             to_left = _log_ratio(share, left, _LOG_RATIO_LIMIT)
-            features = (1.0, to_model_error, to_left, 0.0, 0.0, 0.0)
+            features = (1.0, to_left, 0.0, 0.0, 0.0)
         else:
             # What a wrong value changes, the others imitate within their tolerances: its share tells little.
             off = _log_ratio(tolerances_off, _FAR_OFF_TOLERANCES, _LOG_TOLERANCES_LIMIT)
-            features = (0.0, 0.0, 0.0, 1.0, left_beyond_model_error, off)
+            features = (0.0, 0.0, 1.0, left_beyond_model_error, off)
             interests = max(interests, _exceeds(tolerances_off, _FAR_OFF_TOLERANCES))
             interests *= _exceeds(tolerances_off, _NEAR_TOLERANCES)
         is_listed = name in weighing.listed and explanation.fit.effects[place].as_listed

@@ -26,7 +26,7 @@ from diagnosis.judge.set_features import EFFECT_FEATURES, SET_FEATURES, EffectFe
 LISTED = ("friction", "lag", "spring")
 TRUTH = NamingModel(
     np.array([1.2, 0.4, -1.8]),
-    np.array([0.8, 1.0, 0.4, -0.7, -1.8, 1.2]),
+    np.array([0.8, 0.4, -0.7, -1.8, 1.2]),
     np.array([-0.3, 1.2]),
 )
 
