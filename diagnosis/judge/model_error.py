@@ -59,7 +59,9 @@ def looked_at_again(
             return answer
     in_windows = BesideModelError(search.run_in_time(), rng)
     again = in_windows.answer(rng)
-    if in_windows.names_something and again.combination and not named < set(again.combination):
+    # What windows only add is what free runs deny; where these name nothing, windows are all there is.
+    only_add = bool(named) and named < set(again.combination)
+    if in_windows.names_something and again.combination and not only_add:
         return again
     return answer
 

@@ -91,6 +91,7 @@ def test_an_effect_is_sized_in_windows_beside_a_drift_nobody_lists(
     assert value == pytest.approx(size, rel=0.25)
     assert answer.completeness.probability > 0.5
     assert answer.shares.horizon_samples
+    assert answer.shares.in_windows
 
 
 def _bar(bias_V):
