@@ -1,0 +1,178 @@
+"""Facts of a result, worded once: a terminal, a page, the JSON answer and a study show the same `Row`.
+
+A function of `workflow.describe` makes a `Section` of rows from the typed values of a result. Rules that
+decide (met or missed, worth a remark or not) stand in such a function or below it, never in a renderer.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from ident.data.finding import Finding
+from workflow.text.formats import at_least, at_most, interval, number, unit as with_unit
+
+# Digits of a number where its fact asks for no others: what a drawing or a data sheet gives.
+USUAL_DIGITS = 3
+
+
+class Verdict(Enum):
+    """Whether a fact is as it was required."""
+
+    NONE = "none"  # nothing was required of it
+    MET = "met"
+    MISSED = "missed"
+    DOUBTFUL = "doubtful"
+
+
+class Bound(Enum):
+    """What a number says of the value behind it."""
+
+    VALUE = "value"
+    AT_LEAST = "at least"  # shown rounded down
+    AT_MOST = "at most"  # shown rounded up
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """The value of a fact, as text for people and as plain data for programs.
+
+    Attributes:
+        text: As people read it, unit included.
+        plain: As JSON holds it: a number in `unit`, [low, high], text, a list or a mapping; None for "not
+            known" or "never".
+        unit: Of the number or the interval; "" for words and pure numbers.
+    """
+
+    text: str
+    plain: Any
+    unit: str = ""
+
+    @classmethod
+    def of(
+        cls,
+        value: float | None,
+        unit: str = "",
+        *,
+        digits: int = USUAL_DIGITS,
+        bound: Bound = Bound.VALUE,
+        missing: str = "never",
+    ) -> Quantity:
+        """A number with its unit.
+
+        Args:
+            value: In `unit`; None where there is none.
+            unit: As it stands behind the number.
+            digits: Significant digits.
+            bound: A bound is rounded to its safe side, so that what the text says holds.
+            missing: The text of None.
+        """
+        if value is None:
+            return cls(missing, None, unit)
+        rounded = {Bound.VALUE: number, Bound.AT_LEAST: at_least, Bound.AT_MOST: at_most}[bound]
+        text = with_unit(rounded(value, digits), unit)
+        if bound is Bound.AT_LEAST:
+            text = f"at least {text}"
+        if bound is Bound.AT_MOST:
+            text = f"at most {text}"
+        return cls(text, float(value) if math.isfinite(value) else None, unit)
+
+    @classmethod
+    def between(cls, low: float, high: float, unit: str = "", *, digits: int | None = None) -> Quantity:
+        """An interval; digits: significant ones, None: two digits of its width."""
+        return cls(with_unit(interval((low, high), digits), unit), [float(low), float(high)], unit)
+
+    @classmethod
+    def words(cls, text: str) -> Quantity:
+        """What is no number."""
+        return cls(text, text)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fact of a result.
+
+    Attributes:
+        key: Its place in the JSON answer and in a study, dots between levels: "certificate.modulus_margin".
+            "" for a fact that programs read elsewhere.
+        name: As people call it, in lower case: "modulus margin".
+        value: Number with unit, interval or words.
+        remark: What to know beside it: "required: 0.5; smallest at 2.28 Hz".
+        verdict: Whether it is as required.
+    """
+
+    key: str
+    name: str
+    value: Quantity
+    remark: str = ""
+    verdict: Verdict = Verdict.NONE
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A drawing of `workflow.figures` by its name, with what it is drawn of and its caption."""
+
+    drawing: str
+    caption: str
+    subjects: tuple[Any, ...] = ()
+    file: str = ""  # tells two pictures of one drawing apart
+
+
+@dataclass(frozen=True)
+class Section:
+    """What there is to say of one subject, in the order of importance.
+
+    Attributes:
+        title: The subject: "closed loop".
+        rows: Facts that everybody sees.
+        pictures: Drawn when the page shows them.
+        notes: What was found and is no number; each says itself.
+        parts: Folded on a page; on a terminal with --verbose only.
+    """
+
+    title: str
+    rows: tuple[Row, ...] = ()
+    pictures: tuple[Picture, ...] = ()
+    notes: tuple[Finding, ...] = ()
+    parts: tuple[Section, ...] = ()
+
+    def all_rows(self) -> Iterator[Row]:
+        """Rows of the section and of its parts, depth first."""
+        yield from self.rows
+        for part in self.parts:
+            yield from part.all_rows()
+
+
+def answer(sections: Sequence[Section]) -> dict[str, Any]:
+    """Rows by key, nested at the dots, as a JSON answer holds them.
+
+    Raises:
+        ValueError: Two rows have one key, or a key is also the beginning of another: one would hide the
+            other.
+    """
+    nested: dict[str, Any] = {}
+    for section in sections:
+        for row in section.all_rows():
+            if row.key:
+                _put(nested, row)
+    return nested
+
+
+def _put(nested: dict[str, Any], row: Row) -> None:
+    *levels, last = row.key.split(".")
+    place = nested
+    for level in levels:
+        place = place.setdefault(level, {})
+        if not isinstance(place, dict):
+            raise ValueError(f"the key {row.key!r} begins with the key of another row")
+    if last in place:
+        raise ValueError(f"two rows have the key {row.key!r}")
+    place[last] = row.value.plain
+
+
+def by_key(sections: Sequence[Section]) -> Mapping[str, Row]:
+    """Rows that have a key, by it: for the columns of a study and for Python."""
+    return {row.key: row for section in sections for row in section.all_rows() if row.key}
