@@ -35,6 +35,12 @@ from plant.machine import OFF_AXIS
 
 # Effects that are numbers of a joint in MJCF: frictionloss, damping, damping[1], stiffness, stiffness[2].
 _IN_MJCF = ("coulomb_friction", "viscous_friction", "quadratic_drag", "spring", "hardening_spring")
+# Warnings after which MuJoCo goes on from the model's reference state.
+_OF_A_RUNAWAY = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
 # Fields of dry friction that a frictionloss can be, if it changes from step to step.
 _AS_FRICTIONLOSS = {"coulomb", "excess", "stribeck_velocity", "load"}
 
@@ -128,12 +134,13 @@ def sensed_under(joints: tuple[JointForces, ...], model: Any, data: Any, control
     joints : tuple of JointForces
     model, data : MjModel, MjData
         As the record begins. The model is as before when this returns.
-    control : (N, U)
-        Commands of the steps.
+    control : (N, NU)
+        Commands of all actuators of the model, tracking included, of N steps.
 
     Returns
     -------
     (N, S)
+        Numbers of all sensors; not finite from the step on in which the trial runs away.
     """
     stated_level = np.array(model.dof_frictionloss)
     dry = [(joint.dof, joint.forces.dry) for joint in joints if joint.forces.dry != DryFriction()]
@@ -151,10 +158,22 @@ def sensed_under(joints: tuple[JointForces, ...], model: Any, data: Any, control
             data.qfrc_applied[dof] = smooth_force(table, data.qpos[position], data.qvel[dof])
         data.ctrl[:] = command
         mujoco.mj_step(model, data)
+        if ran_away(data):
+            readings[k:] = np.nan
+            break
         readings[k] = data.sensordata
     model.dof_frictionloss[:] = stated_level
     data.qfrc_applied[:] = 0.0
     return readings
+
+
+def ran_away(data: Any) -> bool:
+    """Whether MuJoCo met a position, speed or acceleration that is infinite, no number or beyond its limits.
+
+    It then sets the state back to the model's reference and goes on: what follows is finite, and of another
+    trial.
+    """
+    return any(data.warning[warning].number > 0 for warning in _OF_A_RUNAWAY)
 
 
 def _number(model: Any, name: str) -> Real | None:

@@ -317,28 +317,35 @@ class MujocoModel:
     def reaches(self) -> dict[str, tuple[float, str]]:
         """Command of a servo, or output of a measured joint -> its largest size, and its unit.
 
-        That is the end of the joint's range, of an output as its sensor reads it. Of a joint without one it
-        is infinite, but for a joint that a servo turns: that goes no more than once round.
+        That is the end of the joint's range, of a command through the servo's gear, of an output as its
+        sensor reads it. Of a joint without a range it is infinite, but for a hinge that a servo turns: that
+        goes no more than once round.
         """
-        # A servo's force is kp (command - position): its bias by the position is the gain with a minus.
-        joint_of_servo = {}
-        for actuator in self.spec.actuators:
-            if actuator.biasprm[1] == -actuator.gainprm[0] != 0:
-                joint_of_servo[actuator.name] = actuator.target
+        # A servo's force is kp (command - gear position): its bias by the position is the gain with a minus.
+        servos = {
+            actuator.name: actuator
+            for actuator in self.spec.actuators
+            if actuator.biasprm[1] == -actuator.gainprm[0] != 0
+        }
+        joint_of_servo = {name: servo.target for name, servo in servos.items()}
         joint_of_output = {self.outputs[joint.column]: joint.name for joint in self.tracked}
         units = {joint: self.units[output] for output, joint in joint_of_output.items()}
         reaches = {}
         for name, joint in {**joint_of_servo, **joint_of_output}.items():
             if joint not in units:
                 continue
-            limits = np.array(self.nominal.joint(joint).range)
-            if not np.any(limits):
-                end = _WHOLE_TURN_RAD if joint in joint_of_servo.values() else np.inf
-                limits = np.array([-end, end])
+            ends = np.array(self.nominal.joint(joint).range)
+            if not np.any(ends):
+                is_hinge = self.nominal.joint(joint).type == mujoco.mjtJoint.mjJNT_HINGE
+                is_turned = is_hinge and joint in joint_of_servo.values()
+                end = _WHOLE_TURN_RAD if is_turned else np.inf
+                ends = np.array([-end, end])
             if name in joint_of_output:
                 gain, offset = self.gain_and_offset(name)
-                limits = gain * limits + offset
-            reaches[name] = (float(np.max(np.abs(limits))), units[joint])
+                ends = gain * ends + offset
+            else:
+                ends = servos[name].gear[0] * ends
+            reaches[name] = (float(np.max(np.abs(ends))), units[joint])
         return reaches
 
     def number(self, name: str, without: float) -> float:

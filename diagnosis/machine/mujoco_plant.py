@@ -208,6 +208,11 @@ class MujocoArm(MujocoModel):
         -------
         Plant
             Quantities that do not show in the first records are exact if stated, else left out.
+
+        Raises
+        ------
+        ValueError
+            One line: in a record the model as stated runs away.
         """
         quantities = {}
         for name, quantity in self.quantities(experiments).items():
@@ -215,6 +220,13 @@ class MujocoArm(MujocoModel):
                 quantities[name] = quantity
         simulation = MujocoSimulation(self, quantities, noise)
         stated = simulation.parameters
+        for experiment in experiments:
+            if not np.all(np.isfinite(simulation(stated, {}, experiment.input))):
+                raise ValueError(
+                    f"experiment {experiment.name}: the model as stated runs away (MuJoCo meets an infinite "
+                    "position, speed or acceleration): check the timestep, units of the commands, and stiff "
+                    "or negative springs"
+                )
         tolerances = {}
         for name in stated:
             usual = TOLERANCES.get(name.rpartition(".")[2], _OTHER_TOLERANCE)

@@ -28,7 +28,7 @@ from diagnosis.machine.mujoco_edits import (
     put_component,
     put_gain,
 )
-from diagnosis.machine.mujoco_forces import JointForces, sensed_under
+from diagnosis.machine.mujoco_forces import JointForces, ran_away, sensed_under
 from diagnosis.machine.mujoco_model import MujocoModel
 from diagnosis.machine.own_plant import PlantExperiment
 from diagnosis.machine.plant_effect import PlantEffect
@@ -682,14 +682,23 @@ def _wind(model: Any, data: Any, command: Real) -> None:
 
 
 def _sensed(model: Any, data: Any, control: Real) -> Real:
-    """(N, numbers) what sensors read at the beginning of N steps under their commands, control (N, NU)."""
+    """(N, numbers) what sensors read at the beginning of N steps under their commands, control (N, NU).
+
+    Not finite from where the trial runs away.
+    """
     joints = JointForces.of_model(model)
     if joints:
         return sensed_under(joints, model, data, control)
     state = np.zeros(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))
     mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
-    _, readings = rollout.rollout(model, data, state[None], control[None])
-    return np.asarray(readings[0])
+    _, rollouts = rollout.rollout(model, data, state[None], control[None])
+    readings = np.array(rollouts[0])
+    if ran_away(data):
+        # A rollout ends there and repeats its last row.
+        changes = np.flatnonzero(np.any(np.diff(readings, axis=0) != 0, axis=1))
+        last_change = changes[-1] if changes.size else -1
+        readings[last_change + 1 :] = np.nan
+    return readings
 
 
 def _rms(signals: Real) -> Real:

@@ -91,6 +91,48 @@ def test_a_joint_is_where_its_sensor_says_whatever_the_sensor_s_gain_and_offset(
     assert arm.reaches["hinge"][0] == pytest.approx(np.max(np.abs(ends)))
 
 
+@pytest.mark.parametrize(
+    ("joint", "servo", "command", "reading"),
+    [
+        ("hinge", 'kp="5"', 2 * np.pi, np.inf),
+        ("hinge", 'kp="5" gear="3"', 6 * np.pi, np.inf),
+        ("hinge", 'kp="5" gear="3"', 1.5, 0.5),
+        ("slide", 'kp="5"', np.inf, np.inf),
+    ],
+)
+def test_a_servo_reaches_through_its_gear_and_only_a_hinge_goes_once_round(joint, servo, command, reading):
+    limits = f'type="{joint}"' if joint == "slide" else ""
+    if reading < np.inf:
+        limits += f' range="0 {np.rad2deg(reading)}"'
+    text = ROD.replace("<motor", f"<position {servo}").replace('damping="0.2"', f'{limits} damping="0.2"')
+    reaches = arm_of(text).reaches
+    assert reaches["motor"][0] == pytest.approx(command)
+    # A reading without a range is that of a servo's joint: once round where that turns.
+    once_round = 2 * np.pi if joint == "hinge" else np.inf
+    assert reaches["hinge"][0] == pytest.approx(min(reading, once_round))
+
+
+@pytest.mark.parametrize("force", ["", '<numeric name="hinge.cogging" data="0.01 20 0"/>'])
+def test_a_trial_that_runs_away_is_not_finite_from_there_on(force):
+    """MuJoCo sets it back and goes on, with and without a force of ours that is held over a step."""
+    soft = '<joint name="hinge" stiffness="1"'
+    text = ROD.replace('<joint name="hinge"', soft).replace("<custom>", f"<custom>{force}")
+    plant, inputs = plant_of(arm_of(text))
+    outputs = plant.untracked({**plant.parameters, "hinge.stiffness": -1e5}, {}, inputs)[:, 0]
+    first_bad = int(np.argmin(np.isfinite(outputs)))
+    assert 0 < first_bad < 20
+    assert not np.any(np.isfinite(outputs[first_bad:]))
+
+
+@pytest.mark.parametrize("model_error", [0.0, 0.05])
+def test_a_model_that_runs_away_as_stated_is_refused(model_error):
+    arm = arm_of(ROD.replace('damping="0.2"', 'damping="0.2" stiffness="-1e5"'))
+    torque = steps()
+    measured = PlantExperiment("push", "estimation", np.column_stack([torque, torque]), torque[:, None])
+    with pytest.raises(ValueError, match="experiment push: the model as stated runs away"):
+        arm.plant((measured,), np.array([1e-4]), model_error=model_error)
+
+
 @pytest.mark.long
 def test_a_force_limit_that_is_stated_wrong_is_named():
     limit, stated = 0.7, 0.35
