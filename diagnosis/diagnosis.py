@@ -124,7 +124,8 @@ def _unstated(case: PlantCase, answer: Diagnosis) -> tuple[str, ...]:
         return ()
     remains = answer.completeness.most
     usual = case.machine.weighing.model_error
-    if not remains < usual:
+    # Zero is the completeness of an answer whose effects were not all tried: nothing was measured.
+    if not 0 < remains < usual:
         return ()
     return (
         f"model_error is unspecified, and {100 * remains:.2g} % of the motion remains, more than noise. If a"

@@ -78,7 +78,8 @@ def difference_quotients(
 def solve_or_least_squares(matrix: Real, right: Real) -> Real:
     """x (M,) of matrix x = right; the smallest least-squares solution where the matrix (M, M) is singular.
 
-    It becomes so where a trial ran away and everything else is lost in rounding.
+    It becomes so where a trial ran away and everything else is lost in rounding. Raises
+    `numpy.linalg.LinAlgError` where a number of the matrix is not finite.
     """
     try:
         return np.asarray(np.linalg.solve(matrix, right))

@@ -53,7 +53,8 @@ _NEAR_POINTS = 9
 # Changes of the logarithm of a parameter that a scan tries where contacts switch: 8 % to a factor of 20, each
 # two or three times the last.
 _FAR_CHANGES = np.array([-3.0, -2.0, -1.2, -0.6, -0.25, -0.08, 0.08, 0.25, 0.6, 1.2, 2.0, 3.0])
-# Options of `descend` that lead to an end, along flat valleys too.
+# Options of `descend` that lead to an end, along flat valleys too: four times the usual iterations, and a
+# gain that is a hundredth of what `SUBSTANTIAL` asks of a difference between sets.
 FINE: dict[str, Any] = {"iterations": 40, "tolerance": 0.02}
 # Iterations after which the Jacobian by the deviations, of the nominal or of a point nearby, is looked at
 # again, and the number of deviations from which on that is worth a simulation.
@@ -312,7 +313,8 @@ def descend(
     Parameters
     ----------
     records : RecordsToFit
-        Simulates, P + A times an iteration and once for every step that is tried.
+        Simulates A times an iteration and once for every step that is tried; P times more where derivatives
+        by the nominal values are made anew (at first unless given, then where they have changed).
     candidates : sequence of Candidate
         Effects to be fitted.
     deviations : (P,) array
@@ -326,9 +328,11 @@ def descend(
     columns : StartColumns, optional
         Derivatives by the start at a point nearby; renewed once on the way.
     iterations : int
-        At most, at least 1.
+        At most, at least 1. Ten reach the neighbourhood of an end, which is what sets are ranked by; `FINE`
+        goes to the end.
     tolerance : float
-        A gain of the loss below it ends the descent.
+        A gain of the loss below it ends the descent. Half a nat is a fourth of what `SUBSTANTIAL` asks of a
+        difference between sets.
     touching : bool
         Starts feel contacts (`RecordsToFit.start_columns`).
     moved : (P,) bool array, optional

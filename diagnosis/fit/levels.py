@@ -186,7 +186,11 @@ class Levels:
         return np.asarray(np.bincount(self.band, e * e, minlength=self.floor.size), dtype=np.float64)
 
     def of_record(self, part: slice) -> Levels:
-        """Bands of one record by the place of its coefficients among the N, which it has for itself."""
+        """Bands of one record, which it has for itself.
+
+        part : place of all its coefficients among the N; of a part of a record bands would be cut, and
+        their energies too small.
+        """
         band = self.band[part]
         bands = slice(int(band.min()), int(band.max()) + 1)
         output_of_band = self.output_of_band[bands]

@@ -159,12 +159,17 @@ class RecordsToFit:
         effects : sequence
             With their sizes.
         start : FittedStart
-            Of these records.
+            Of these records, one row of states each.
+
+        Raises
+        ------
+        ValueError
+            Starts of another number of records.
         """
         simulate = self.nominal.at(deviations).simulator(effects)
         return [
             self._residuals_of_record(simulate, r, states, start.zeros)
-            for r, states in enumerate(start.states)
+            for r, states in zip(range(len(self.experiments)), start.states, strict=True)
         ]
 
     def _residuals_of_record(self, simulate: Callable[..., Real], r: int, states: Real, zeros: Real) -> Real:

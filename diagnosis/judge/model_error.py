@@ -35,9 +35,13 @@ def looked_at_again(
 ) -> Diagnosis:
     """The answer of a machine that does not forget its inputs, from windows where a free run says less.
 
-    Windows are not looked at where the records leave no gap that interests, nor where the first answer leaves
-    none, in them either; they are not taken where they only add to what was named, nor where evidence in
-    windows names nothing.
+    The answer of the free run is returned, in this order, where
+
+    1. it names nothing, not even an unknown cause, the machine is a rig, or it forgets its inputs;
+    2. the named effects leave less than the model error within windows too;
+    3. evidence in windows names nothing, or only adds to what the free run named.
+
+    Otherwise the answer from windows is.
     """
     first = judge.search
     answer = judge.answer(rng)

@@ -122,10 +122,12 @@ def better_nominal(search: Search) -> Explanation:
 
 
 def look_closer(search: Search, nominal: Explanation) -> None:
-    """Fit what is near the most probable sets, until nothing new is found or the time is up.
+    """Fit what is near the most probable sets: at most `FOLLOWED_SETS` rounds, fewer where one finds nothing
+    new. Time is asked once a round, so that the last one may end late.
 
-    Sets that are nearly as probable as the best are fitted with an effect exchanged for another one and with
-    a simpler one, the best one without each of its effects.
+    Sets within `SUBSTANTIAL` (2 nats, a factor of 7) of the best are fitted with an effect exchanged for
+    another one and with a simpler one, the best one without each of its effects. An effect that is likelier
+    there than not (.5) is not exchanged.
 
     Parameters
     ----------

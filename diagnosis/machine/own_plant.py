@@ -81,7 +81,7 @@ def place_of(error: BaseException, file: str = "") -> str:
     """
     frames = traceback.extract_tb(error.__traceback__)[1:]
     package = str(Path(__file__).parent)
-    called = [frame for frame in frames if not frame.filename.startswith(package)]
+    called = [frame for frame in frames if str(Path(frame.filename).parent) != package]
     if not called:
         return ""
     of_file = [frame for frame in called if frame.filename == (file or called[0].filename)]
@@ -90,7 +90,7 @@ def place_of(error: BaseException, file: str = "") -> str:
     return f" ({Path(of_file[-1].filename).name}, line {of_file[-1].lineno})"
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
     """Whether a value is a finite number, of Python or NumPy."""
     return isinstance(value, (int, float, np.integer, np.floating)) and bool(np.isfinite(value))
 
@@ -163,12 +163,12 @@ class Plant:
         if self.model_error is not None and not self.model_error >= 0:
             raise ValueError(f"plant: model_error must not be negative; got {self.model_error}")
         for key, value in self.parameters.items():
-            if not _is_number(value):
+            if not is_number(value):
                 raise ValueError(f"plant: parameter {key} must be a finite number; got {value!r}")
         for key, tolerance in self.tolerances.items():
             if key not in self.parameters:
                 raise ValueError(f"plant: tolerance of {key}, which is no parameter of it")
-            if not _is_number(tolerance) or not 0 < tolerance <= _LARGEST_TOLERANCE:
+            if not is_number(tolerance) or not 0 < tolerance <= _LARGEST_TOLERANCE:
                 raise ValueError(
                     f"plant: tolerance of {key} must be between 0 and 10 (a share of the value); "
                     f"got {tolerance!r}"

@@ -98,12 +98,19 @@ class PlantEffect:
         return replace(self, parameters=tuple(p.at(magnitudes) for p in self.parameters))
 
     def candidates(self) -> tuple[Candidate, ...]:
-        """Search spaces of the effect: one, of both signs or sides of a ratio two."""
+        """Search spaces of the effect: one; two of both signs, or of both sides of a ratio.
+
+        Below one a ratio has none where the tolerance of its stated value explains every smaller ratio.
+        """
         if self.multiplies:
+            # Of a ratio the ends stand for something else: the tolerance of the stated value, and the
+            # largest ratio (`wrong_values`).
+            ratio = self.parameters[0]
+            sides = ratio_candidates(self, tolerance=ratio.low, largest=ratio.high)
             # At its end a ratio wants to go on: the value is not the cause, or nowhere near.
             return tuple(
                 replace(side, axes=(replace(side.axes[0], edge="high" if side.grows else "low"),))
-                for side in ratio_candidates(self, self.parameters[0].low, self.parameters[0].high)
+                for side in sides
             )
         return searches(self, self.parameters, signed=self.signed, grows=self.grows)
 

@@ -62,9 +62,10 @@ _SLOWEST_HZ = 1.5
 _FASTEST_HZ = 30.0
 # The same as a share of the Nyquist frequency: a difference of samples is no rate beyond it.
 _OF_NYQUIST = 0.6
-# Lowest frequency that is compared: a drift of a sensor is slower [Hz],
+# Lowest frequency that is compared [Hz]: a drift of a sensor (five seconds and more) is slower. Chosen.
 _DRIFT_HZ = 0.2
-# and so many periods are in the record.
+# Periods of that lowest frequency in the record besides: the taper's main lobe is two bins wide on each side,
+# so that a straight line that was not quite taken off reaches no farther. Chosen.
 _LEAST_PERIODS = 1.5
 # Samples at one value that are a limit, where a sensor repeats values now and then.
 _CLIPPED_ROWS = 5
@@ -320,8 +321,11 @@ def _factor_fault(case: Case, far: dict[str, float], or_voltage: Sequence[str]) 
 
 
 def _speed(signal: Real, dt_s: float, highest_Hz: float) -> Spectrum:
-    """(F,) spectrum of the rate of a signal (T,) less its straight line, tapered: above drift, to a
-    frequency."""
+    """(F,) complex spectrum of the rate of a signal (T,), up to the factor 2 pi i: in the signal's units, Hz.
+
+    The signal less its straight line, tapered. F frequencies from above a sensor's drift, and
+    `_LEAST_PERIODS` periods of the record, to highest_Hz.
+    """
     n = len(signal)
     k = np.linspace(-1.0, 1.0, n)
     line = np.polynomial.polynomial.polyfit(k, signal, 1)

@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 from diagnosis.machine.around import Actuator, Body, Sensor
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.machine_protocol import Real
-from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantExperiment, place_of
+from diagnosis.machine.own_plant import OF_TRIAL, Plant, PlantExperiment, is_number, place_of
 from diagnosis.machine.plant_effect import PlantEffect
 from diagnosis.machine.with_effects import with_effects
 
@@ -28,6 +28,8 @@ USUAL_TOLERANCE = 0.05
 _DEFINED = ("simulate", "PARAMETERS", "INPUTS", "OUTPUTS")
 # What a file calls the step of its simulation, as far as it is a number of seconds.
 _STEP_NAMES = ("DT_S", "dt_s", "DT", "dt", "TS", "Ts", "STEP_S", "step_s")
+# Of a value in an error line, so that the line stays one.
+_SHOWN_CHARACTERS = 60
 
 
 @runtime_checkable
@@ -86,33 +88,42 @@ class PythonFile:
 
     @classmethod
     def read(cls, path: Path) -> PythonFile:
-        """Raises ValueError, one line: a file that ends with an error or lacks a name, values without
-        names."""
-        # For what it imports from beside it.
+        """What a file defines; the file is run, with what it imports from beside it.
+
+        Raises
+        ------
+        ValueError
+            One line: the file ends with an error, lacks a name, or a name holds something else than its kind.
+        """
         folder = str(path.resolve().parent)
         if folder not in sys.path:
             sys.path.append(folder)
         try:
             defined = runpy.run_path(str(path))
         except (Exception, SystemExit) as error:
+            words = " ".join(str(error).split())
             at = place_of(error, str(path))
-            raise ValueError(f"ended with {type(error).__name__}: {error}{at}") from error
+            raise ValueError(f"ended with {type(error).__name__}: {words}{at}") from error
         missing = [key for key in _DEFINED if key not in defined]
         if missing:
             raise ValueError(
                 f"does not define {missing[0]}; expected simulate, PARAMETERS, INPUTS and OUTPUTS"
             )
-        tolerances = defined.get("TOLERANCES", {})
-        for key, values in (("PARAMETERS", defined["PARAMETERS"]), ("TOLERANCES", tolerances)):
-            if not isinstance(values, Mapping):
-                raise ValueError(f'{key} must be name -> number, as {{"mass_kg": 1.2}}; got {values!r}')
+        if not callable(defined["simulate"]):
+            raise ValueError(
+                "simulate must be a function of (parameters, effects, inputs); "
+                f"got {_in_short(defined['simulate'])}"
+            )
+        effects = defined.get("EFFECTS", ())
+        if not isinstance(effects, list | tuple) or not all(isinstance(e, PlantEffect) for e in effects):
+            raise ValueError(f"EFFECTS must be a list of PlantEffect; got {_in_short(effects)}")
         return cls(
             defined["simulate"],
-            defined["PARAMETERS"],
-            tolerances,
-            tuple(defined.get("EFFECTS", ())),
-            _names(defined["INPUTS"]),
-            _names(defined["OUTPUTS"]),
+            _numbers_by_name("PARAMETERS", defined["PARAMETERS"]),
+            _numbers_by_name("TOLERANCES", defined.get("TOLERANCES", {})),
+            tuple(effects),
+            _names("INPUTS", defined["INPUTS"]),
+            _names("OUTPUTS", defined["OUTPUTS"]),
             _named_step(defined),
         )
 
@@ -137,9 +148,29 @@ def _named_step(defined: Mapping[str, Any]) -> float | None:
     return None
 
 
-def _names(names: str | Sequence[str]) -> tuple[str, ...]:
-    """Names as a tuple: one name without a comma behind it is a string."""
-    return (names,) if isinstance(names, str) else tuple(names)
+def _names(key: str, names: object) -> tuple[str, ...]:
+    """Names as a tuple: one name without a comma behind it is a string. Raises ValueError, one line."""
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, list | tuple) or not all(isinstance(name, str) for name in names):
+        raise ValueError(f'{key} must be names of columns, as ["torque_Nm"]; got {_in_short(names)}')
+    return tuple(names)
+
+
+def _numbers_by_name(key: str, values: object) -> Mapping[str, float]:
+    """Values that are name -> number. Raises ValueError, one line."""
+    if not isinstance(values, Mapping) or not all(isinstance(name, str) for name in values):
+        raise ValueError(f'{key} must be name -> number, as {{"mass_kg": 1.2}}; got {_in_short(values)}')
+    for name, value in values.items():
+        if isinstance(value, bool) or not is_number(value):
+            raise ValueError(f"{key}: {name} must be a number; got {_in_short(value)}")
+    return values
+
+
+def _in_short(value: object) -> str:
+    """A value as Python writes it, on one line, cut where it is long."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]} ..."
 
 
 def plant_with_all(

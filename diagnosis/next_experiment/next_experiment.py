@@ -18,6 +18,7 @@ from diagnosis.next_experiment.experiment_choices import (
     tailored_excitations,
     within,
 )
+from plant.rig import Rig
 
 # A pair this many standard deviations apart is settled; an experiment earns nothing by parting it further.
 # Chosen; doubled, one pair that is far apart outweighs two that are not.
@@ -29,7 +30,8 @@ _DECIDED = 0.01
 # Lines of a tailored excitation: enough amplitudes and phases that a handful of free parameters cannot absorb
 # them. Chosen; twice as many share the same voltage.
 _TAILORED_LINES = 12
-# Size of the weak excitations that are tried beside those at the limits.
+# Size of the weak excitations that are tried beside those at the limits: friction weighs three times as much
+# in them, and the motion still stands above the noise of usual sensors. Chosen.
 _WEAK = 1 / 3
 # Power of a line over that of the strongest one below which it is not driven.
 _DRIVEN = 1e-6
@@ -116,8 +118,8 @@ def next_experiment(
     Raises
     ------
     ValueError
-        Fewer than two hypotheses, hypotheses that sample differently or are noise-free, no excitation that
-        stays in the limits.
+        Fewer than two hypotheses, one of a plant of one's own, hypotheses that sample differently or are
+        noise-free, no excitation that stays in the limits.
     """
     competing = tuple(competing)
     _check(competing)
@@ -148,7 +150,7 @@ def next_experiment(
     apart_in_best = np.zeros(0)
     for prospect in prospects:
         # Absorbing parameters only lessen a difference: what cannot win without them need not be computed.
-        if prospect.bound[0] <= best[0]:
+        if prospect.bound <= best:
             break
         apart, _ = prospect.distances(competing)
         score = expected_log_bayes_factor(apart, weights)
@@ -190,6 +192,11 @@ def _check(competing: Sequence[CompetingHypothesis]) -> None:
         raise ValueError(f"an experiment separates at least two hypotheses; got {len(competing)}")
     first = competing[0]
     for hypothesis in competing:
+        if not isinstance(hypothesis.rig, Rig):
+            raise ValueError(
+                f"{hypothesis.name}: excitations are made for a rig's motor; what to record of a plant of "
+                "one's own its diagnosis says (`Diagnosis.next_experiment`)"
+            )
         same_period = hypothesis.rig.sampling.dt_s == first.rig.sampling.dt_s
         if not same_period or not np.array_equal(hypothesis.noise, first.noise):
             raise ValueError("all hypotheses need the same sampling period and sensor noise")

@@ -46,8 +46,9 @@ def shares_of_sets(trials: Sequence[Trial[Any]]) -> dict[tuple[str, ...], float]
     Notes
     -----
     Bayesian bootstrap (Rubin, Ann. Statist. 9, 1981) over blocks. In every draw the smallest set is taken
-    that is within one standard error of the best, as for the repair itself, the better one of two that are
-    equally small.
+    that is within one standard error of the best, the better one of two that are equally small. The repair
+    itself (`Repairs.best`) prefers named effects besides, and none where it predicts worse than the nominal
+    model: these shares do not, since the names are made from them.
     """
     energies = np.array([trial.error.energy for trial in trials])
     blocks = energies.shape[1]

@@ -267,9 +267,11 @@ class Search(SearchLoop[Explanation]):
     def prediction_residuals(
         self, log: int, deviations: Real, effects: Sequence[Any], start: FittedStart
     ) -> Real:
-        """See `SearchLoop.prediction_residuals`.
+        """(T, Y) (measured - model) / noise of an estimation record of which nothing but its start is fitted.
 
-        In windows what is left has no part of what starts of windows do.
+        log : its place among the estimation records. deviations : (P,), in tolerances off. start : of all
+        estimation records. In windows what is left has no part of what starts of windows do. Not finite where
+        the simulation runs away.
         """
         if log not in self._single_logs:
             record = self.case.estimation[log]

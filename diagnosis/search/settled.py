@@ -28,10 +28,11 @@ _REWEIGHTED_ITERATIONS = 30
 _CONVERGED = 1e-7
 # Most steps of a start: linear columns lead there in one or two.
 _STEPS = 5
-# What a step must gain for another one to be tried, in units of the loss.
+# What a step must gain for another one to be tried, in units of the loss: a tenth of what `SUBSTANTIAL` asks
+# of a difference between sets, so that starts do not decide one.
 _LEAST_GAIN = 0.2
 # Shares of a step that are tried, the largest first, where columns are difference quotients: beside contacts
-# a whole step may jump over what it seeks.
+# a whole step may jump over what it seeks. Each about a third of the last.
 _SHARES_OF_STEP = (1.0, 0.3, 0.1, 0.03)
 # Beginnings of a record that its start is sought on: a sixteenth, then a quarter.
 _BEGINNINGS = (16, 4)

@@ -125,7 +125,11 @@ class WhiteSearch(SearchLoop[Hypothesis]):
     def candidate_beside(
         self, parent: Fit, candidate: Candidate, points: Sequence[StartPoint]
     ) -> tuple[Candidate, list[StartPoint]]:
-        """See `SearchLoop.candidate_beside`; the points that superposition likes best."""
+        """The candidate and the start points from which it is fitted beside the effects of a fit.
+
+        The `FOLLOWED_SETS` points that superposition likes best: where outputs changed by each effect alone
+        are added, they leave least. Sizes begin where the candidate changes outputs at all.
+        """
         smallest = smallest_size(candidate, points, _SMALLEST_CHANGE_BESIDE)
         if smallest is not None:
             candidate = candidate.from_size(smallest)

@@ -235,6 +235,13 @@ def test_excitations_fit_their_voltage_and_length():
         (lambda: Limits(0.0), "limit voltage_V must be positive"),
         (lambda: Limits(1.0, np.nan), "limit hub_angle_rad must be positive"),
         (lambda: next_experiment(_competing(None), Limits(1.0)), "at least two hypotheses; got 1"),
+        (
+            lambda: next_experiment(
+                [discrimination.CompetingHypothesis(0.5, "a simulation", noise=np.ones(1), name="own")] * 2,
+                Limits(1.0),
+            ),
+            "own: excitations are made for a rig's motor",
+        ),
         (lambda: discrimination.CompetingHypothesis(1.5, RIG), "lies between 0 and 1; got"),
         (lambda: excitations(1.0, 50, DT, np.random.default_rng(0)), "at least 100 samples; got 50"),
         (

@@ -113,6 +113,12 @@ def test_a_simulation_gets_all_listed_effects_around_it(tmp_path, opened):
     [
         (PYTHON.replace("INPUTS, OUTPUTS", "OUTPUTS, _"), "does not define INPUTS; expected simulate"),
         (PYTHON.replace('{"spring": 0.2}', "0.2"), "TOLERANCES must be name -> number"),
+        (PYTHON.replace('{"spring": 0.2}', '{"spring": "soft"}'), "spring must be a number; got 'soft'"),
+        (PYTHON + "\nEFFECTS = 3\n", "EFFECTS must be a list of PlantEffect; got 3"),
+        (PYTHON + "\nINPUTS = 3\n", "INPUTS must be names"),
+        (PYTHON + "\nOUTPUTS = [1, 2]\n", "OUTPUTS must be names"),
+        (PYTHON + "\nsimulate = 3\n", "simulate must be a function"),
+        (PYTHON + "\nraise ValueError('two\\nlines')\n", r"two lines \(carriage.py, line"),
         (
             PYTHON.replace("import numpy", "import numpi"),
             r"ended with ModuleNotFoundError.*carriage.py, line 2",
@@ -121,8 +127,9 @@ def test_a_simulation_gets_all_listed_effects_around_it(tmp_path, opened):
 )
 def test_a_python_file_that_is_none_is_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "carriage.py").write_text(text)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=message) as refusal:
         PythonFile.read(tmp_path / "carriage.py")
+    assert "\n" not in str(refusal.value)
 
 
 @pytest.mark.parametrize(
