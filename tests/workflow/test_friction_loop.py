@@ -293,9 +293,9 @@ def test_friction_at_the_load_acts_in_the_loop(belt, jump):
     weights[np.argmax(np.abs(found.arm.rates)), 0] += jump / found.coefficients[0]
     loop = FrictionLoop.of(law, replace(found, arm=replace(found.arm, weights=weights)))
     assert np.max(np.abs(loop.run(step).measured - true)) < 1e-3
-    assert np.max(np.abs(replace(loop, beyond=0.0).run(step).measured - true)) > 9e-3
+    assert np.max(np.abs(replace(loop, load_level=0.0).run(step).measured - true)) > 9e-3
     assert friction_feedforward(law, found).level == pytest.approx(0.04)
-    drawn_levels = [one.beyond for one in drawn(law, found, np.random.default_rng(1), 200)]
+    drawn_levels = [one.load_level for one in drawn(law, found, np.random.default_rng(1), 200)]
     assert np.std(drawn_levels) == pytest.approx(0.001, rel=0.2)
     assert replace(loop, controller=controller()).error_at_rest == pytest.approx(0.04 / 5, rel=1e-4)
 

@@ -25,19 +25,39 @@ from workflow.tasks.sampled_plant import realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, converter_steps, loop_of_arm, rig_of
 from workflow.tasks.stage import StageInput
 
-# Samples of a run on the simulated arm, and at most of one on a plant that was drawn.
-_SHORTEST, _LONGEST, _LONGEST_DRAWN = 200, 6000, 60_000
+# Samples of a run at least: fewer show no shape of a step.
+_SHORTEST = 200
+# Samples of a run on the simulated arm at most: each costs a step of the nonlinear arm.
+_LONGEST = 6000
+# Samples of a run on a plant that was drawn at most. It is linear and ten times as fast to simulate.
+_LONGEST_DRAWN = 60_000
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """What is asked of the loop: reference step after the lead-in, input disturbance from half-way on; (T,)
-    each. given: what the loop is given for the reference, which a filter makes of it. resolution: one count
-    of the sensor."""
+    """Signals that a closed-loop run is driven with: a reference step, then a constant input disturbance.
+
+    Attributes
+    ----------
+    time_s, reference : (T,) arrays
+        The step begins after the lead-in, in units of the output.
+    filtered_reference : (T,) array
+        What the loop gets: the reference behind the reference filter, or the reference where there is none.
+    disturbance : (T,) array
+        Added to the plant's input, in its units; zero before sample `half`.
+    step : float
+        Size of the reference step.
+    half : int
+        First sample of the disturbance.
+    tracking : bool
+        Whether the specification asks the output to follow the reference.
+    resolution : float
+        One count of the sensor, in units of the output; 0 where it is not known.
+    """
 
     time_s: RealArray
     reference: RealArray
-    given: RealArray
+    filtered_reference: RealArray
     disturbance: RealArray
     step: float
     half: int
@@ -46,25 +66,51 @@ class Trial:
 
 
 def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
-    """Prediction and machine on the same trial; Monte Carlo over noise and rig, or over drawn plants."""
-    config, results = stage.config, stage.results
-    controller, options = results.design.controller, config.closed_loop
+    """The loop on the identified model (prediction) and on the machine, both on the same trial.
+
+    Parameters
+    ----------
+    stage : StageInput
+        With the results of every stage before it.
+
+    Returns
+    -------
+    ClosedLoopResult
+        With `check`, or with `skipped`, one line, where there is no controller or the nominal loop is
+        unstable. On the simulated arm each run has its own noise and draw of the rig; where records are logs
+        the machine is plants drawn from the posterior.
+    """
+    config = stage.config
+    results = stage.results
+    controller = results.design.controller
+    options = config.closed_loop
     if controller is None:
         return ClosedLoopResult(skipped=results.certify.reason)
     law = results.reference_filter.law(controller)
     with naming("closed loop"):
+        # A nominal loop that is unstable has no settling time to choose the length of the trial by.
         radius = max(float(np.max(np.abs(closed_loop_poles(controller, plant)))) for plant in stage.plants)
         if not radius < 1:
             return ClosedLoopResult(skipped="the nominal closed loop is unstable")
         reference_filter = results.reference_filter.filter
         trial = make_trial(stage, controller.dt_s, radius, reference_filter)
-        channels, performance = results.uncertainty.seen_by_controller(config), config.performance_index
+
+        # Prediction: on the posterior mean, of the performance channel too where there is one.
+        channels = results.uncertainty.seen_by_controller(config)
+        performance = config.performance_index
         posterior = channels[config.control_index].posterior
-        tip = None if performance is None else channels[performance].posterior
-        mean = (posterior, posterior.mean[None]), None if tip is None else (tip, tip.mean[None])
-        predicted = run_on_draws(controller, *mean, trial)
+        tip = None
+        mean_tip = None
+        if performance is not None:
+            tip = channels[performance].posterior
+            mean_tip = (tip, tip.mean[None])
+        predicted = run_on_draws(controller, (posterior, posterior.mean[None]), mean_tip, trial)
+
+        # Machine: the simulated arm, or, where records are logs, plants drawn from the posterior.
         stage.progress.update("closed_loop", 0.1, "machine")
-        sensitivity, conditions, friction = None, [], None
+        sensitivity = None
+        conditions = []
+        friction = None
         if config.machine == "simulated":
             achieved = run_on_arm(stage, law, trial)
             if options.sensitivity:
@@ -83,8 +129,15 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                     measured=OUTPUT_NAMES.index(config.control_channel.output),
                     rng=stage.rng("closed_loop", "conditions"),
                 )
-                some = bench.slew(), bench.push(), *bench.payloads(), bench.late(), *bench.frictions()
-                conditions = [*some, bench.coarse(), *bench.overdriven()]
+                conditions = [
+                    bench.slew(),
+                    bench.push(),
+                    *bench.payloads(),
+                    bench.late(),
+                    *bench.frictions(),
+                    bench.coarse(),
+                    *bench.overdriven(),
+                ]
         else:
             # Control and performance channel are drawn independently, the parts of the set in turn.
             control_rng = stage.rng("closed_loop", "control")
@@ -94,19 +147,24 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             counts = np.bincount(np.arange(options.draws) % len(members))
             runs = []
             for member, draws in zip(members, counts.tolist(), strict=False):
-                own = member.posterior, member.posterior.sample(control_rng, draws)
-                shown = None if tip is None else (tip, tip.sample(rng, draws))
-                runs.append(run_on_draws(controller, own, shown, trial, **steps))
+                control_draws = (member.posterior, member.posterior.sample(control_rng, draws))
+                tip_draws = None if tip is None else (tip, tip.sample(rng, draws))
+                runs.append(run_on_draws(controller, control_draws, tip_draws, trial, **steps))
             achieved = LoopRuns.together(runs)
+
+        # Dry friction is no part of the linear runs above: what it does is checked on the step alone.
         if options.sensitivity and results.identify.friction is not None:
             stage.progress.update("closed_loop", 0.95, "friction")
             first = slice(0, trial.half)
             friction = check_friction(
-                stage, controller, trial.reference[first], trial.given[first], sensitivity
+                stage, controller, trial.reference[first], trial.filtered_reference[first], sensitivity
             )
-    followed = None if reference_filter is None else config.reference_filter
-    dt_s = controller.dt_s
-    model = None if followed is None else model_answer(followed.reference_model, trial.reference, dt_s)
+
+    # What the output would be if it followed the reference model exactly.
+    ideal_output = None
+    if reference_filter is not None and config.reference_filter is not None:
+        reference_model = config.reference_filter.reference_model
+        ideal_output = model_answer(reference_model, trial.reference, controller.dt_s)
     return ClosedLoopResult(
         check=LoopCheck(
             machine=config.machine,
@@ -122,7 +180,7 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
             time_s=trial.time_s,
             reference=trial.reference,
             disturbance=trial.disturbance,
-            model_answer=model,
+            model_answer=ideal_output,
             predicted_runs=predicted,
             achieved_runs=achieved,
             sensitivity=sensitivity,
@@ -140,8 +198,26 @@ def _simulated(stage: StageInput) -> SimulatedSource:
 def make_trial(
     stage: StageInput, dt_s: float, pole_radius: float, reference_filter: ReferenceFilter | None = None
 ) -> Trial:
-    """Half for the step, half for the disturbance, each long enough for the slowest closed-loop pole."""
-    options, config = stage.config.closed_loop, stage.config
+    """The trial of a run: half for the step, half for the disturbance.
+
+    Parameters
+    ----------
+    stage : StageInput
+    dt_s : float
+        Period of the controller [s].
+    pole_radius : float
+        Modulus of the slowest closed-loop pole, below 1; each half is long enough for it to die out.
+    reference_filter : ReferenceFilter, optional
+        Of the loop.
+
+    Returns
+    -------
+    Trial
+        Sizes that are not stated are half the rms of the output and a tenth of that of the input in the
+        records of the fit.
+    """
+    options = stage.config.closed_loop
+    config = stage.config
     used = stage.results.records.fitted(config.control_channel)
     # A plant that was drawn is linear, and cheap: at a high sampling rate a slow pole takes many samples.
     longest = _LONGEST if config.machine == "simulated" else _LONGEST_DRAWN
@@ -149,14 +225,16 @@ def make_trial(
     if options.duration_s is not None:
         samples = min(max(round(options.duration_s / dt_s), _SHORTEST), longest)
     step = options.reference_step or 0.5 * rms_of([record.output for record in used])
-    disturbance, k, half = options.disturbance, np.arange(samples), samples // 2
+    disturbance = options.disturbance
+    k = np.arange(samples)
+    half = samples // 2
     if disturbance is None:
         disturbance = 0.1 * rms_of([record.input for record in used])
     reference = np.where(k >= round(LEAD_IN * samples), step, 0.0)
     return Trial(
         time_s=np.asarray(k * dt_s, dtype=np.float64),
         reference=reference,
-        given=reference if reference_filter is None else reference_filter.filtered(reference),
+        filtered_reference=(reference if reference_filter is None else reference_filter.filtered(reference)),
         disturbance=np.where(k >= half, disturbance, 0.0),
         step=step,
         half=half,
@@ -167,10 +245,14 @@ def make_trial(
 
 
 def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopRuns:
-    """The nonlinear arm of the source with its extra effects; every run has its own noise and rig draw."""
-    config, options = stage.config, stage.config.closed_loop
-    shown = config.performance_index
-    tip = None if shown is None else OUTPUT_NAMES.index(config.channels[shown].output)
+    """Closed-loop runs (R, T) on the nonlinear arm of the source with its extra effects.
+
+    Every run has its own noise; the first is on the nominal rig, the others on draws within its tolerances.
+    """
+    config = stage.config
+    options = stage.config.closed_loop
+    performance = config.performance_index
+    tip = None if performance is None else OUTPUT_NAMES.index(config.channels[performance].output)
     nominal = rig_of(_simulated(stage))
     runs = []
     for draw in range(options.draws):
@@ -178,27 +260,53 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopR
         # The first run is the nominal rig, the others as its tolerances allow (all alike where it has none).
         rig = nominal if draw == 0 else nominal.drawn(stage.rng("closed_loop", "rig", str(draw)))
         arm = loop_of_arm(config, stage.rng("closed_loop", "noise", str(draw)), options.effects, rig)
-        runs.append(simulate(controller, reference=trial.given, input_disturbance=trial.disturbance, **arm))
+        runs.append(
+            simulate(
+                controller, reference=trial.filtered_reference, input_disturbance=trial.disturbance, **arm
+            )
+        )
     return _loop_runs(runs, None if tip is None else [run.output[:, tip] for run in runs])
 
 
 def run_on_draws(
     controller: Controller,
-    drawn: tuple[ResponsePosterior, RealArray],
-    shown: tuple[ResponsePosterior, RealArray] | None,
+    control: tuple[ResponsePosterior, RealArray],
+    performance: tuple[ResponsePosterior, RealArray] | None,
     trial: Trial,
     **steps: float,
 ) -> LoopRuns:
-    """One closed loop per draw of coefficients (R, P), of the performance channel (R, P') too where there is
-    one: its output follows from the command that acted. steps: of the converters."""
-    posterior, draws = drawn
+    """One closed loop for each draw of the plant.
+
+    Parameters
+    ----------
+    controller : Controller
+    control : tuple of ResponsePosterior and (R, P) array
+        The channel that is fed back, and R draws of its coefficients.
+    performance : tuple of ResponsePosterior and (R, P') array, or None
+        A second channel and its draws. Its output follows from the command that acted, in open loop.
+    trial : Trial
+    **steps : float
+        Steps of the converters: `measurement_step`, `command_step`.
+
+    Returns
+    -------
+    LoopRuns
+        R runs of T samples.
+    """
+    posterior, draws = control
     how: dict[str, Any] = {"input_disturbance": trial.disturbance, **steps}
-    runs = [simulate_plant(controller, realise(posterior, one), trial.given, **how) for one in draws]
-    if shown is None:
+    runs = [
+        simulate_plant(controller, realise(posterior, coefficients), trial.filtered_reference, **how)
+        for coefficients in draws
+    ]
+    if performance is None:
         return _loop_runs(runs, None)
-    tip, tip_draws = shown
-    pairs = zip(runs, tip_draws, strict=True)
-    return _loop_runs(runs, [tip.simulate(run.command + trial.disturbance, own) for run, own in pairs])
+    tip, tip_draws = performance
+    tip_outputs = [
+        tip.simulate(run.command + trial.disturbance, coefficients)
+        for run, coefficients in zip(runs, tip_draws, strict=True)
+    ]
+    return _loop_runs(runs, tip_outputs)
 
 
 def _loop_runs(runs: Sequence[ClosedLoopTrajectory], performance: Sequence[RealArray] | None) -> LoopRuns:
@@ -211,7 +319,11 @@ def _loop_runs(runs: Sequence[ClosedLoopTrajectory], performance: Sequence[RealA
 
 
 def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
-    """Step and disturbance metrics of every run; `settled` says whether its motion dies out."""
+    """Step and disturbance metrics of every run.
+
+    A run is `settled` where the last tenth of both halves moves by no more than a tenth of the step (two
+    counts of the sensor at least) and, where tracking is asked for, has arrived within it.
+    """
     rows = []
     for output, command, limited in zip(runs.output, runs.command, runs.limited, strict=True):
         first = slice(0, trial.half)

@@ -55,11 +55,32 @@ def find_design(
     advise: bool = True,
     between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> DesignResult:
-    """One controller for all plants; `reason` says in one line how it stands against the specification, with
-    `advise` also what would be met instead. between_own_points: of the certificate that this was tried with.
+    """One controller for all plants, and in one line how it stands against the specification.
 
-    With `calibrate`, and plants to draw from, one whose sampled responses are stable as often as the
-    certificate then asks. A specification that no controller can meet is a result, not an error.
+    With `options.calibrate`, and plants to draw from, its sampled responses are stable as often as the
+    certificate then asks.
+
+    Parameters
+    ----------
+    plants : sequence of UncertainPlant
+        With one sampling time.
+    specification : Specification
+        As it is stated; requirements with a limit may give way as far as it.
+    synthesis : SynthesisOptions
+    options : CertificateOptions
+    rng : Generator
+        Of the starts of the search.
+    progress : callable, optional
+        Called with the share that is done and a line.
+    advise : bool
+        Where the specification is missed, `reason` also says what would be met instead. Takes more designs.
+    between_own_points : {"linear", "nothing"}
+        What certificates of that advice take for granted between the frequencies of a measured response.
+
+    Returns
+    -------
+    DesignResult
+        Without a controller where no controller can meet the specification: that is a result, not an error.
     """
     # As it is stored: without what a run says beside it.
     specification = Specification.model_validate(
@@ -70,24 +91,29 @@ def find_design(
     if plants:
         # What the user has to change, not what a search has found.
         specification.refuse_sampling(plants[0].dt_s)
-    at_start = copy.deepcopy(rng)
+    rng_at_start = copy.deepcopy(rng)
+
+    # The search: with `calibrate` a second one follows, for the share of posterior samples.
+    jointly = None
     try:
         if options.calibrate and undrawable(plants) is None:
             parts = [part_of(progress, number, 2) if progress else None for number in range(2)]
             specification, first = synthesise_giving_way(
                 plants, specification, synthesis, rng=rng, progress=parts[0]
             )
-            found = synthesise_jointly(
+            joint_design = synthesise_jointly(
                 plants, specification, synthesis, rng=rng, first=first, progress=parts[1]
             )
-            result, jointly = found.result, said("draws_stable", found)
+            result = joint_design.result
+            jointly = said("draws_stable", joint_design)
         else:
             specification, result = synthesise_giving_way(
                 plants, specification, synthesis, rng=rng, progress=progress
             )
-            jointly = None
     except SpecificationError as impossible:
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
+
+    # How it stands, and what the user could ask for instead.
     reason = said("outcome", result)
     if advise and 1.0 < result.gamma < math.inf:
         meets = would_meet(
@@ -96,7 +122,7 @@ def find_design(
             result.gamma,
             synthesis,
             options,
-            at_start,
+            rng_at_start,
             between_own_points=between_own_points,
         )
         reason += said("would_meet", meets)
@@ -113,12 +139,25 @@ def would_meet(
     *,
     between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> tuple[str, float] | None:
-    """A key of the specification, and a value of it with which a design is certified, the rest as it is.
+    """A key of the specification and a value with which a design is certified, the rest as it is.
 
-    A larger effort_limit, else a smaller bandwidth; of a key that gives way a further limit; None where none
-    of a few is. Quick designs find what may do; it is told only once it was designed and
-    certified as a user would who typed it. gamma: worst case of the design that missed. rng: as that design
-    had it when it began; it is not moved on.
+    Quick designs find a candidate; it is told only once it was designed and certified in the way that a user
+    would who typed it.
+
+    Parameters
+    ----------
+    plants, specification, synthesis, options, between_own_points
+        See `find_design`; the specification as the user stated it.
+    gamma : float
+        Weighted worst case of the design that missed, above 1.
+    rng : Generator
+        As that design had it when it began; it is not moved on.
+
+    Returns
+    -------
+    tuple of str and float, or None
+        A larger effort_limit, else a smaller bandwidth; of a key that gives way a further limit. None where
+        none of a few values is certified.
     """
     root = int(copy.deepcopy(rng).integers(2**63))
     quick = synthesis.model_copy(update={"sufficient_gamma": _CLEARLY})
@@ -130,17 +169,19 @@ def would_meet(
     if specification.highest_effort_limit is not None:
         missed = missed.model_copy(update={"effort_limit": specification.highest_effort_limit})
     whole_designs = 0
+    # More effort costs the user least; a lower bandwidth is the second choice.
     for key, factors in (("effort_limit", (1.5 * gamma, 3 * gamma)), ("bandwidth_rad_s", (0.5, 0.25))):
         stated = getattr(missed, key)
         for factor in factors if stated is not None else ():
             value = float(f"{factor * stated:.2g}")
-
             asked = missed.model_copy(update={key: value})
             try:
-                found = synthesise(plants, asked, quick, rng=np.random.default_rng(root), thorough=False)
+                quick_design = synthesise(
+                    plants, asked, quick, rng=np.random.default_rng(root), thorough=False
+                )
             except SpecificationError:
                 continue
-            if not found.gamma <= _CLEARLY:
+            if not quick_design.gamma <= _CLEARLY:
                 continue
 
             # As a user would who typed it.
@@ -174,8 +215,27 @@ def certify_asked(
     *,
     between_own_points: Literal["nothing", "linear"] = "linear",
 ) -> CertifyResult:
-    """The certificate, and for how many sampled responses its worst case holds. With `calibrate` the ellipses
-    are of the calibrated level where that is higher, and the share of stable draws is an item."""
+    """The certificate of a controller, and for how many sampled responses its worst case holds.
+
+    With `options.calibrate` the ellipses are of the calibrated level where that is higher, and the share of
+    stable draws is an item of the certificate.
+
+    Parameters
+    ----------
+    controller : Controller
+    plants : sequence of UncertainPlant
+        Every one has to meet the specification.
+    specification : Specification
+    options : CertificateOptions
+    rng : Generator
+        Of the posterior samples.
+    between_own_points : {"linear", "nothing"}
+        What is taken for granted between the frequencies of a measured response.
+
+    Returns
+    -------
+    CertifyResult
+    """
     reason = undrawable(plants) if options.joint_draws else said("not_drawn")
     calibrated = reason is None and options.calibrate
     certificate = certify(
@@ -244,7 +304,8 @@ def find_bracket(
     options: AchievableOptions,
     progress: Callable[[float, str], None] | None = None,
 ) -> AchievablePerformance:
-    """The bracket, or why there is none."""
+    """What a controller of any order could reach on these plants (lower and upper bound of the worst case),
+    or the reason why that is not known."""
     if not options.compute:
         return AchievablePerformance(reason=said("bracket_not_asked"))
     try:
@@ -261,7 +322,8 @@ def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[s
     bracket = found.bracket
     if bracket is None:
         return {"reached": None, "floor": None, "above_percent": None, "reason": found.reason}
-    reached, floor = codec.plain(bracket.ellipse), codec.plain(bracket.floor)
+    reached = codec.plain(bracket.ellipse)
+    floor = codec.plain(bracket.floor)
     known = gamma is not None and math.isfinite(gamma) and reached is not None
     return {
         "reached": reached,
@@ -275,21 +337,36 @@ def bracket_numbers(found: AchievablePerformance, gamma: float | None) -> dict[s
 def find_filter(
     controller: Controller, plants: Sequence[UncertainPlant], settings: ReferenceFilterSettings | None
 ) -> ReferenceFilterResult:
-    """The filter, or why there is none.
+    """The reference filter of a loop, or the reason why there is none.
 
-    A loop that is not robustly stable has no worst-case error: a result, with the reason. Raises InputError:
-    see `check_filter`.
+    Parameters
+    ----------
+    controller : Controller
+    plants : sequence of UncertainPlant
+    settings : ReferenceFilterSettings or None
+        None: no filter is asked for, and the result is empty.
+
+    Returns
+    -------
+    ReferenceFilterResult
+        Without a filter, but with a reason, where the loop is not robustly stable: it has no worst-case error
+        to make small.
+
+    Raises
+    ------
+    InputError
+        One line: a frequency beyond what the sampling time allows (`check_filter`).
     """
     if settings is None:
         return ReferenceFilterResult()
     check_filter(settings, controller.dt_s)
     try:
-        found = design_reference_filter(
+        reference_filter = design_reference_filter(
             controller, plants, settings.reference_model, settings, weight=settings.error_weight
         )
     except ValueError as unfit:
         return ReferenceFilterResult(reason=said("no_filter", str(unfit)))
-    return ReferenceFilterResult(found)
+    return ReferenceFilterResult(reference_filter)
 
 
 def check_filter(settings: ReferenceFilterSettings | None, dt_s: float, source: str = "") -> None:
@@ -299,7 +376,8 @@ def check_filter(settings: ReferenceFilterSettings | None, dt_s: float, source: 
     """
     if settings is None:
         return
-    nyquist, where = np.pi / dt_s, f"{source}: reference_filter" if source else "reference_filter"
+    nyquist = np.pi / dt_s
+    where = f"{source}: reference_filter" if source else "reference_filter"
     for rate in settings.poles_rad_s or ():
         if not 0 < rate < nyquist:
             raise InputError(

@@ -42,10 +42,28 @@ from workflow.text.templates import said, words
 
 @dataclass(frozen=True, eq=False)
 class DesignSource:
-    """A plant as read; remarks say what is worth knowing about it; a run brings its own specification and
-    options (`config`), and knows what a certificate is about (`certified_for`), the units of input and
-    output, and the columns they have in the logs (`logged`); part: of the run's set that the plant is, where
-    that has several; path: its file or directory."""
+    """A plant with what its file says of it.
+
+    Attributes
+    ----------
+    plant : UncertainPlant
+    origin : str
+        Kind of the file, in words.
+    remarks : tuple of str
+        What is worth knowing about the plant, a line each.
+    config : RunConfig, optional
+        Of a run: its specification and options.
+    certified_for : str
+        Of a run: what a certificate is about; "" otherwise.
+    units : tuple of two str
+        Of input and output, "" where they are not known.
+    logged : Logged, optional
+        Of a run: the columns that input and output have in the logs.
+    part : str
+        Which part of the run's set the plant is, "" where the set has one.
+    path : Path
+        Its file or directory.
+    """
 
     plant: UncertainPlant
     origin: str
@@ -59,7 +77,25 @@ class DesignSource:
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
-    """All plants, by different names and with one sampling time. Raises InputError naming the file."""
+    """All plants of a design, by different names and with one sampling time.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files or run directories, one or more.
+    design : DesignFile
+        Its `plant` and `uncertainty` sections say what files leave open.
+
+    Returns
+    -------
+    list of DesignSource
+        In the order of the paths; a run directory gives one for each part of its set.
+
+    Raises
+    ------
+    InputError
+        One line that names the file.
+    """
     sources = list[DesignSource]()
     for path in paths:
         several = _sources_of_run(path) if path.is_dir() else [load_source(path, design)]
@@ -77,18 +113,23 @@ def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource
         )
     if len(paths) == 1:
         return sources
+
+    # One controller runs at one period.
     for source in sources[1:]:
         if not np.isclose(source.plant.dt_s, sources[0].plant.dt_s, rtol=1e-9, atol=0):
             raise InputError(
                 f"{source.path}: sampling time {source.plant.dt_s:.6g} s, but {paths[0]} has "
                 f"{sources[0].plant.dt_s:.6g} s: one controller runs at one"
             )
+
+    # Shortest names that differ: of the file, with its folder, or the whole path.
     names = [path.stem if path.suffix else path.name for path in paths]
     if len(set(names)) < len(names):
         names = [f"{path.absolute().parent.name}/{path.name}" for path in paths]
     if len(set(names)) < len(names):
         names = [str(path) for path in paths]
     by_path = dict(zip(paths, names, strict=True))
+
     # A run in several parts says behind its own name which part of it a plant is.
     renamed = []
     for source in sources:
@@ -122,7 +163,13 @@ def level_can_change(plant: UncertainPlant) -> bool:
 
 
 def load_source(path: Path, design: DesignFile) -> DesignSource:
-    """One plant. Raises InputError: one line that names the file."""
+    """One plant from a file, by its content; of a run directory the first part of its set.
+
+    Raises
+    ------
+    InputError
+        One line that names the file.
+    """
     if path.is_dir():
         return _sources_of_run(path)[0]
     if _ending(path) in READERS and _ending(path) not in DOCUMENTS:
@@ -132,14 +179,17 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
         return _measured(path, design)
     with naming(str(path)):
         if codec.DOCUMENT in document:
-            found = codec.from_arrays(IdentifiedPlant, document)
-            name, nominal = found.model.output_name, found.model.to_control()
-            plant = UncertainPlant(name, nominal, found.posterior, level=found.level)
+            identified = codec.from_arrays(IdentifiedPlant, document)
+            name = identified.model.output_name
+            nominal = identified.model.to_control()
+            plant = UncertainPlant(name, nominal, identified.posterior, level=identified.level)
             return DesignSource(plant, "model and posterior of flexlink identify")
         if document.get("format") == FORMAT:
             exported = read_model(path)
-            name, nominal = exported.model.output_name, exported.model.to_control()
-            if (ellipses := exported.ellipses) is None:
+            name = exported.model.output_name
+            nominal = exported.model.to_control()
+            ellipses = exported.ellipses
+            if ellipses is None:
                 return _stated(name, nominal, design, "exported model")
             plant = UncertainPlant(name, nominal, ellipses, level=ellipses.level)
             return DesignSource(plant, "exported model with ellipses", _inside(ellipses, plant.nominal))
@@ -150,7 +200,9 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
 
 def _ending(path: Path) -> str:
     """The ending that says the format; of a file packed by gzip that before .gz."""
-    return Path(path.stem).suffix.lower() if path.suffix.lower() == ".gz" else path.suffix.lower()
+    if path.suffix.lower() == ".gz":
+        return Path(path.stem).suffix.lower()
+    return path.suffix.lower()
 
 
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
@@ -166,21 +218,29 @@ def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: 
 
 
 def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: DesignFile) -> None:
-    """A pole on the circle decides how often the Nyquist curve has to turn: it is never guessed."""
+    """Nothing, for a model with as many poles at z = 1 as the design file states.
+
+    Raises InputError otherwise: such a pole decides how often the Nyquist curve has to turn, so it is never
+    guessed.
+    """
     poles = np.asarray(nominal.poles(), dtype=np.complex128)
-    found, told = count_integrators(poles), design.plant.integrators
-    if found != told:
-        away = np.sort(np.abs(poles - 1.0))[found:told]
+    counted = count_integrators(poles)
+    stated = design.plant.integrators
+    if counted != stated:
+        away = np.sort(np.abs(poles - 1.0))[counted:stated]
         near = f" (another pole is {away[0]:.3g} away)" if away.size else ""
         raise InputError(
-            f"{path}: {found} of its poles at z = 1 (integration){near}, [plant] says {told}: write "
-            f"integrators = {found} in [plant] of {design.name} if that is meant"
+            f"{path}: {counted} of its poles at z = 1 (integration){near}, [plant] says {stated}: write "
+            f"integrators = {counted} in [plant] of {design.name} if that is meant"
         )
 
 
 def _measured(path: Path, design: DesignFile) -> DesignSource:
-    """A measured frequency response with variances, as repeated points, or as one sweep where the design file
-    states the uncertainty."""
+    """The plant of a measured frequency response.
+
+    Its size comes from variances, from repeated points, or, of one sweep, from what the design file states.
+    The nominal model is that of the design file, or one fitted to the response.
+    """
     about = design.plant
     if about.dt_s is None:
         raise InputError(
@@ -191,7 +251,8 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
         response, stated = _read_response(path, design)
         if response.omega_rad_s.size < 2:
             raise InputError(f"{path}: one frequency is no response; expected many")
-    origin, said = "measured response", tuple[str, ...]()
+    origin = "measured response"
+    remarks = tuple[str, ...]()
     if about.nominal is not None:
         nominal = read_state_space(about.nominal, read_document(about.nominal))
         if not np.isclose(float(nominal.dt), about.dt_s, rtol=1e-9, atol=0):
@@ -203,42 +264,46 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
         if stated and about.nominal is not None:
             return replace(_stated(path.stem, nominal, design, origin), remarks=_inside(response, nominal))
         if about.nominal is None:
-            found = identify_frf(response, about.fit.model_copy(update={"integrators": about.integrators}))
-            nominal, origin = found.model.to_control(), "measured response, poles of a fitted model"
+            fit = about.fit.model_copy(update={"integrators": about.integrators})
+            fitted = identify_frf(response, fit)
+            nominal = fitted.model.to_control()
+            origin = "measured response, poles of a fitted model"
             if stated:
                 # Chi-square tells nothing of an uncertainty that somebody stated.
-                told = [item for item in found.verdicts if item.kind is not FindingKind.CHI_SQUARE]
-                said = (*(words(item) for item in (*told, *found.warnings)), *_inside(response, nominal))
-                return replace(_stated(path.stem, nominal, design, origin), remarks=said)
-            said = tuple(words(item) for item in (*found.verdicts, *found.warnings))
+                verdicts = [item for item in fitted.verdicts if item.kind is not FindingKind.CHI_SQUARE]
+                remarks = tuple(words(item) for item in (*verdicts, *fitted.warnings))
+                remarks = (*remarks, *_inside(response, nominal))
+                return replace(_stated(path.stem, nominal, design, origin), remarks=remarks)
+            remarks = tuple(words(item) for item in (*fitted.verdicts, *fitted.warnings))
             if about.ellipses == "fitted":
-                plant = UncertainPlant(path.stem, nominal, found.posterior, level=response.level)
-                return DesignSource(plant, "model fitted to a measured response", said)
+                plant = UncertainPlant(path.stem, nominal, fitted.posterior, level=response.level)
+                return DesignSource(plant, "model fitted to a measured response", remarks)
         plant = UncertainPlant(path.stem, nominal, response, level=response.level)
-    return DesignSource(plant, origin, (*said, *_inside(response, nominal)))
+    return DesignSource(plant, origin, (*remarks, *_inside(response, nominal)))
 
 
 def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty, bool]:
     """The response, and whether its size is what the design file states."""
     about = design.plant
     assert about.dt_s is not None
-    found = measured_response(
+    measured = measured_response(
         [path],
         about.dt_s,
         level=about.level,
         pool_neighbours=about.pool_neighbours,
         outlier_threshold=about.outlier_threshold,
     )
-    if isinstance(found, FrequencyUncertainty):
-        return found, False
+    if isinstance(measured, FrequencyUncertainty):
+        return measured, False
     if design.uncertainty is None:
         raise InputError(
             f"{path}: one sweep: every frequency is measured once, so its spread is not known; give "
             "variance_real, variance_imag or a stated uncertainty, as [uncertainty] multiplicative = 0.1 in "
             f"{design.name}"
         )
-    grid, first = np.unique(found.omega_rad_s, return_index=True)
-    centre, weight = found.response[first], design.uncertainty.multiplicative or design.uncertainty.additive
+    grid, first = np.unique(measured.omega_rad_s, return_index=True)
+    centre = measured.response[first]
+    weight = design.uncertainty.multiplicative or design.uncertainty.additive
     assert weight is not None
     size = np.abs(centre) if design.uncertainty.multiplicative is not None else 1.0
     # As `StatedDiscs` sees the weight.
@@ -248,10 +313,14 @@ def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty
     return FrequencyUncertainty(grid, centre, covariance, about.dt_s, about.level, "stated"), True
 
 
-def _inside(own: FrequencyUncertainty, nominal: control.StateSpace) -> tuple[str, ...]:
-    inside = own.omega_rad_s > 0
-    at = FrequencyUncertainty(
-        own.omega_rad_s[inside], own.centre[inside], own.covariance[inside], own.dt_s, own.level, own.method
+def _inside(ellipses: FrequencyUncertainty, nominal: control.StateSpace) -> tuple[str, ...]:
+    """A line on the share of ellipses that hold the nominal model; at zero frequency it may be infinite."""
+    moving = ellipses.omega_rad_s > 0
+    above_zero = replace(
+        ellipses,
+        omega_rad_s=ellipses.omega_rad_s[moving],
+        centre=ellipses.centre[moving],
+        covariance=ellipses.covariance[moving],
     )
-    found = NominalAgreement.of(at, lambda omega: frequency_response(nominal, omega))
-    return (said("nominal_inside", found, own.omega_rad_s.size),)
+    agreement = NominalAgreement.of(above_zero, lambda omega: frequency_response(nominal, omega))
+    return (said("nominal_inside", agreement, ellipses.omega_rad_s.size),)

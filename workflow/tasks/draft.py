@@ -27,10 +27,13 @@ from workflow.tasks.first_look import (
 from workflow.tasks.loop_sensitivity import rms_of
 from workflow.tasks.results import IdentifiedChannel, UncertainChannel
 
-# Of the first mode or notch, or of the highest frequency that the logs tell: the bandwidth that is asked for,
-# and the one that is asked for at least.
-_PART, _LEAST_PART = 3, 100
-_ORDER = 5  # of the controller: integrator, roll-off and a notch, with one state to spare
+# First mode or notch (or the highest frequency that the logs tell) over the bandwidth that is asked for.
+# Chosen; doubled, the draft asks for half the bandwidth. The command is to fall off as many times above it.
+_MODE_OVER_BANDWIDTH = 3
+# First mode or notch over the lowest bandwidth that is asked for. Chosen; only a loop below it is a miss.
+_MODE_OVER_LOWEST_BANDWIDTH = 100
+# Order of the controller: integrator, roll-off and a notch, with one state to spare.
+_ORDER = 5
 # How far a drafted effort limit gives way where it cannot be met, as a factor: it is what the recorded
 # command allows a step of half the motion's spread, at four times of it (12 dB) a step of an eighth stays
 # within the command's limit. Chosen; doubled, a machine that misses it is certified for smaller steps.
@@ -48,14 +51,39 @@ _SAME_DIGITS = 5e-3
 
 @dataclass(frozen=True)
 class Draft:
-    """look: at the records that are fitted. split_sample: of one log that is split, else None. limit: as
-    stated, or at which commands stand in the logs (`clipped`) or were cut after they were logged (`unseen`),
-    else the largest command. in_loop: a reference was recorded, or the command follows the position. step: of
-    the output's quantisation, 0 without one. specification: keys of [specification]. reference_step: half the
-    rms motion, or, beside an unstable pole, what the effort limit answers with the largest command.
-    timing: of the command between two rows. recorded_rad_s: bandwidth of the loop that made the logs, 0 where
-    they do not tell it. held_rad_s: above it a sensor that holds its readings tells no mode, 0 where none
-    does."""
+    """What a configuration file is drafted from.
+
+    Attributes
+    ----------
+    look : FirstLook
+        At the records that are fitted.
+    position : bool
+        Whether the output is a position.
+    in_loop : bool
+        A reference was recorded, or the command follows the position.
+    split_sample : int or None
+        First sample that validates of one log that is split; None for several logs.
+    limit : float
+        Of the command, in its unit: as stated, or at which commands stand in the logs (`clipped`) or were cut
+        after they were logged (`unseen`), else the largest command.
+    clipped, unseen : bool
+        Where the limit comes from.
+    step : float
+        Of the output's quantisation, 0 without one.
+    specification : mapping of str to value
+        Keys of [specification].
+    reference_step : float
+        Half the rms motion, or, beside an unstable pole, the step that the effort limit answers with the
+        largest command; in units of the output.
+    unstable_per_s : float
+        Growth rate of the pole of an arm that its weight throws over [1/s], 0 without one.
+    timing : CommandTiming
+        Of the command between two rows.
+    recorded_rad_s : float
+        Bandwidth of the loop that made the logs [rad/s], 0 where they do not tell it.
+    held_rad_s : float
+        Above it a sensor that holds its readings tells no mode [rad/s]; 0 where none does.
+    """
 
     look: FirstLook
     position: bool
@@ -87,10 +115,31 @@ def draft_of(
     controller_period_s: float | None = None,
     command_averaged: bool = False,
 ) -> Draft:
-    """Of SISO records of one sampling time, of which the last validates; of one the last part, where that is
-    honest. limit: of the amplifier; controller_period_s, command_averaged: of the controller that made the
-    logs (`timing_of`), as far as they are known. Raises ValueError, one line, where the logs of a loop excite
-    few frequencies, or contradict the period."""
+    """The draft of a configuration for these logs.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        One input, one output, one sampling time. The last one validates; of a single one its last part, where
+        that moves as the first (`split_sample`).
+    position : bool
+        Whether the output is a position.
+    limit : float, optional
+        Of the amplifier, in units of the input.
+    controller_period_s : float, optional
+        Of the controller that made the logs [s], where it is known.
+    command_averaged : bool
+        Each row has the mean of the command since the row before.
+
+    Returns
+    -------
+    Draft
+
+    Raises
+    ------
+    ValueError
+        One line: the logs of a loop excite few frequencies, or contradict the period.
+    """
     fitted = list(records[:-1]) or list(records)
     in_loop = all(record.reference is not None for record in fitted) or recorded_in_loop(fitted)
     if in_loop:
@@ -98,68 +147,92 @@ def draft_of(
     timing = timing_of(
         records, in_loop=in_loop, stated_period_s=controller_period_s, averaged=command_averaged
     )
+
+    # The command's limit: as stated, where commands stand, or where the motion shows that they were cut.
     look = first_look(fitted, position=position)
     highest = max(float(np.max(np.abs(record.input))) for record in records)
-    at_limit, unseen = _limit(records), None
+    at_limit = _limit(records)
+    cut_limit = None
     if limit is None and at_limit is None:
-        unseen = unseen_limit(look, position=position)
-    if unseen is not None:
+        cut_limit = unseen_limit(look, position=position)
+    if cut_limit is not None:
         # As on a data sheet: with as few digits as the logs allow.
-        rounded = [float(f"{unseen:.{digits}g}") for digits in (1, 2, 3)]
-        unseen = next((value for value in rounded if abs(value / unseen - 1) < _SAME_DIGITS), unseen)
-        look = first_look([record.limited(unseen) for record in fitted], position=position)
-    reached = limit or at_limit or unseen or highest
+        rounded = [float(f"{cut_limit:.{digits}g}") for digits in (1, 2, 3)]
+        cut_limit = next((value for value in rounded if abs(value / cut_limit - 1) < _SAME_DIGITS), cut_limit)
+        look = first_look([record.limited(cut_limit) for record in fitted], position=position)
+    reached = limit or at_limit or cut_limit or highest
+
+    # Sizes of the drafted requirements.
     spread = _moved(fitted, look)
     # A step of half the spread may ask for the largest command.
     effort = reached / (0.5 * spread) if spread > 0 else 1.0
     unstable = _unstable_per_s(look)
+    reference_step = 0.5 * spread
+    if unstable or not spread > 0:
+        reference_step = reached / effort
     return Draft(
-        look,
-        position,
-        in_loop,
-        split_sample(records[0]) if len(records) == 1 else None,
-        reached,
-        at_limit is not None,
-        unseen is not None,
-        grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
-        _specification(look, timing, effort, reached, unstable),
-        _rounded(reached / effort if unstable or not spread > 0 else 0.5 * spread),
-        unstable,
-        timing,
+        look=look,
+        position=position,
+        in_loop=in_loop,
+        split_sample=split_sample(records[0]) if len(records) == 1 else None,
+        limit=reached,
+        clipped=at_limit is not None,
+        unseen=cut_limit is not None,
+        step=grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
+        specification=_specification(look, timing, effort, reached, unstable),
+        reference_step=_rounded(reference_step),
+        unstable_per_s=unstable,
+        timing=timing,
         held_rad_s=min((float(held.values["from_rad_s"]) for held in held_readings(fitted)), default=0.0),
     )
 
 
-def informed(draft: Draft, found: IdentifiedChannel, spread: UncertainChannel) -> Draft:
-    """The same with the specification that follows from the model that came out of the logs: its first mode
-    that swings and whose damping is told, its first notch, the band that its ellipses tell."""
-    look, model, omega = draft.look, found.model, spread.frequency.omega_rad_s
+def informed(draft: Draft, channel: IdentifiedChannel, uncertain: UncertainChannel) -> Draft:
+    """The draft with a specification that follows from the model that was identified.
+
+    Parameters
+    ----------
+    draft : Draft
+        From the logs alone.
+    channel : IdentifiedChannel
+        Its first mode that swings and whose damping the records tell, and its first notch, set the bandwidth.
+    uncertain : UncertainChannel
+        The band in which its ellipses are small takes the place of that of the first look.
+
+    Returns
+    -------
+    Draft
+        Unchanged where no response is told.
+    """
+    look = draft.look
+    model = channel.model
+    omega = uncertain.frequency.omega_rad_s
     effort = 0.0
     recorded = 0.0
     law = draft.timing.law
     if law is not None and law.on_error is not None:
-        # Largest |K S| of the recorded loop on the model, and where its |S| rises to -3 dB.
+        # The new loop is to be no slower than the recorded one: largest |K S| of that on the model, and where
+        # its |S| rises to -3 dB.
         numerator, denominator = law.on_error
         z = np.exp(1j * omega * law.dt_s)
         k = np.polyval(numerator, z) / np.polyval(denominator, z)
         sensitivity = 1 / np.abs(1 + k * model.frequency_response(omega))
         effort = float(np.max(np.abs(k) * sensitivity))
         recorded = float(omega[np.argmax(sensitivity > np.sqrt(0.5))])
-    size = np.abs(spread.frequency.centre)
-    known = omega[np.trace(spread.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
+    size = np.abs(uncertain.frequency.centre)
+    known = omega[np.trace(uncertain.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
     if look.told_rad_s is None or not known.size:
         return draft
     band = min(look.told_rad_s[0], float(known[0])), float(known[-1])
-    intervals = [None] * len(found.modes) if spread.intervals is None else spread.intervals.modes
-    modes = [
-        (mode.omega_rad_s, mode.damping)
-        for mode, interval in zip(found.modes, intervals, strict=True)
-        if interval is not None and interval.told
-        if found.is_mode(mode) and mode.damping < LIGHT
-    ]
+    intervals = [None] * len(channel.modes) if uncertain.intervals is None else uncertain.intervals.modes
+    modes = []
+    for mode, interval in zip(channel.modes, intervals, strict=True):
+        damping_is_known = interval is not None and interval.told
+        if damping_is_known and channel.is_mode(mode) and mode.damping < LIGHT:
+            modes.append((mode.omega_rad_s, mode.damping))
     notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)
     look = replace(look, told_rad_s=band, mode=min(modes, default=None), notch=notch)
-    unstable = max((growth for growth, _ in found.unstable_poles), default=0.0)
+    unstable = max((growth for growth, _ in channel.unstable_poles), default=0.0)
     return replace(
         draft,
         look=look,
@@ -186,16 +259,17 @@ def _moved(records: Sequence[Record], look: FirstLook) -> float:
 
 
 def _limit(records: Sequence[Record]) -> float | None:
-    """Where commands of both signs stand, the same for both; None where they stand nowhere."""
+    """The value at which commands of both signs stand, as far from zero; None where they stand nowhere."""
     clipped = [record.input[:, 0] for record in records if clipped_share(record.input[:, 0]) > 0]
     if not clipped:
         return None
-    low, high = min(float(u.min()) for u in clipped), max(float(u.max()) for u in clipped)
+    low = min(float(command.min()) for command in clipped)
+    high = max(float(command.max()) for command in clipped)
     return high if abs(high + low) <= _SAME_LIMIT * high else None
 
 
 def _unstable_per_s(look: FirstLook) -> float:
-    """The pole of the rigid motion that a weight throws over, 0 where there is none."""
+    """Growth rate [1/s] of the rigid motion that a weight throws over, 0 where there is none."""
     motion = look.motion
     if motion is None or not motion.sprung or motion.stiffness is None or motion.stiffness.value >= 0:
         return 0.0
@@ -218,25 +292,30 @@ def _specification(
     recorded loop had."""
     dt_s = look.records[0].dt_s * timing.rows_per_command
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
+    # What the bandwidth stays below: the first mode, else the first notch, else what the logs tell.
     base = look.mode[0] if look.mode else look.notch or highest
-    bandwidth = max(base / _PART, _BEYOND_UNSTABLE * unstable, recorded)
+    bandwidth = max(base / _MODE_OVER_BANDWIDTH, _BEYOND_UNSTABLE * unstable, recorded)
     # The rows hold all of the delay from a command to the motion, and this loop waits for nothing else.
     at_once = {"computational_delay_samples": 0} if timing.acts_at_once else {}
-    band = {
-        "mode_peak_ratio": 1.0,
-        "highest_mode_peak_ratio": _PEAK_GIVES_WAY,
-        "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
-    }
+    peak_of_mode: dict[str, Any] = {}
+    if look.mode:
+        peak_of_mode = {
+            "mode_peak_ratio": 1.0,
+            "highest_mode_peak_ratio": _PEAK_GIVES_WAY,
+            "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
+        }
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
         # Below an unstable pole, too: the loop has to cross above it, tracking need not reach so far.
-        "lowest_bandwidth_rad_s": _rounded(min(base / _LEAST_PART, recorded or np.inf)),
+        "lowest_bandwidth_rad_s": _rounded(min(base / _MODE_OVER_LOWEST_BANDWIDTH, recorded or np.inf)),
         "modulus_margin": 0.5,
         "effort_limit": _rounded(effort),
         "highest_effort_limit": _rounded(_EFFORT_GIVES_WAY * _rounded(effort)),
         # Above what the logs tell the command falls off.
-        "effort_rolloff_rad_s": _rounded(min(max(highest, _PART * bandwidth), 0.5 * np.pi / dt_s)),
-        **(band if look.mode else {}),
+        "effort_rolloff_rad_s": _rounded(
+            min(max(highest, _MODE_OVER_BANDWIDTH * bandwidth), 0.5 * np.pi / dt_s)
+        ),
+        **peak_of_mode,
         "controller_damping": 0.3,
         "integrator": True,
         "input_limit": limit,

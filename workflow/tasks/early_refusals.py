@@ -34,9 +34,8 @@ _SAID_AT_ONCE = frozenset(
     }
 )
 
-# Findings on readings that are none: what is identified from them is of no machine.
+# Findings on rows that hold no reading of the sensor: what is identified from them is of no machine.
 _NO_READINGS = frozenset({FindingKind.SPIKES, FindingKind.NO_READING})
-
 
 # Share of one log that is fitted: its last part validates. Chosen, as is usual for one log.
 _FITTED_SHARE = 0.7
@@ -60,19 +59,26 @@ def split_sample(record: Record) -> int | None:
 
 
 def fitted_records(records: Sequence[Record]) -> list[Record]:
-    """Of logs without stated roles those that a model is fitted to: all but the last, which validates, or the
-    first part of a single one; a single one whose input stands still as it is."""
+    """Records that a model is fitted to, where nobody stated the roles of the logs.
+
+    All but the last, which validates; of a single one its first part, or all of it where the input stands
+    still in that.
+    """
     if len(records) > 1:
         return list(records[:-1])
     record = records[0]
-    if np.ptp(record.input) == 0 or np.ptp(record.input[: round(_FITTED_SHARE * record.n_samples)]) == 0:
+    first_part = record.input[: round(_FITTED_SHARE * record.n_samples)]
+    if np.ptp(first_part) == 0:
         return [record]
     return [record.slice(0, split_sample(record) or record.n_samples)]
 
 
 @contextmanager
 def naming_readings(records: Sequence[Record]) -> Iterator[None]:
-    """A refusal inside begins with the first reading that is none, its likely cause. Raises InputError."""
+    """A context in which a refusal begins with the first row that holds no reading: its likely cause.
+
+    records: with the notes of their reading. Raises InputError.
+    """
     try:
         yield
     except InputError as refused:
@@ -127,8 +133,22 @@ def refuse_constant_input(record: Record) -> None:
 def refuse_hopeless_source(
     config: AnyConfig, records: Sequence[Record], progress: Progress | None = None
 ) -> None:
-    """`refuse_hopeless_logs` for each channel of a configuration and its records, in its order; of several
-    joints nothing is judged here. Raises InputError."""
+    """Nothing, for a configuration whose every channel can be identified from its logs.
+
+    Parameters
+    ----------
+    config : RunConfig or JointsConfig
+        Of several joints, or of simulated records, nothing is judged here.
+    records : sequence of Record
+        In the order of the configuration's records.
+    progress : Progress, optional
+        Told a line for each doubt.
+
+    Raises
+    ------
+    InputError
+        One line, see `refuse_hopeless_logs`.
+    """
     if not isinstance(config, RunConfig) or not isinstance(config.source, FileSource):
         return
     limit = config.source.input_limit or np.inf
@@ -149,23 +169,40 @@ def refuse_hopeless_source(
 def refuse_hopeless_channel(
     channel: Channel, measured: Sequence[Record], loop: ClosedLoopData, progress: Progress | None = None
 ) -> None:
-    """`refuse_hopeless_logs` for the records (one input, one output) that a channel is identified from; loop:
-    how logs of one are used. Raises InputError."""
+    """Nothing, for a channel that can be identified from its records.
+
+    Parameters
+    ----------
+    channel : Channel
+    measured : sequence of Record
+        One input, one output.
+    loop : ClosedLoopData
+        How logs that were made in a loop are used.
+    progress : Progress, optional
+        Told a line for each doubt.
+
+    Raises
+    ------
+    InputError
+        One line, see `refuse_hopeless_logs`.
+    """
     options = channel.identification
     # A loop is opened by its reference, if every record has one that moves, unless another way is stated.
     # Behind a filter the command may excite other frequencies than as recorded.
     moving = all(record.reference is not None and np.ptp(record.reference) > 0 for record in measured)
     filtered = channel.increments or channel.band_rad_s is not None
+    real_poles = options.n_real or 0
+    pole_pairs = options.n_pairs or 0
     refuse_hopeless_logs(
         measured,
         progress,
-        order=(options.n_real or 0) + 2 * (options.n_pairs or 0),
+        order=real_poles + 2 * pole_pairs,
         loop=moving and not filtered and loop.method in ("auto", "two_stage"),
     )
 
 
 def fit_options(options: IdentOptions | None) -> FitOptions:
-    """Options of a search as those of a channel: what is not stated is left to the channel."""
+    """Options of a channel with what the options of a search state; the rest is left to the channel."""
     stated = {} if options is None else options.model_dump(exclude_unset=True)
     return FitOptions.model_validate(stated)
 
@@ -176,8 +213,24 @@ def single_channel(
     described: UncertaintyOptions,
     band_rad_s: tuple[float, float] | None,
 ) -> Channel:
-    """The channel that records like this one (one input, one output) are identified as. Raises ValueError,
-    one line, for settings that contradict each other or the sampling time."""
+    """The channel that records like this one are identified as.
+
+    Parameters
+    ----------
+    record : Record
+        One input, one output.
+    fit : FitOptions
+        Of the pole search.
+    described : UncertaintyOptions
+        What the ellipses describe.
+    band_rad_s : tuple of two float, or None
+        The data are confined to this band [rad/s].
+
+    Raises
+    ------
+    ValueError
+        One line: settings that contradict each other or the sampling time.
+    """
     try:
         channel = Channel(
             input=record.input_names[0],

@@ -66,7 +66,21 @@ class ExperimentLimits(Section):
 
 @dataclass(frozen=True)
 class PlannedRecord:
-    """One voltage file and what to expect of it; the angle is None without a rig or a gain."""
+    """One voltage file and what to expect of it.
+
+    Attributes
+    ----------
+    file : str
+        Name of the CSV file.
+    rms_V, peak_V : float
+        Root mean square and largest value of the voltage.
+    realisation : int
+        Number of the draw of phases, from 1.
+    crest_factor : float
+        Peak over rms.
+    peak_angle_deg : float or None
+        Largest hub angle to expect; None without a rig or a gain.
+    """
 
     file: str
     rms_V: float
@@ -78,7 +92,19 @@ class PlannedRecord:
 
 @dataclass(frozen=True, eq=False)
 class PlannedExperiment:
-    """voltages_V (A, M, T) over amplitudes, realisations and samples."""
+    """Voltages of an experiment and what is predicted of it.
+
+    Attributes
+    ----------
+    limits : ExperimentLimits
+        What was allowed.
+    plan : ExperimentPlan
+        Periods, lines and amplitudes.
+    seed : int
+        Of the random phases and of the lines that are left out.
+    voltages_V : (A, M, T) array
+        Over amplitudes, realisations and samples.
+    """
 
     limits: ExperimentLimits
     plan: ExperimentPlan
@@ -87,17 +113,29 @@ class PlannedExperiment:
 
     @cached_property
     def records(self) -> tuple[PlannedRecord, ...]:
-        motion, rows = motion_of(self.limits), list[PlannedRecord]()
-        for rms_V, rung in zip(self.plan.rms_V, self.voltages_V, strict=True):
-            for k, voltage in enumerate(rung, 1):
-                angle = None if motion is None else float(np.degrees(np.max(np.abs(motion(voltage)))))
-                peak = float(np.max(np.abs(voltage)))
-                name = f"{len(rows) + 1:02d}_{rms_V:g}_V_rms_realisation_{k}.csv"
-                rows.append(PlannedRecord(name, rms_V, k, peak, crest_factor(voltage), angle))
-        return tuple(rows)
+        """One for each file, amplitude by amplitude."""
+        motion = motion_of(self.limits)
+        planned = list[PlannedRecord]()
+        for rms_V, realisations in zip(self.plan.rms_V, self.voltages_V, strict=True):
+            for number, voltage in enumerate(realisations, 1):
+                peak_angle_deg = None
+                if motion is not None:
+                    peak_angle_deg = float(np.degrees(np.max(np.abs(motion(voltage)))))
+                planned.append(
+                    PlannedRecord(
+                        file=f"{len(planned) + 1:02d}_{rms_V:g}_V_rms_realisation_{number}.csv",
+                        rms_V=rms_V,
+                        realisation=number,
+                        peak_V=float(np.max(np.abs(voltage))),
+                        crest_factor=crest_factor(voltage),
+                        peak_angle_deg=peak_angle_deg,
+                    )
+                )
+        return tuple(planned)
 
     @property
     def duration_s(self) -> float:
+        """Of all records together, lead-in included [s]."""
         return self.plan.duration_s(self.limits.dt_s)
 
     @cached_property
@@ -122,10 +160,15 @@ class PlannedExperiment:
 
     @property
     def noise_std_rad(self) -> float:
-        """Of the hub angle: as stated, of the rig, or of the steps of an encoder of 12 bits."""
+        """Standard deviation of the hub angle's noise [rad]: as stated, else of the rig, else of the steps of
+        an encoder of 12 bits (a step over the root of 12: errors spread evenly over it)."""
+        if self.limits.noise_std_rad:
+            return self.limits.noise_std_rad
         rig = self.limits.rig
-        known = self.limits.noise_std_rad or (rig and rig.sensors.hub_angle_noise_rad)
-        return known or 2 * np.pi / 2**12 / np.sqrt(12)
+        if rig is not None and rig.sensors.hub_angle_noise_rad:
+            return rig.sensors.hub_angle_noise_rad
+        encoder_step_rad = 2 * np.pi / 2**12
+        return float(encoder_step_rad / np.sqrt(12))
 
     @cached_property
     def radii(self) -> tuple[float, ...]:
@@ -134,8 +177,10 @@ class PlannedExperiment:
 
 
 def motion_of(limits: ExperimentLimits) -> Callable[[RealArray], RealArray] | None:
-    """Hub angle (T,) [rad] from rest under a voltage (T,): that of the linear rig, or of an integrator."""
-    rig, gain = limits.rig, limits.gain_rad_per_Vs
+    """A function from voltage (T,) [V] to hub angle (T,) [rad], from rest: of the linear rig, or of an
+    integrator where only a gain is stated; None without either."""
+    rig = limits.rig
+    gain = limits.gain_rad_per_Vs
     if rig is not None:
         # Takes a second to load: limits that are refused do not need it.
         from plant.simulation import simulate
@@ -145,9 +190,20 @@ def motion_of(limits: ExperimentLimits) -> Callable[[RealArray], RealArray] | No
 
 
 def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) -> PlannedExperiment:
-    """The longest periods and largest voltages that the limits allow; settings: fields of the plan by name.
+    """The experiment with the longest periods and largest voltages that the limits allow.
 
-    Raises InputError (one line) where no experiment stays within them.
+    Parameters
+    ----------
+    limits : ExperimentLimits
+    seed : int
+        Of the random phases and of the lines that are left out.
+    **settings : object
+        Fields of `ExperimentPlan` by name.
+
+    Raises
+    ------
+    InputError
+        One line: no experiment stays within the limits.
     """
     motion = motion_of(limits)
     if limits.angle_deg is not None and motion is None:
@@ -166,12 +222,16 @@ def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) 
         voltages = plan.records(limits.dt_s, np.random.default_rng(seed))
     except ValueError as error:
         raise InputError(str(error)) from error
+
+    # Without stated amplitudes the voltages are scaled to the first limit that they meet.
     if not limits.rms_V:
         angle_rad = np.inf if limits.angle_deg is None else float(np.radians(limits.angle_deg))
         plan = plan.scaled(voltages, peak_V=limits.peak_V, angle_rad=angle_rad, motion=motion)
         voltages = plan.records(limits.dt_s, np.random.default_rng(seed))
-    found = PlannedExperiment(limits, plan, seed, voltages)
-    for record in found.records:
+
+    # Stated amplitudes may go beyond a limit: that is refused with the first file that does.
+    experiment = PlannedExperiment(limits, plan, seed, voltages)
+    for record in experiment.records:
         about = f"{record.rms_V:g} V rms, realisation {record.realisation}"
         if record.peak_V > limits.peak_V * (1 + 1e-9):
             raise InputError(f"{about}: peak of {record.peak_V:.4g} V, {limits.peak_V:g} V are allowed")
@@ -180,4 +240,4 @@ def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) 
                 f"{about}: the hub is expected to turn by {record.peak_angle_deg:.4g} degrees, "
                 f"{limits.angle_deg:g} are allowed"
             )
-    return found
+    return experiment

@@ -30,7 +30,16 @@ def filter_file(controller_file: Path) -> Path:
 
 
 def law_bytes(law: Controller | ReferenceFilter, suffix: str, dialect: Dialect = Dialect()) -> bytes:  # noqa: B008
-    """The file's content, by the ending."""
+    """Content of a file of a controller or reference filter.
+
+    Parameters
+    ----------
+    law : Controller or ReferenceFilter
+    suffix : str
+        ".json", ".mat", ".h", or any other for C source.
+    dialect : Dialect
+        Names and number type of the C code.
+    """
     suffix = suffix.lower()
     if suffix == ".json":
         return law.to_json().encode()
@@ -60,9 +69,18 @@ def gain_unit_of(command_unit: str, error_unit: str) -> str:
 
 @dataclass(frozen=True)
 class Logged:
-    """Columns of the logs, of which quantity = scale * column + offset: scales of errors (Y,) and commands
-    (U,), what they are in words, and the unit of command over error, "" where it is not known. A
-    law for them needs no scale and no turned sign on the machine."""
+    """Columns of the logs in which a controller is written: it needs no scale and no turned sign on the
+    machine.
+
+    Attributes
+    ----------
+    error, command : tuples of float
+        Scales of the Y errors and U commands, of quantity = scale * column + offset.
+    signals : str
+        What errors and commands are, in words.
+    gain_unit : str
+        Unit of command over error, "" where it is not known.
+    """
 
     error: tuple[float, ...]
     command: tuple[float, ...]
@@ -71,7 +89,9 @@ class Logged:
 
     @classmethod
     def of(cls, config: AnyConfig, records: RecordsResult) -> Logged:
-        source, loops = config.source, config.loops
+        """The columns of a run's loops; of simulated records scales are 1."""
+        source = config.source
+        loops = config.loops
         scale, offset = (source.scale, source.offset) if isinstance(source, FileSource) else ({}, {})
         columns = [[loop.output for loop in loops], [loop.input for loop in loops]]
         error, command = (tuple(scale.get(name, 1.0) for name in names) for names in columns)
@@ -85,7 +105,7 @@ class Logged:
         return cls(error, command, said("signals", *columns, units, scale, offset), gain_unit)
 
     def law(self, law: Controller) -> Controller:
-        """Of a law in quantities."""
+        """The law for the columns, of one for quantities."""
         scaled = law.in_units(np.array(self.error), np.array(self.command))
         return replace(scaled, signals=self.signals, gain_unit=self.gain_unit)
 
@@ -106,24 +126,47 @@ def write_controller(
     about: str = "",
     dialect: Dialect | None = None,
 ) -> list[Path]:
-    """Write the `targets` of `out` where their content is not there already; the files there are now.
+    """Write the `targets` of `out`; files that have this content already are left alone.
 
-    about: what it is certified for; dialect: of the C code.
+    Parameters
+    ----------
+    out : Path
+        A file, or a directory: then all formats.
+    controller : Controller
+    reference_filter : ReferenceFilter or None
+        Written beside the controller, by `filter_file`.
+    certified : bool
+        Otherwise the name inside the files says NOT CERTIFIED.
+    about : str
+        What it is certified for.
+    dialect : Dialect, optional
+        Of the C code.
+
+    Returns
+    -------
+    list of Path
+        All files of the controller and its filter, written or not.
     """
     c = dialect or Dialect()
-    known = f", certified for {about}" if about else ""
-    law = replace(controller, name=controller.name + (known if certified else " (NOT CERTIFIED)"))
+    if not certified:
+        remark = " (NOT CERTIFIED)"
+    elif about:
+        remark = f", certified for {about}"
+    else:
+        remark = ""
+    law = replace(controller, name=controller.name + remark)
     content = {path: law_bytes(law, path.suffix, c) for path in targets(out)}
     if reference_filter is not None:
         content |= {filter_file(path): law_bytes(reference_filter, path.suffix, c) for path in targets(out)}
-    storage.write_together(
-        {path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data}
-    )
+    changed = {
+        path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data
+    }
+    storage.write_together(changed)
     return list(content)
 
 
 def model_bytes(path: Path, file: ModelFile) -> bytes:
-    """JSON or MAT by the ending (`workflow.config.command_files.MODEL_SUFFIXES`)."""
+    """Content of a model file: MAT or, by any other ending of `MODEL_SUFFIXES`, JSON."""
     return file.to_mat() if path.suffix.lower() == ".mat" else file.to_json().encode("utf-8")
 
 

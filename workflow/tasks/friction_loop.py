@@ -49,18 +49,27 @@ from workflow.tasks.results import (
 from workflow.tasks.simulated_rig import converter_steps, loop_of_arm
 from workflow.tasks.stage import StageInput
 
-# A step sought by bisection is right to this share of itself; how far around the guess it may lie.
-_SHARE, _APART = 0.01, 10.0
-_DRAWS = 16  # Student's factor of a 95 % interval is then within a tenth of its limit: 2.13
-TOLERANCE_PERCENT = 5.0  # of a peak of |S|: half a decibel
+# A step sought by bisection is right to this share of itself.
+_BISECTION_SHARE = 0.01
+# Factor by which that step may lie below or above the guess. Chosen.
+_BISECTION_RANGE = 10.0
+# Arms drawn for an interval: Student's factor at 95 % is then within a tenth of its limit (2.13 of 1.96).
+_DRAWS = 16
+# Of a peak of |S|, in percent: half a decibel.
+TOLERANCE_PERCENT = 5.0
 # Shares of the large size; the first and SMALL are measured by `sensitivity_on_arm`.
 _SHARES = (1.0, 0.3, SMALL, 0.03, 0.01)
-# The sine's period is so many times the delay of the loop; its linear error is 2 pi over that.
-_SLOW, _LONGEST = 300.0, 20_000
-_SINE_SHARE = 0.2  # of the reference step
+# The slow sine's period over the delay of the loop; the linear error is 2 pi over that, 2 % of the sine.
+_PERIOD_OVER_DELAY = 300.0
+# Samples of that period at most.
+_LONGEST_PERIOD = 20_000
+# Amplitude of the slow sine over the reference step. Chosen.
+_SINE_SHARE = 0.2
 # Friction lets integral action wait: the step is watched so many times as long as the linear loop needs.
-_WATCHED, _MOST_WATCHED = 20, 100_000
-# A picture shows so many times the trial's step: what moves in that is still seen.
+_WATCHED = 20
+# Samples for which it is watched at most, unless the linear loop itself needs more.
+_MOST_WATCHED = 100_000
+# A picture shows at most so many times the trial's step: what moves in that is still seen.
 _MOST_SHOWN = 4
 # Sizes over which a step's settling time is given, over the one asked for: an octave either way, which a user
 # who tries another step hardly leaves; a quarter of an octave apart, with the step itself (share 1) in the
@@ -70,55 +79,84 @@ STEP_SHARES = 2.0 ** np.linspace(-1.0, 1.0, 9)
 # sizes are tried there. On eight hunting loops at most 3 % of 300 random sizes settle outside of the range,
 # with 15 even sizes up to 13 %.
 _MORE_SIZES = 8
-_JUMP = 1.2  # factor between the times of neighbouring sizes up to which nothing is sought between them
+# Factor between the times of neighbouring sizes up to which nothing is sought between them.
+_JUMP = 1.2
 
 
 @dataclass(frozen=True, eq=False)
 class FrictionLoop:
     """A controller, with its limits and feed-forward, around one arm of a fit.
 
-    coefficients (P,) and friction: of the arm; beyond: level at the load behind its first spring, 0 for none;
-    the steps as of `control_design.analysis.closed_loop.simulate`. Neglected: limits other than the
-    controller's own.
+    Neglected: limits other than the controller's own.
+
+    Attributes
+    ----------
+    controller : Controller
+    fit : FrictionFit
+        The fit that the arm is of, at the controller's period.
+    coefficients : (P,) array
+        Of this arm, in the basis of the fit.
+    friction : FrictionLaw
+        At the shaft of this arm.
+    load_level : float
+        Level of the friction at the load behind the first spring, in units of the input; 0 for none.
+    measurement_step, command_step : float
+        Of the converters, see `control_design.analysis.closed_loop.simulate`.
     """
 
     controller: Controller
-    found: FrictionFit
+    fit: FrictionFit
     coefficients: RealArray
     friction: FrictionLaw
-    beyond: float = 0.0
+    load_level: float = 0.0
     measurement_step: float = 0.0
     command_step: float = 0.0
 
     @classmethod
-    def of(cls, controller: Controller, found: FrictionFit, **steps: float) -> FrictionLoop:
-        """On the arm as it was fitted."""
-        return cls(controller, found, found.coefficients, found.law, found.beyond, **steps)
+    def of(cls, controller: Controller, fit: FrictionFit, **steps: float) -> FrictionLoop:
+        """The loop on the arm as it was fitted; steps: of the converters, by name."""
+        return cls(controller, fit, fit.coefficients, fit.law, fit.beyond, **steps)
 
     def run(self, reference: RealArray, noise: np.random.Generator | None = None) -> ClosedLoopTrajectory:
-        """From rest, reference (T,); noise: white, of the size of the fit's residual (sensor and encoder)."""
-        law, arm = self.controller, self.found.arm
-        n, spring = reference.size, self.found.spring
-        measured, command, limited = np.empty(n), np.empty(n), np.empty(n, dtype=np.bool_)
+        """The loop from rest.
+
+        Parameters
+        ----------
+        reference : (T,) array
+            In units of the output.
+        noise : Generator, optional
+            Of white measurement noise, as large as the fit's residual (sensor and encoder); None: none.
+        """
+        law = self.controller
+        arm = self.fit.arm
+        n = reference.size
+        spring = self.fit.spring
+        measured = np.empty(n)
+        command = np.empty(n)
+        limited = np.empty(n, dtype=np.bool_)
         weights = arm.weights @ self.coefficients
         # An arm has inertia. Where the fit has the speed jump against the force, a shaft at rest would creep.
         # It is taken off the fastest real pole: off an integrator it would change the gain at standstill.
         size = np.where(arm.chain | (arm.rates.imag != 0), 0.0, np.abs(arm.rates))
         if np.any(size):
             weights[np.argmax(size)] -= min(float(weights[~arm.chain].real.sum()), 0.0)
+        measurement_noise = np.zeros(n) if noise is None else self.fit.noise_std * noise.standard_normal(n)
+        feedforward = np.zeros(n)
+        if law.feedforward is not None:
+            feedforward = law.feedforward.signal(reference, law.dt_s)
         loop_through(
             kernel_array(reference),
-            np.zeros(n) if noise is None else self.found.noise_std * noise.standard_normal(n),
-            np.zeros(n) if law.feedforward is None else law.feedforward.signal(reference, law.dt_s),
+            measurement_noise,
+            feedforward,
             *law_arrays(law),
             np.array([self.measurement_step, self.command_step]),
             law.computational_delay_samples,
             arm.structure.input_delay_samples,
-            lag_steps(self.found.lag),
+            lag_steps(self.fit.lag),
             arm.stepped(weights),
             arm.dt_s,
             self.friction.array,
-            np.zeros(6) if spring is None else spring.array(self.beyond, self.friction),
+            np.zeros(6) if spring is None else spring.array(self.load_level, self.friction),
             measured,
             command,
             limited,
@@ -126,16 +164,19 @@ class FrictionLoop:
         time_s = np.asarray(np.arange(n) * law.dt_s, dtype=np.float64)
         return ClosedLoopTrajectory(time_s, reference, measured[:, None], command, limited, law.dt_s)
 
-    def answer(self, step: RealArray, given: RealArray | None = None) -> ClosedLoopTrajectory:
-        """To a step (T,), held as long as friction may make it wait; given (T,): as a filter has it."""
+    def answer(self, step: RealArray, filtered: RealArray | None = None) -> ClosedLoopTrajectory:
+        """The answer to a step (T,), which is held for as long as friction may make the loop wait.
+
+        filtered (T,): what a reference filter makes of the step; None: there is no filter.
+        """
         held = watched_samples(step.size) - step.size
-        run = self.run(np.pad(step if given is None else given, (0, held), mode="edge"))
+        run = self.run(np.pad(step if filtered is None else filtered, (0, held), mode="edge"))
         return replace(run, reference=np.pad(step, (0, held), mode="edge"))
 
     def settling(
         self,
         step: RealArray,
-        given: RealArray | None = None,
+        filtered: RealArray | None = None,
         *,
         answer: ClosedLoopTrajectory | None = None,
     ) -> SettlingRange:
@@ -145,7 +186,7 @@ class FrictionLoop:
         ----------
         step : (T,) array
             The reference, in units of the output.
-        given : (T,) array, optional
+        filtered : (T,) array, optional
             What a reference filter makes of it.
         answer : ClosedLoopTrajectory, optional
             What `answer` gives for this step, where the caller has it: it is not run again.
@@ -155,13 +196,13 @@ class FrictionLoop:
         One step's time is chance with dry friction: sticking just inside or just outside of the band of 2 %
         decides, and so do the last digits of the integration. See `SettlingRange`.
         """
-        given = step if given is None else given
+        filtered = step if filtered is None else filtered
         dt_s = self.controller.dt_s
 
         def settling_time_s(share: float) -> float | None:
             if share == 1.0 and answer is not None:
                 return step_metrics(answer).settling_time_s
-            return step_metrics(self.answer(share * step, share * given)).settling_time_s
+            return step_metrics(self.answer(share * step, share * filtered)).settling_time_s
 
         shares = STEP_SHARES.tolist()
         times_s = [settling_time_s(share) for share in shares]
@@ -200,12 +241,16 @@ class FrictionLoop:
         law = self.controller
         answer = control.step_response(law.to_control(), np.arange(samples) * law.dt_s).outputs
         size = self.friction.breakaway / float(np.max(np.abs(answer)))
-        low, high = size / _APART, size * _APART
+        low = size / _BISECTION_RANGE
+        high = size * _BISECTION_RANGE
         if not (size > 0 and sticks(low)):
             return 0.0
-        while high > (1 + _SHARE) * low:
+        while high > (1 + _BISECTION_SHARE) * low:
             middle = float(np.sqrt(low * high))
-            low, high = (middle, high) if sticks(middle) else (low, middle)
+            if sticks(middle):
+                low = middle
+            else:
+                high = middle
         return low
 
     @property
@@ -214,36 +259,43 @@ class FrictionLoop:
         an arm that integrates has 1 / G = 0 and integral action leaves no error."""
         # A millionth of the Nyquist frequency: there an integrator is as good as infinite.
         omega = np.array([1e-6 * np.pi / self.controller.dt_s])
-        gain = self.controller.response(omega) + 1 / self.found.model.frequency_response(omega)
-        return at_rest(self.friction, self.beyond) / float(np.abs(gain[0]))
+        gain = self.controller.response(omega) + 1 / self.fit.model.frequency_response(omega)
+        return breakaway_of(self.friction, self.load_level) / float(np.abs(gain[0]))
 
     def moving_sine(self, omega_rad_s: float) -> float:
         """Amplitude of a sine from which on it moves the arm: friction over |K|, as the command of an
         arm that stands is K times the reference."""
         gain = self.controller.response(np.array([omega_rad_s]), with_delay=False)
-        return at_rest(self.friction, self.beyond) / float(np.abs(gain[0]))
+        return breakaway_of(self.friction, self.load_level) / float(np.abs(gain[0]))
 
 
 def watched_samples(samples: int) -> int:
-    """For how long a step is watched that the linear loop follows within so many samples."""
+    """Number of samples for which a step is watched that the linear loop follows within so many."""
     return min(_WATCHED * samples, max(_MOST_WATCHED, samples))
 
 
-def at_rest(friction: FrictionLaw, beyond: float) -> float:
-    """What friction at shaft and load holds together: that of the load falls with speed alike."""
-    return friction.breakaway * (1 + beyond / friction.level if friction.level > 0 else 1)
+def breakaway_of(friction: FrictionLaw, load_level: float) -> float:
+    """Force that friction at shaft and load holds together at standstill, in units of the input.
+
+    The friction of the load is taken to fall with speed as that of the shaft does.
+    """
+    if not friction.level > 0:
+        return friction.breakaway
+    return friction.breakaway * (1 + load_level / friction.level)
 
 
 def drawn(
-    controller: Controller, found: FrictionFit, rng: np.random.Generator, draws: int, **steps: float
+    controller: Controller, fit: FrictionFit, rng: np.random.Generator, draws: int, **steps: float
 ) -> list[FrictionLoop]:
-    """Loops on arms drawn from the covariance of the fit."""
+    """Loops of a controller on arms drawn from the covariance of the fit; steps: of the converters."""
     loops = []
     for _ in range(draws):
-        change = found.covariance_factor @ rng.standard_normal(found.covariance_factor.shape[1])
-        coefficients, friction = found.moved(change)
-        beyond = 0.0 if found.spring is None else max(found.beyond + float(change[-1]), 0.0)
-        loops.append(FrictionLoop(controller, found, coefficients, friction, beyond, **steps))
+        change = fit.covariance_factor @ rng.standard_normal(fit.covariance_factor.shape[1])
+        coefficients, friction = fit.moved(change)
+        load_level = 0.0
+        if fit.spring is not None:
+            load_level = max(fit.beyond + float(change[-1]), 0.0)
+        loops.append(FrictionLoop(controller, fit, coefficients, friction, load_level, **steps))
     return loops
 
 
@@ -253,26 +305,45 @@ def predicted_peak(
     noise: np.random.Generator,
     **excitation: Any,
 ) -> Interval:
-    """95 % interval of the peak of |S| as it would be measured with the excitation of `sensitivity_of`, whose
-    phases (the same in every call) are known; arm, friction and noise are those of the loops."""
+    """95 % interval of the peak of |S| as it would be measured on one more arm like these.
+
+    Parameters
+    ----------
+    loops : sequence of FrictionLoop
+        Two or more, with arm and friction of their own.
+    phases : callable
+        Returns a generator of the excitation's phases, in the same state in every call.
+    noise : Generator
+        Of the measurement noise.
+    **excitation
+        Keywords of `sensitivity_of`.
+    """
     return interval_of([loop.sensitivity(phases(), noise, **excitation).peak[0] for loop in loops])
 
 
-def friction_feedforward(controller: Controller, found: FrictionFit) -> FrictionFeedforward:
-    """Of the identified friction at shaft and load, as late as T = G K / (1 + G K) is towards standstill."""
+def friction_feedforward(controller: Controller, fit: FrictionFit) -> FrictionFeedforward:
+    """Feed-forward of the identified friction at shaft and load.
+
+    It comes as late as T = G K / (1 + G K) does towards standstill, but one sample at least: the loop
+    follows its reference with that delay.
+    """
     omega = np.array([1e-5 * np.pi / controller.dt_s])
-    loop = controller.response(omega) * found.model.frequency_response(omega) * found.drive_response(omega)
+    loop = controller.response(omega) * fit.model.frequency_response(omega) * fit.drive_response(omega)
     delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
-    law = found.law
-    both = found.level / law.level if law.level > 0 else 1.0
-    fall = law.fall if law.excess > 0 else 1.0
+    law = fit.law
+    load_factor = fit.level / law.level if law.level > 0 else 1.0
     return FrictionFeedforward(
-        found.level, law.presliding, max(delay_s, controller.dt_s), excess=both * law.excess, fall=fall
+        fit.level,
+        law.presliding,
+        max(delay_s, controller.dt_s),
+        excess=load_factor * law.excess,
+        fall=law.fall if law.excess > 0 else 1.0,
     )
 
 
 def interval_of(values: Sequence[float]) -> Interval:
-    """Where one more of these positive values lies: Student's law of their logarithms."""
+    """95 % interval in which one more of these positive values lies, two or more: Student's law of their
+    logarithms."""
     logs = np.log(values)
     reach = student.ppf(0.5 + LEVEL / 2, logs.size - 1) * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
     return float(np.exp(logs.mean() - reach)), float(np.exp(logs.mean() + reach))
@@ -282,21 +353,36 @@ def check_friction(
     stage: StageInput,
     controller: Controller,
     reference: RealArray,
-    given: RealArray,
+    filtered: RealArray,
     sensitivity: SensitivityCheck | None,
 ) -> FrictionCheck:
-    """What friction does to the loop of this controller (without feed-forward), predicted and, where
-    `sensitivity` was measured on the simulated arm, measured. reference (T,): a step and the time in which
-    the linear loop settles; given (T,): what a reference filter makes of it."""
+    """What dry friction does to the loop of a controller without feed-forward.
+
+    Parameters
+    ----------
+    stage : StageInput
+        With an identified friction and a certificate.
+    controller : Controller
+    reference : (T,) array
+        A step, and the time in which the linear loop settles.
+    filtered : (T,) array
+        What a reference filter makes of it.
+    sensitivity : SensitivityCheck or None
+        |S| measured on the simulated arm: then further sizes are measured, too; None: all is predicted.
+    """
     certificate = stage.results.certify.certificate
     assert stage.results.identify.friction is not None
     assert certificate is not None
-    found = resampled_friction(stage.results.identify.friction, controller.dt_s)
+    fit = resampled_friction(stage.results.identify.friction, controller.dt_s)
     steps = converter_steps(stage.config.closed_loop)
-    loops = drawn(controller, found, stage.rng("closed_loop", "friction"), _DRAWS, **steps)
+    loops = drawn(controller, fit, stage.rng("closed_loop", "friction"), _DRAWS, **steps)
+
+    # The peak of |S| by size of the reference: predicted over the drawn arms, measured on the machine.
     plan = sensitivity_plan(stage, controller, reference.size)
     names = ["0", "further 1", "1", "further 2", "further 3"]
-    low, high, measured = np.empty(len(_SHARES)), np.empty(len(_SHARES)), np.empty(len(_SHARES))
+    low = np.empty(len(_SHARES))
+    high = np.empty(len(_SHARES))
+    measured = np.empty(len(_SHARES))
     for k, (name, share) in enumerate(zip(names, _SHARES, strict=True)):
         excitation = plan.excitation(share)
         noise = stage.rng("closed_loop", "friction noise", name)
@@ -308,21 +394,25 @@ def check_friction(
             measured[k] = measured_on_arm(stage, controller, excitation, name).peak[0]
     sizes = plan.rms * np.array(_SHARES)
     certified = max(plant.worst_peak_sensitivity for plant in certificate.plants)
-    fitted = FrictionLoop.of(controller, found, **steps)
+
+    # Sticking and the error at rest, on the arm as fitted and on the drawn ones.
+    fitted_loop = FrictionLoop.of(controller, fit, **steps)
     radius = float(np.max(np.abs(controller.poles), initial=0.0))
-    rest = settling_samples(radius, 200, 6000)
+    settle_samples = settling_samples(radius, 200, 6000)
     # With integral action the command grows until the arm moves, however small the step or the error.
     integral = radius > 1 - 1e-9
-    sticking = [0.0 if integral else loop.sticking_step(rest) for loop in (fitted, *loops)]
-    error_at_rest = 0.0 if integral else fitted.error_at_rest
-    level = at_rest(found.law, found.beyond)
-    run = fitted.answer(reference, given)
+    sticking = [0.0 if integral else loop.sticking_step(settle_samples) for loop in (fitted_loop, *loops)]
+    error_at_rest = 0.0 if integral else fitted_loop.error_at_rest
+    breakaway = breakaway_of(fit.law, fit.beyond)
+
+    # The reference step on the arm as fitted.
+    run = fitted_loop.answer(reference, filtered)
     error = np.abs(run.reference - run.measured)[int(np.flatnonzero(run.reference)[0]) :]
     tolerance = TOLERANCE_PERCENT / 100
     return FrictionCheck(
-        level=level,
-        level_interval=_around(level, found),
-        presliding=found.law.presliding,
+        level=breakaway,
+        level_interval=_around(breakaway, fit),
+        presliding=fit.law.presliding,
         sizes=sizes,
         low=low,
         high=high,
@@ -335,22 +425,25 @@ def check_friction(
         sticking_step=sticking[0],
         sticking_interval=interval_of(sticking[1:]) if min(sticking) > 0 else (0.0, max(sticking)),
         error_at_rest=error_at_rest,
-        error_interval=_around(error_at_rest, found),
+        error_interval=_around(error_at_rest, fit),
         step=step_metrics(run),
-        settling=fitted.settling(reference, given, answer=run),
+        settling=fitted_loop.settling(reference, filtered, answer=run),
         watched_s=error.size * controller.dt_s,
         left=float(np.max(error[error.size // 2 :])),
         output=run.measured[: _shown_samples(run, reference.size)],
         tracking=slow_sine(
             stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
         ),
-        **beside_recorded(stage, fitted, reference),
+        **beside_recorded(stage, fitted_loop, reference),
     )
 
 
 def _shown_samples(run: ClosedLoopTrajectory, samples: int) -> int:
-    """As many as the trial's step has, or a little more than its settling needs, as far as a picture can show
-    both."""
+    """Number of samples of a run that a picture shows.
+
+    Those of the trial's step, or, where its settling takes longer, a little more than that needs, up to
+    `_MOST_SHOWN` times the step.
+    """
     settling_s = step_metrics(run).settling_time_s
     if settling_s is None:
         return samples
@@ -360,8 +453,12 @@ def _shown_samples(run: ClosedLoopTrajectory, samples: int) -> int:
 
 
 def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> dict[str, Any]:
-    """The loop that made the logs on the same step (T,), and both on the reference of the first log: fields
-    of `FrictionCheck`."""
+    """The loop that made the logs beside the new one: the fields of `FrictionCheck` that begin with
+    "recorded", and `errors`; empty where the logs do not tell that loop.
+
+    It answers the same step (T,); `errors` are the standard deviations of the error on the reference of the
+    first log: as logged, of the recorded loop in simulation, of the new loop.
+    """
     recorded = recorded_loop(stage, loop)
     record = stage.results.records.fitted(stage.config.control_channel)[0]
     if recorded is None or record.reference is None:
@@ -389,7 +486,9 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
     """
     timing = stage.results.records.timing
     law = None if timing is None else timing.law
-    if law is None or law.on_error is None or abs(law.dt_s - loop.controller.dt_s) > 1e-6 * law.dt_s:
+    if law is None or law.on_error is None:
+        return None
+    if abs(law.dt_s - loop.controller.dt_s) > 1e-6 * law.dt_s:
         return None
     numerator, denominator = law.on_error
     state_space = scipy.signal.tf2ss(numerator, denominator)
@@ -438,32 +537,44 @@ def soonest(
     # No more is tried than the bandwidth that was reached, as fewer states do not slow the loop, and nothing
     # else gives way further.
     reached = first.specification or asked
-    kept: dict[str, Any] = {}
+    fixed: dict[str, Any] = {}
     for key, limit in GIVES_WAY.items():
-        kept |= {key: getattr(reached, key), limit: None}
+        fixed |= {key: getattr(reached, key), limit: None}
     if reached.bandwidth_rad_s and reached.bandwidth_rad_s > asked.lowest_bandwidth_rad_s:
-        kept["lowest_bandwidth_rad_s"] = asked.lowest_bandwidth_rad_s
+        fixed["lowest_bandwidth_rad_s"] = asked.lowest_bandwidth_rad_s
     for fewer in range(1, min(3, law.order)):
         if best_s <= enough_s:
             break
-        tried = again(asked.model_copy(update={**kept, "controller_order": law.order - fewer}))
-        if tried.met and tried.controller is not None:
-            tried_s = replace(loop, controller=tried.controller).settling(step).median_s
-            if tried_s < best_s:
-                best = tried
-                best_s = tried_s
+        design = again(asked.model_copy(update={**fixed, "controller_order": law.order - fewer}))
+        if design.met and design.controller is not None:
+            design_s = replace(loop, controller=design.controller).settling(step).median_s
+            if design_s < best_s:
+                best = design
+                best_s = design_s
     return best
 
 
-def _around(value: float, found: FrictionFit) -> Interval:
-    """95 % interval of what is proportional to the level."""
-    share = 1.96 * found.level_std / found.level if found.level > 0 else 0.0
+def _around(value: float, fit: FrictionFit) -> Interval:
+    """95 % interval of a value that is proportional to the level of the friction."""
+    share = 1.96 * fit.level_std / fit.level if fit.level > 0 else 0.0
     return value * max(1 - share, 0.0), value * (1 + share)
 
 
 def holds_from(sizes: Sequence[float] | RealArray, excess: RealArray) -> float | None:
-    """The size from which on, up to the first (largest), the excess (N,) is not positive; between sizes
-    straight over their logarithm."""
+    """The size from which on, up to the largest, an excess is not positive.
+
+    Parameters
+    ----------
+    sizes : (N,) sequence
+        Falling.
+    excess : (N,) array
+        Taken as straight over the logarithm of the size between two of them. nan counts as positive.
+
+    Returns
+    -------
+    float or None
+        None where the excess is positive at the largest size already.
+    """
     over = np.flatnonzero(~(excess <= 0))
     if over.size == 0:
         return float(sizes[-1])
@@ -474,16 +585,32 @@ def holds_from(sizes: Sequence[float] | RealArray, excess: RealArray) -> float |
 
 
 def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on_arm: bool) -> SlowSine:
-    """The error on a slow sine without feed-forward and with it, on the simulated arm as identified or on the
-    identified arm with its friction; after the first quarter of a period."""
+    """Errors of the loop on a slow sine, without friction feed-forward and with it.
+
+    Parameters
+    ----------
+    stage : StageInput
+        With an identified friction.
+    controller : Controller
+    amplitude : float
+        Of the sine, in units of the output.
+    on_arm : bool
+        On the simulated arm of the run; else on the identified arm with its friction.
+
+    Returns
+    -------
+    SlowSine
+        Errors after the first quarter of a period, in which the loop leaves its rest.
+    """
     assert stage.results.identify.friction is not None
-    found = resampled_friction(stage.results.identify.friction, controller.dt_s)
-    forward = friction_feedforward(controller, found)
-    period = int(min(_SLOW * forward.lag_s / controller.dt_s, _LONGEST))
+    fit = resampled_friction(stage.results.identify.friction, controller.dt_s)
+    forward = friction_feedforward(controller, fit)
+    period = int(min(_PERIOD_OVER_DELAY * forward.lag_s / controller.dt_s, _LONGEST_PERIOD))
     omega = 2 * np.pi / (period * controller.dt_s)
     reference = amplitude * np.sin(2 * np.pi * np.arange(round(1.25 * period)) / period)
-    given = stage.results.reference_filter.filter
-    reference = reference if given is None else given.filtered(reference)
+    reference_filter = stage.results.reference_filter.filter
+    if reference_filter is not None:
+        reference = reference_filter.filtered(reference)
     errors = []
     for feedforward in (None, forward):
         law = replace(controller, feedforward=feedforward)
@@ -491,15 +618,15 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
         if on_arm:
             run = simulate(law, reference=reference, **loop_of_arm(stage.config, noise))
         else:
-            run = FrictionLoop.of(law, found).run(reference, noise)
+            run = FrictionLoop.of(law, fit).run(reference, noise)
         errors.append((run.reference - run.measured)[period // 4 :])
-    linear = FrictionLoop(controller, found, found.coefficients, FrictionLaw(0.0)).run(reference)
-    rest = (linear.reference - linear.measured)[period // 4 :]
+    linear = FrictionLoop(controller, fit, fit.coefficients, FrictionLaw(0.0)).run(reference)
+    linear_error = (linear.reference - linear.measured)[period // 4 :]
     return SlowSine(
         amplitude=amplitude,
         omega_rad_s=omega,
-        linear_rms=float(np.sqrt(np.mean(rest**2))),
+        linear_rms=float(np.sqrt(np.mean(linear_error**2))),
         without=errors[0],
         given=errors[1],
-        moves_from=FrictionLoop.of(controller, found).moving_sine(omega),
+        moves_from=FrictionLoop.of(controller, fit).moving_sine(omega),
     )

@@ -54,13 +54,13 @@ def gave_way(asked: Specification, used: Specification | None) -> tuple[GaveWay,
     -------
     tuple of GaveWay
     """
-    found = []
+    changes = []
     for key, limit in GIVES_WAY.items():
-        most = getattr(asked, limit)
-        if used is None or most is None:
+        how_far = getattr(asked, limit)
+        if used is None or how_far is None:
             continue
         before = getattr(asked, key)
         after = getattr(used, key)
         if abs(after - before) > _SAME * before:
-            found.append(GaveWay(key, before, after, most, _CAPTIONS[key]))
-    return tuple(found)
+            changes.append(GaveWay(key, before, after, how_far, _CAPTIONS[key]))
+    return tuple(changes)

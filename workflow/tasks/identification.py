@@ -41,14 +41,18 @@ from workflow.tasks.results import IdentifiedChannel, IdentifyResult
 from workflow.tasks.stage import StageInput
 from workflow.text.templates import said
 
-_OF_THE_FIT = 0.6  # share of the time; the stabilisation plot takes the rest
-# Samples of a record that tell whether its command follows its output.
-_TELLING = 50_000
+# Share of the time that the fit takes; the stabilisation plot takes the rest. For the progress bar only.
+_SHARE_OF_FIT = 0.6
+# Samples of a record, from its start, that are searched for feedback from its output. Chosen for speed.
+_SAMPLES_FOR_FEEDBACK = 50_000
 
 
 def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
-    """The channel's columns as the pole search sees them: as measured, as increments, or inside the band; as
-    if there were no friction, where it is given."""
+    """The channel's columns of a record as the pole search sees them: one input, one output.
+
+    As if there were no friction, where a `friction` is passed; else as increments, inside the channel's band,
+    or as measured.
+    """
     record = record.siso(channel.input, channel.output)
     if friction is not None:
         return friction.taken_off(record)
@@ -58,15 +62,18 @@ def as_fitted(record: Record, channel: Channel, friction: FrictionFit | None = N
 
 
 def as_bounded(record: Record, channel: Channel, friction: FrictionFit | None = None) -> Record:
-    """The channel's columns as the ellipses see them; the same unless a wider band is given for them."""
+    """The channel's columns of a record as the ellipses see them: as the pole search does, unless the channel
+    states a wider band for them."""
     if channel.bounds_band_rad_s is None:
         return as_fitted(record, channel, friction)
     return _inside(record.siso(channel.input, channel.output), channel, channel.bounds_band_rad_s)
 
 
 def _inside(record: Record, channel: Channel, band_rad_s: tuple[float, float]) -> Record:
-    """The record within a band; without the start that the filter spoils, unless it starts from rest, of a
-    short one half."""
+    """A record within a band [rad/s], without the start that the filter spoils.
+
+    A record from rest keeps its start; of a short one at most half is left out.
+    """
     filtered = band_limited(record, *band_rad_s)
     if channel.identification.estimate_initial_state is False:
         return filtered
@@ -75,28 +82,44 @@ def _inside(record: Record, channel: Channel, band_rad_s: tuple[float, float]) -
 
 
 def _searched_around(channel: Channel, dt_s: float) -> IdentOptions:
-    """No pair far outside the band, unless bounds are stated: it could only fit the filter's skirts."""
-    options, band = channel.identification, channel.band_rad_s
+    """Options of the pole search that keep its pairs within an octave of the channel's band, unless bounds
+    are stated: a pair far outside could only fit the filter's skirts."""
+    options = channel.identification
+    band = channel.band_rad_s
     if band is None or options.coordinates == "raw":
         return options
-    bounds = {"omega_min_rad_s": band[0] / 2, "omega_max_rad_s": min(2 * band[1], 0.9 * np.pi / dt_s)}
-    return options.model_copy(update={k: v for k, v in bounds.items() if getattr(options, k) is None})
+    bounds = {}
+    if options.omega_min_rad_s is None:
+        bounds["omega_min_rad_s"] = band[0] / 2
+    if options.omega_max_rad_s is None:
+        bounds["omega_max_rad_s"] = min(2 * band[1], 0.9 * np.pi / dt_s)
+    return options.model_copy(update=bounds)
 
 
 def identify_channels(stage: StageInput) -> IdentifyResult:
-    """Fit every channel; free runs on all validation and repeat records."""
-    config, records = stage.config, stage.results.records
+    """Models of every channel, with free runs on all validation and repeat records.
+
+    Raises
+    ------
+    InputError
+        One line that names the channel, where its logs cannot carry a model.
+    """
+    config = stage.config
+    records = stage.results.records
     unseen = [(item.record, item.role) for item in records.records if item.role != "estimation"]
-    friction, shaft = None, config.control_channel
+
+    # Friction is that of the shaft whose position is fed back; all channels share it.
+    friction = None
+    shaft = config.control_channel
     if config.friction_identified:
         with naming(f"channel {shaft.label!r}"):
             progress = partial(stage.progress.update, "identify", 0.0)
-            others = [one for one in config.channels if one is not shaft]
+            other_channels = [channel for channel in config.channels if channel is not shaft]
             friction = shaft_friction(
                 records.fitted(shaft),
                 shaft,
                 lambda done, what: progress(what),
-                free=any(one.uncertainty.friction_identified for one in others),
+                free=any(channel.uncertainty.friction_identified for channel in other_channels),
             )
     in_loop = isinstance(config.source, FileSource) and (
         config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
@@ -137,7 +160,9 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
 
 def made_in_loop(measured: Sequence[Record]) -> bool:
     """Whether records of the output that may be fed back were made in closed loop."""
-    return recorded_in_loop([record.slice(0, min(record.n_samples, _TELLING)) for record in measured])
+    return recorded_in_loop(
+        [record.slice(0, min(record.n_samples, _SAMPLES_FOR_FEEDBACK)) for record in measured]
+    )
 
 
 def shaft_friction(
@@ -147,11 +172,26 @@ def shaft_friction(
     *,
     free: bool = False,
 ) -> FrictionFit:
-    """Coulomb friction of the shaft whose position a channel measures; free: as of `fit_friction`, for other
-    outputs behind the same friction."""
-    found = fit_friction(measured, channel.identification, free=free, progress=report)
-    refuse_unseen_shaft(found, measured)
-    return found
+    """Coulomb friction of the shaft whose position a channel measures.
+
+    Parameters
+    ----------
+    measured : sequence of Record
+        One input, one output, as recorded.
+    channel : Channel
+    report : callable
+        Called with the share that is done and a line.
+    free : bool
+        See `fit_friction`: for other outputs behind the same friction.
+
+    Raises
+    ------
+    ValueError
+        One line: the logs do not show this friction.
+    """
+    friction = fit_friction(measured, channel.identification, free=free, progress=report)
+    refuse_unseen_shaft(friction, measured)
+    return friction
 
 
 def identify_channel(
@@ -166,18 +206,38 @@ def identify_channel(
     units: float = 1.0,
     law: RecordedLaw | None = None,
 ) -> IdentifiedChannel:
-    """One channel from records: what `flexlink run` and `flexlink identify` do.
+    """The model of one channel from its records, in `flexlink run` and `flexlink identify` alike.
 
-    measured: SISO, as recorded; unseen: others, with their roles; loop: how to use logs made in closed loop,
-    None for others; friction: of the shaft that the output is the position of; units: as of
-    `with_stated_controller`; law: that repeats the command of these records, where one is known. Raises
-    ValueError, one line, where the logs cannot carry it.
+    Parameters
+    ----------
+    channel : Channel
+    measured : sequence of Record
+        The fit's records as recorded, one input and one output.
+    unseen : sequence of tuples of Record and role
+        Records that are not fitted, for free runs.
+    loop : ClosedLoopData or None
+        How logs that were made in closed loop are used; None: these were not.
+    report : callable
+        Called with the share that is done and a line.
+    friction : FrictionFit, optional
+        Of the shaft that the output is the position of.
+    with_plot : bool
+        Also compute the stabilisation plot.
+    units : float
+        See `with_stated_controller`.
+    law : RecordedLaw, optional
+        A law that repeats the command of these records.
+
+    Raises
+    ------
+    ValueError
+        One line: the logs cannot carry a model.
     """
     if channel.uncertainty.friction_remote:
         return _behind_remote_friction(
             channel, measured, unseen, loop, report, with_plot=with_plot, units=units
         )
-    options, given = _searched_around(channel, measured[0].dt_s), None
+    options = _searched_around(channel, measured[0].dt_s)
     # The arm with friction was fitted without delay, and a closed loop looks like one.
     as_logged = options if friction is None and loop is None else options.with_delay_stated()
     # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
@@ -187,6 +247,7 @@ def identify_channel(
     doubts = list(distinct([*doubts, *early_doubts(measured)]))
 
     def fitted(opened: TwoStage | None, closed_loop: Finding | None = None) -> IdentifiedChannel:
+        """The channel from records that a reference opened, or, None, from the records as logged."""
         if opened is None:
             bounded = [as_bounded(record, channel, friction) for record in measured]
             used = [as_fitted(record, channel, friction) for record in measured]
@@ -194,7 +255,7 @@ def identify_channel(
             used = bounded = list(opened.records)
             if channel.bounds_band_rad_s is not None:
                 used = [as_fitted(record, channel) for record in bounded]
-        found = identified_channel(
+        identified = identified_channel(
             channel.label,
             used,
             fresh,
@@ -205,15 +266,20 @@ def identify_channel(
         )
         if friction is not None:
             # What stands at its limit is seen in what was measured, not where the friction is taken off.
-            others = [w for w in found.identification.search.warnings if w.kind is not FindingKind.CLIPPED]
-            found = with_warnings(found, [*others, *clipped(measured)])
-        warnings = [*doubts, *amplitude_effects(measured), *found.identification.warnings]
-        model = found.model
-        if (band := channel.data_band_rad_s) is not None:
+            not_clipped = [
+                warning
+                for warning in identified.identification.search.warnings
+                if warning.kind is not FindingKind.CLIPPED
+            ]
+            identified = with_warnings(identified, [*not_clipped, *clipped(measured)])
+        warnings = [*doubts, *amplitude_effects(measured), *identified.identification.warnings]
+        model = identified.model
+        band = channel.data_band_rad_s
+        if band is not None:
             # The search may go an octave further.
             warnings += pairs_outside(model.poles, options.fixed(), model.dt_s, band)
         return replace(
-            with_warnings(found, [*warnings, *(opened.warnings if opened else ())]),
+            with_warnings(identified, [*warnings, *(opened.warnings if opened else ())]),
             bounded=tuple(bounded),
             increments=channel.increments,
             band_rad_s=channel.band_rad_s,
@@ -222,28 +288,41 @@ def identify_channel(
         )
 
     if friction is not None:
-        return fitted(
-            None,
-            finding(FindingKind.DIRECT_WITH_FRICTION) if friction.observed and loop is not None else None,
-        )
+        closed_loop = None
+        if friction.observed and loop is not None:
+            closed_loop = finding(FindingKind.DIRECT_WITH_FRICTION)
+        return fitted(None, closed_loop)
     if loop is None:
         return fitted(None)
+
+    # Where a known law on the error made the command, that loop itself opens the records.
     moving = all(record.reference is not None and np.ptp(record.reference) > 0 for record in measured)
     controlled = loop.controlled
-    ways = [("two_stage", moving), ("direct", True), ("indirect", controlled)]
-    explained = None
     filtered = channel.increments or channel.band_rad_s is not None
     by_reference = moving and not filtered and loop.method in ("auto", "two_stage")
     if by_reference and law is not None and law.on_error is not None:
-        found_in_loop = _in_recorded_loop(fitted, measured, options, law)
-        if found_in_loop is not None:
-            return found_in_loop
-    for way in [way for way, open_ in ways if open_] if loop.method == "auto" else [loop.method]:
+        in_recorded_loop = _in_recorded_loop(fitted, measured, options, law)
+        if in_recorded_loop is not None:
+            return in_recorded_loop
+
+    # Ways to use logs of a loop, in this order: the first one that explains the command, or whose residuals
+    # the loop did not feed back.
+    if loop.method != "auto":
+        ways = [loop.method]
+    else:
+        ways = ["direct"]
+        if moving:
+            ways.insert(0, "two_stage")
+        if controlled:
+            ways.append("indirect")
+    explained = None
+    remark = None
+    for way in ways:
         if way == "direct":
-            found = fitted(None)
-            given, spoilt = _direct(found, explained, stated=loop.method == "direct")
+            direct = fitted(None)
+            remark, spoilt = _direct(direct, explained, stated=loop.method == "direct")
             if not spoilt or loop.method != "auto":
-                return replace(found, closed_loop=given)
+                return replace(direct, closed_loop=remark)
             continue
         known = measured if way == "two_stage" else with_stated_controller(measured, loop, units)
         opened = two_stage([as_bounded(record, channel) for record in known], options)
@@ -251,8 +330,9 @@ def identify_channel(
         if explained >= EXPLAINED_PERCENT or loop.method != "auto":
             kind = FindingKind.TWO_STAGE if way == "two_stage" else FindingKind.INDIRECT
             return fitted(opened, finding(kind, **opened.finding.values))
-    assert given is not None
-    raise ValueError(said("loop_refused", given.values, controlled))
+    # "direct" is among the ways of "auto", and a stated way has returned.
+    assert remark is not None
+    raise ValueError(said("loop_refused", remark.values, controlled))
 
 
 def _behind_remote_friction(
@@ -265,11 +345,11 @@ def _behind_remote_friction(
     with_plot: bool,
     units: float,
 ) -> IdentifiedChannel:
-    """The channel from records without the friction of a shaft that the sensor does not see, with that
-    friction; arguments as of `identify_channel`.
+    """The channel from records without the friction of a shaft that the sensor does not see, with `remote`.
 
-    The law of a controller made the command, not what friction leaves of it, so it is of no use here. Raises
-    ValueError, one line, where the logs were not made in a loop or do not tell such a friction.
+    Parameters are those of `identify_channel`, but for the law: that made the command, not what friction
+    leaves of it, so it is of no use here. Raises ValueError, one line, where the logs were not made in a loop
+    or do not tell such a friction.
     """
     if loop is None:
         raise ValueError("response = 'without remote friction' is for logs of a loop; none was seen in these")
@@ -282,8 +362,8 @@ def _behind_remote_friction(
         (without_remote_friction(record.siso(channel.input, channel.output), remote), role)
         for record, role in unseen
     ]
-    found = identify_channel(plain, free, free_unseen, loop, report, with_plot=with_plot, units=units)
-    return replace(found, remote=remote)
+    identified = identify_channel(plain, free, free_unseen, loop, report, with_plot=with_plot, units=units)
+    return replace(identified, remote=remote)
 
 
 def _in_recorded_loop(
@@ -304,56 +384,75 @@ def _in_recorded_loop(
     opened = opened_by_loop(measured, law, options)
     if min(opened.fit_percent) < EXPLAINED_PERCENT:
         return None
-    found = fitted(opened, opened.finding)
-    if found.model.feedthrough:
-        return found
-    percent = [fit_in_loop(found.model, record, law).fit_percent for record in measured]
+    identified = fitted(opened, opened.finding)
+    if identified.model.feedthrough:
+        return identified
+    percent = [fit_in_loop(identified.model, record, law).fit_percent for record in measured]
     if min(percent) < EXPLAINED_PERCENT:
         return None
     explained = {"least_in_loop_percent": min(percent), "most_in_loop_percent": max(percent)}
-    return replace(found, closed_loop=finding(FindingKind.TWO_STAGE, **opened.finding.values, **explained))
+    return replace(
+        identified, closed_loop=finding(FindingKind.TWO_STAGE, **opened.finding.values, **explained)
+    )
 
 
 def with_stated_controller(
     measured: Sequence[Record], loop: ClosedLoopData, units: float = 1.0
 ) -> list[Record]:
-    """The records with what the stated controller tells of the reference. units: of the records, over those
-    of the logs, in which the controller is: scale of the input over that of the output. Raises InputError for
-    a file that holds none."""
+    """The records with a reference made of the stated controller, each shorter by its order.
+
+    Parameters
+    ----------
+    measured : sequence of Record
+        One input, one output.
+    loop : ClosedLoopData
+        With a controller, or a file of one.
+    units : float
+        Scale of the input over that of the output, from the logs to the records: the controller is in units
+        of the logs.
+
+    Raises
+    ------
+    InputError
+        One line: a file that holds no controller.
+    """
     if loop.controller is not None:
-        numerator, denominator = list(loop.controller.numerator), list(loop.controller.denominator)
+        numerator = list(loop.controller.numerator)
+        denominator = list(loop.controller.denominator)
     else:
         from workflow.tasks.system_files import read_controller  # what reads systems is slow to load
 
         assert loop.controller_file is not None
         numerator, denominator = read_controller(loop.controller_file, measured[0].dt_s)
-    numerator = [units * one for one in numerator]
+    numerator = [units * coefficient for coefficient in numerator]
     return [with_controller(record, numerator, denominator) for record in measured]
 
 
-def _direct(found: IdentifiedChannel, explained: float | None, *, stated: bool) -> tuple[Finding, bool]:
-    """What is to be said of the logged input taken as it is, and whether noise that the loop fed back spoils
-    the model.
+def _direct(channel: IdentifiedChannel, explained: float | None, *, stated: bool) -> tuple[Finding, bool]:
+    """What is to be said of a fit by the logged input, and whether noise that the loop fed back spoils it.
 
     Feedback does no harm where the residuals are not found again in later inputs; else what they have in
     common with the input is held against the ellipses, which take model and noise as independent.
     """
-    model, residuals = found.model, found.identification.residuals
+    model = channel.model
+    residuals = channel.identification.residuals
     delay = model.input_delay_samples
-    inputs = [record.input[: record.n_samples - delay, 0] for record in found.used]
-    why, times = "clean", 0.0
+    inputs = [record.input[: record.n_samples - delay, 0] for record in channel.used]
+    why = "clean"
+    times = 0.0
     if independence_test(inputs, residuals).precedes_input:
         bounds = EmbeddingOptions(coloured_noise=True, max_ar_order=NOISE_ORDERS[-1])
-        times = fed_back(tangent(found.bounded, model, bounds), found.bounded)
+        times = fed_back(tangent(channel.bounded, model, bounds), channel.bounded)
         why = "small" if times <= 1 else "spoilt"
-    told = {} if explained is None else {"explained_percent": explained}
-    return finding(FindingKind.DIRECT, why=why, times=times, stated=stated, **told), why == "spoilt"
+    by_reference = {} if explained is None else {"explained_percent": explained}
+    remark = finding(FindingKind.DIRECT, why=why, times=times, stated=stated, **by_reference)
+    return remark, why == "spoilt"
 
 
-def with_warnings(found: IdentifiedChannel, warnings: Sequence[Finding]) -> IdentifiedChannel:
-    """The channel with this as what is doubtful of its model."""
-    search = replace(found.identification.search, warnings=tuple(warnings))
-    return replace(found, identification=replace(found.identification, search=search))
+def with_warnings(channel: IdentifiedChannel, warnings: Sequence[Finding]) -> IdentifiedChannel:
+    """The channel with these warnings of its model in place of its own."""
+    search = replace(channel.identification.search, warnings=tuple(warnings))
+    return replace(channel, identification=replace(channel.identification, search=search))
 
 
 def identified_channel(
@@ -366,40 +465,59 @@ def identified_channel(
     with_plot: bool = True,
     friction: FrictionFit | None = None,
 ) -> IdentifiedChannel:
-    """Model of SISO records as the fit is to see them, with free runs on the records it does not see.
+    """A channel from records that are prepared for the fit.
 
-    friction: taken off these records; of logs made in a loop, everything is over windows and behind its
-    observer, because the arm drifts.
+    Parameters
+    ----------
+    name : str
+    used : sequence of Record
+        One input, one output, as the fit is to see them.
+    fresh : sequence of tuples of Record and role
+        Records that the fit does not see, prepared alike, for free runs.
+    options : IdentOptions
+    report : callable
+        Called with the share that is done and a line.
+    with_plot : bool
+        Also compute the stabilisation plot.
+    friction : FrictionFit, optional
+        Was taken off these records. Of logs made in a loop, model and free runs are over windows and behind
+        its observer, because the arm drifts.
     """
-    share, in_loop = _OF_THE_FIT if with_plot else 1.0, friction is not None and friction.observed
+    share = _SHARE_OF_FIT if with_plot else 1.0
+    in_loop = friction is not None and friction.observed
 
     def part(done: float, what: str) -> None:
         report(share * done, what)
 
     if friction is not None and in_loop:
-        found = identify_behind(friction, used, options, part)
-        options = options.model_copy(update={"input_delay_samples": found.model.input_delay_samples})
+        identification = identify_behind(friction, used, options, part)
+        options = options.model_copy(update={"input_delay_samples": identification.model.input_delay_samples})
     else:
-        found = identify(used, options, progress=part)
+        identification = identify(used, options, progress=part)
     again = fit_in_windows if in_loop else fit_on_fresh_data
-    fits = tuple(again(found.model, record) for record, _ in fresh)
+    fits = tuple(again(identification.model, record) for record, _ in fresh)
     unseen = [
         finding(FindingKind.NO_ANSWER_THERE, record=record.label, fit_percent=fit.fit_percent)
         for fit, (record, _) in zip(fits, fresh, strict=True)
         if not fit.answers
     ]
     # All of its warnings are looked for now, so that it is a plain value.
-    found = replace(found, search=replace(found.search, warnings=(*found.warnings, *unseen)), advise=tuple)
-    plot = (
-        stabilisation(
-            used, found, options, progress=lambda done, what: report(share + (1 - share) * done, what)
-        )
-        if with_plot
-        else None
+    identification = replace(
+        identification,
+        search=replace(identification.search, warnings=(*identification.warnings, *unseen)),
+        advise=tuple,
     )
+    plot = None
+    if with_plot:
+        plot = stabilisation(
+            used,
+            identification,
+            options,
+            progress=lambda done, what: report(share + (1 - share) * done, what),
+        )
     return IdentifiedChannel(
         name=name,
-        identification=found,
+        identification=identification,
         used=tuple(used),
         bounded=tuple(used),
         fresh=fits,

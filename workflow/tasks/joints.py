@@ -46,16 +46,25 @@ Real = npt.NDArray[np.float64]
 
 
 def _of(stage: StageInput) -> tuple[JointsConfig, Any]:
-    """The configuration and the results, as what they are."""
+    """Configuration and results of a stage by their types in a run for several joints."""
     config: Any = stage.config
     return config, stage.results
 
 
 def identify_points(stage: StageInput) -> PointModels:
-    """A model and its ball for every operating point; each search begins at the poles of the point before."""
+    """A model and its uncertainty ball for every operating point.
+
+    Each search begins at the poles of the point before: they move little between operating points.
+
+    Raises
+    ------
+    InputError
+        One line that names the operating point.
+    """
     config, results = _of(stage)
     options = config.identification
     least = min(config.dead_times)
+    # A delay that all inputs share is the model's, the rest of each is taken off its signal beforehand.
     later = tuple(delay - least for delay in config.dead_times)
     asked = IdentOptions(
         integrators=options.integrators,
@@ -72,62 +81,85 @@ def identify_points(stage: StageInput) -> PointModels:
         prepared.setdefault((item.condition or "arm", item.role), []).append(record)
     # A free run of joints that turn freely drifts away, that of differences does not.
     again = fit_on_fresh_data if options.increments else fit_in_windows
-    found: list[PointModel] = []
+    points: list[PointModel] = []
     start: Poles | None = None
     for number, name in enumerate(names):
 
         def report(fraction: float, message: str, number: int = number, name: str = name) -> None:
             stage.progress.update("identify", (number + fraction) / len(names), f"{name}: {message}")
 
-        records, fresh = prepared[name, "estimation"], prepared.get((name, "validation"), [])
+        records = prepared[name, "estimation"]
+        fresh = prepared.get((name, "validation"), [])
         remarks: tuple[Finding, ...] = ()
         with naming(f"operating point {name!r}"):
             if any(record.reference is not None for record in records):
                 stages = two_stage_several(records, asked, start=start, progress=report)
                 assert stages.plant is not None
-                records, start = list(stages.records), stages.plant.poles
+                records = list(stages.records)
+                start = stages.plant.poles
                 remarks = stages.finding, *stages.warnings
-            one = identify_mimo(records, asked, start=start, progress=report)
-            ball = matrix_posterior(records, one, level=options.level)
-            outputs = list(enumerate(one.model.outputs))
-            fits = [tuple(again(own, record.only(k)) for k, own in outputs) for record in fresh]
+            identified = identify_mimo(records, asked, start=start, progress=report)
+            ball = matrix_posterior(records, identified, level=options.level)
+            outputs = list(enumerate(identified.model.outputs))
+            fits = [
+                tuple(again(output_model, record.only(k)) for k, output_model in outputs) for record in fresh
+            ]
             remarks += tuple(
                 finding(
                     FindingKind.NO_ANSWER_THERE, record=f"{fit.name}, {output}", fit_percent=fit.fit_percent
                 )
-                for each in fits
-                for fit, output in zip(each, one.model.output_names, strict=True)
+                for fits_of_record in fits
+                for fit, output in zip(fits_of_record, identified.model.output_names, strict=True)
                 if not fit.answers
             )
             # A colour of the noise is the ball's own.
-            remarks += tuple(item for item in one.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL)
+            remarks += tuple(
+                item for item in identified.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL
+            )
             low = options.lowest_rad_s
-            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / one.model.dt_s), FREQUENCIES))
-            noise_std = np.sqrt(np.diag(one.noise_covariance))
-            found.append(
+            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / identified.model.dt_s), FREQUENCIES))
+            noise_std = np.sqrt(np.diag(identified.noise_covariance))
+            Li_a, Li_b, Li_c, Li_d = ball.input_factor(low)
+            points.append(
                 PointModel(
-                    name, one.model, noise_std, one.output_fit_percent, one.rank_one, ball.output_factor,
-                    *ball.input_factor(low), ball.largest_radius(low), shown, remarks, later, tuple(fits),
+                    name=name,
+                    model=identified.model,
+                    noise_std=noise_std,
+                    fit_percent=identified.output_fit_percent,
+                    rank_one=identified.rank_one,
+                    Lo=ball.output_factor,
+                    Li_a=Li_a,
+                    Li_b=Li_b,
+                    Li_c=Li_c,
+                    Li_d=Li_d,
+                    radius=ball.largest_radius(low),
+                    shown=shown,
+                    warnings=remarks,
+                    later=later,
+                    fresh=tuple(fits),
                 )
-            )  # fmt: skip
-        start = one.model.poles
-    return PointModels(tuple(found))
+            )
+        start = identified.model.poles
+    return PointModels(tuple(points))
 
 
 def _with_later_inputs(record: Record, later: tuple[int, ...]) -> Record:
-    """Each input as it stands when it begins to act; the samples before the first of them are left out."""
-    most = max(later)
-    held = [record.input[most - delay : record.n_samples - delay, k] for k, delay in enumerate(later)]
-    return replace(record.slice(most, record.n_samples), input=np.column_stack(held))
+    """The record with each input as it stands when it begins to act: later by so many samples.
+
+    The samples before the last of them begins to act are left out.
+    """
+    longest = max(later)
+    held = [record.input[longest - delay : record.n_samples - delay, k] for k, delay in enumerate(later)]
+    return replace(record.slice(longest, record.n_samples), input=np.column_stack(held))
 
 
 def design_joints(stage: StageInput) -> DesignResult:
-    """One controller for all operating points."""
+    """One controller for all operating points, and in one line how far it is from the specification."""
     config, results = _of(stage)
     plants = _plants(config, results)
     with naming("design"):
         try:
-            found = synthesise_multivariable(
+            synthesis = synthesise_multivariable(
                 plants,
                 config.specification(),
                 config.design.search,
@@ -135,15 +167,14 @@ def design_joints(stage: StageInput) -> DesignResult:
             )
         except SpecificationError as impossible:
             return DesignResult(None, met=False, reason=str(impossible))
-    first = found.blocking[0]
-    joint = config.joints[first.joint or 0]
-    return DesignResult(
-        found,
-        found.gamma <= 1.0,
-        f"worst case {found.gamma:.3f} (at most 1 is needed), of {first.weight} of "
-        f"{joint.input if first.weight == 'effort' else joint.output}, {first.plant}, at "
-        f"{first.omega_rad_s:.3g} rad/s",
+    blocking = synthesis.blocking[0]
+    joint = config.joints[blocking.joint or 0]
+    signal = joint.input if blocking.weight == "effort" else joint.output
+    reason = (
+        f"worst case {synthesis.gamma:.3f} (at most 1 is needed), of {blocking.weight} of "
+        f"{signal}, {blocking.plant}, at {blocking.omega_rad_s:.3g} rad/s"
     )
+    return DesignResult(synthesis, synthesis.gamma <= 1.0, reason)
 
 
 def _plants(config: JointsConfig, results: Any) -> list[MultivariablePlant]:
@@ -151,21 +182,26 @@ def _plants(config: JointsConfig, results: Any) -> list[MultivariablePlant]:
 
 
 def certify_joints(stage: StageInput) -> JointsCertificate:
-    """Checked independently of the synthesis, for all frequencies."""
+    """The certificate of the controller, computed independently of the synthesis, for all frequencies."""
     config, results = _of(stage)
     law = results.design.controller
-    return JointsCertificate(
-        None if law is None else certify_multivariable(law, _plants(config, results), config.specification())
-    )
+    if law is None:
+        return JointsCertificate(None)
+    return JointsCertificate(certify_multivariable(law, _plants(config, results), config.specification()))
 
 
 def run_loops(stage: StageInput) -> JointsLoopResult:
-    """A step of all joints at every operating point: on the nonlinear machine as identified and under further
-    payloads and friction, or on the models where records are logs."""
+    """A step of all joints at every operating point.
+
+    On the nonlinear machine as identified and under further payloads and friction, or on the models where
+    records are logs.
+    """
     config, results = _of(stage)
-    law, source = results.design.controller, config.source
+    law = results.design.controller
+    source = config.source
     if law is None:
         return JointsLoopResult(skipped=results.design.reason)
+    # Twenty time constants of the slowest joint, unless a time is stated.
     bandwidth = min((joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s), default=1.0)
     samples = int(np.ceil((config.closed_loop.duration_s or 20.0 / bandwidth) / law.dt_s))
     step = np.array(config.closed_loop.step or (0.1,) * len(config.joints))
@@ -178,43 +214,53 @@ def run_loops(stage: StageInput) -> JointsLoopResult:
         with naming("closed loop"):
             output, command = simulate_joints(law, machine(), reference)
         runs.append(_judged(point, condition, output, command, step, law))
-    kind: Literal["simulated", "identified"] = (
-        "simulated" if isinstance(source, TwoJointSource) else "identified"
-    )
+    kind: Literal["simulated", "identified"] = "identified"
+    if isinstance(source, TwoJointSource):
+        kind = "simulated"
     return JointsLoopResult(kind, np.asarray(np.arange(samples) * law.dt_s), reference, tuple(runs))
 
 
 def _judged(
     point: str, condition: str, output: Real, command: Real, step: Real, law: Controller
 ) -> JointsRun:
+    """A run with what is read off it. output (T, Y) on a step (Y,), command (T, U)."""
     late = output[-max(1, len(output) // 20) :]
-    size = np.where(step, np.abs(step), np.max(np.abs(step)))  # of a joint that is to rest: the others' step
+    # A joint that is to rest is judged by the largest step of the others.
+    size = np.where(step, np.abs(step), np.max(np.abs(step)))
     settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < SETTLED * size))
-    beyond = np.max(np.where(step < 0, -1.0, 1.0) * (output - step) / size, axis=0)
-    limits = law.limits("input_limit")
+    direction = np.where(step < 0, -1.0, 1.0)
+    overshoot = np.max(direction * (output - step) / size, axis=0)
+    at_limit = np.any(np.abs(command) >= law.limits("input_limit") * (1 - 1e-9), axis=1)
     return JointsRun(
-        point, condition, output, command, settled, beyond,
-        float(np.mean(np.any(np.abs(command) >= limits * (1 - 1e-9), axis=1))),
-    )  # fmt: skip
+        point=point,
+        condition=condition,
+        output=output,
+        command=command,
+        settled=settled,
+        overshoot=overshoot,
+        limited=float(np.mean(at_limit)),
+    )
 
 
 def _machines(
     config: JointsConfig, results: Any, stage: StageInput
 ) -> list[tuple[str, str, Callable[[], Any]]]:
-    source, options = config.source, config.closed_loop
+    """Machines to run the loop on: operating point, condition in words, and a function that makes it."""
+    source = config.source
+    options = config.closed_loop
     if not isinstance(source, TwoJointSource):
         return [
             (point.name, "identified model", partial(LinearMachine, point.plant(0.0).nominal))
             for point in results.identify.points
         ]
-    found: list[tuple[str, str, Callable[[], Any]]] = []
+    machines: list[tuple[str, str, Callable[[], Any]]] = []
     for point in source.points:
         at = partial(machine_at, source, point, stage.rng("closed_loop", point.name))
-        found.append((point.name, "as identified", partial(at, coulomb_Nm=source.coulomb_Nm)))
+        machines.append((point.name, "as identified", partial(at, coulomb_Nm=source.coulomb_Nm)))
         for extra in options.extra_payload_kg:
             words = f"payload {point.payload_kg + extra:g} kg"
-            found.append((point.name, words, partial(at, coulomb_Nm=source.coulomb_Nm, extra_kg=extra)))
+            machines.append((point.name, words, partial(at, coulomb_Nm=source.coulomb_Nm, extra_kg=extra)))
         if options.coulomb_Nm is not None:
             words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
-            found.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
-    return found
+            machines.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
+    return machines

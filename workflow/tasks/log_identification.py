@@ -26,11 +26,26 @@ from workflow.tasks.uncertainty import uncertainty_of
 class LogIdentification:
     """Everything that was found in a set of logs.
 
-    `measured` are the records as read; `about` and `spread` results as of a run's stages; `careful` says what
-    to look at. The stabilisation plot is None where nobody asked for it. `true_modes`: beside each mode of
-    `about` the true one, known of simulated logs. `described`: what the ellipses are about; friction:
-    identified, where that asks for it; equivalent: the viscous friction that acts like it, where it asks for
-    an amplitude. input_limit: that the amplifier gives, where it was stated.
+    Attributes
+    ----------
+    measured, fresh_records : tuples of Record
+        As read: those of the fit, and those for free runs.
+    options : IdentOptions
+        Of the pole search.
+    about : IdentifiedChannel
+        Model and free runs, as the stage "identify" of a run leaves them.
+    spread : UncertainChannel
+        Ellipses and tests, as the stage "uncertainty" leaves them.
+    described : UncertaintyOptions
+        What the ellipses describe.
+    friction : FrictionFit or None
+        Identified where `described` asks for it.
+    equivalent : EquivalentFriction or None
+        Viscous friction that acts like the dry one, where `described` asks for an amplitude.
+    true_modes : tuple of TrueMode or None
+        Beside each mode of `about` the true one; known of simulated logs only.
+    input_limit : float or None
+        Of the amplifier, where it was stated, in units of the input.
     """
 
     measured: tuple[Record, ...]
@@ -46,6 +61,7 @@ class LogIdentification:
 
     @property
     def careful(self) -> tuple[Finding, ...]:
+        """What is doubtful of the model and of its ellipses."""
         return (*self.about.identification.warnings, *self.spread.advice)
 
 
@@ -61,12 +77,35 @@ def identify_records(
     timing: CommandTiming | None = None,
     progress: Progress | None = None,
 ) -> LogIdentification:
-    """Identify one channel from SISO records, as a run with these settings does; nothing is written.
+    """The channel of these records as a run with these settings identifies it; nothing is written.
 
-    described: what the ellipses are about, and their level; loop: how to use logs made in closed loop;
-    timing: of the command between two rows, for which the records are corrected. Raises InputError.
+    Parameters
+    ----------
+    measured : sequence of Record
+        One input, one output, one sampling time.
+    fresh_records : sequence of Record
+        For free runs of the model.
+    options : IdentOptions, optional
+        Of the pole search.
+    described : UncertaintyOptions, optional
+        What the ellipses describe, and their level.
+    band_rad_s : tuple of two float, optional
+        The data are confined to this band [rad/s].
+    loop : ClosedLoopData, optional
+        How logs that were made in closed loop are used.
+    with_plot : bool
+        Also compute the stabilisation plot.
+    timing : CommandTiming, optional
+        Of the command between two rows; the records are corrected for it already.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line: the logs cannot carry a model.
     """
-    progress, described = progress or Progress(), described or UncertaintyOptions()
+    progress = progress or Progress()
+    described = described or UncertaintyOptions()
     loop = loop or ClosedLoopData()
     fit = fit_options(options)
     friction = None

@@ -22,18 +22,39 @@ from ident.data.time_grid import LARGEST_JITTER, clock_doubts, jitter_of, only_r
 from ident.data.units import contradicted_by_loop, refuse_step
 from workflow.engine.errors import naming
 
-_EXACT = 1e-6  # of a step: stamps of a few digits as doubles stray by less
+# Jitter, as a share of a step, that counts as none: stamps of a few digits as doubles stray by less.
+_EXACT = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class TimeLook:
     """How a time column is sampled.
 
-    unit: of the column, as `TimeColumn.unit`. period_s: the usual step. jitter: largest distance of a step
-    from a whole number of them, as a share, 0 where it is the rounding of the stamps. missing: rows that
-    larger steps lack, where jitter leaves no doubt of them; gap_s: the largest step; gap_place: after which
-    row. option: as `option_for`. why: why the stamps are none. runs: names of the first and the last part in
-    which time starts again; the other numbers are of the most uneven one.
+    Where time starts again in a log, the numbers are those of the most uneven part.
+
+    Attributes
+    ----------
+    name, unit : str
+        Of the column; the unit as `TimeColumn.unit`.
+    period_s : float
+        The usual step.
+    jitter : float
+        Largest distance of a step from a whole number of periods, as a share; 0 where it is the stamps'
+        rounding.
+    rounded : bool
+        The stamps stray by their rounding alone.
+    missing : int
+        Rows that larger steps lack, where the jitter leaves no doubt of them.
+    gap_s : float
+        The largest step.
+    gap_place : str
+        After which row it is.
+    option : str
+        What reads the log all the same, as `option_for`.
+    why : str
+        Why the column holds no time stamps; "" where it does.
+    runs : tuple of str
+        Names of the parts in which time starts again.
     """
 
     name: str
@@ -51,8 +72,19 @@ class TimeLook:
 
 @dataclass(frozen=True, eq=False)
 class ColumnLook:
-    """One signal: its numbers (T,), or why there are none. clipped: share of samples that stand at an
-    extreme; step: of its quantisation grid, 0 where there is none."""
+    """One signal of a log.
+
+    Attributes
+    ----------
+    name, unit : str
+    values : (T,) array or None
+        Its numbers; None where `why` says why there are none.
+    why : str
+    clipped : float
+        Share of samples that stand at an extreme.
+    step : float
+        Of its quantisation grid, 0 where there is none.
+    """
 
     name: str
     unit: str
@@ -64,8 +96,19 @@ class ColumnLook:
 
 @dataclass(frozen=True)
 class ResponseLook:
-    """A frequency response: so many points at so many frequencies between two of them, or why it is not
-    understood. spread: it has variances."""
+    """A frequency response in place of a log.
+
+    Attributes
+    ----------
+    points, frequencies : int
+        Rows, and different frequencies among them.
+    low_Hz, high_Hz : float
+        Lowest and highest frequency.
+    spread : bool
+        The file has variances.
+    why : str
+        Why the file is not understood; "" where it is.
+    """
 
     points: int = 0
     frequencies: int = 0
@@ -77,9 +120,28 @@ class ResponseLook:
 
 @dataclass(frozen=True, eq=False)
 class LogLook:
-    """A log: layout of a text file, time, signals; roles: the channel that its names and units tell, if they
-    do, else `unclear` says what to type. response: what it is where it is no log but a frequency response.
-    doubts: what identify says of the way the log is read."""
+    """What a log holds.
+
+    Attributes
+    ----------
+    path : Path
+    rows : int
+        Of its longest column.
+    layout : Layout or None
+        Of a text file.
+    time : TimeLook or None
+        None without a time column.
+    columns : tuple of ColumnLook
+        All but time.
+    roles : Roles or None
+        The channel that names and units of the columns tell.
+    unclear : str
+        What to type where they do not.
+    response : ResponseLook or None
+        Of a file that is no log but a frequency response.
+    doubts : tuple of Finding
+        What `flexlink identify` says of the way in which the log is read.
+    """
 
     path: Path
     rows: int
@@ -102,14 +164,29 @@ class LogLook:
 
 def options_typed(time_unit: str | None, decimal: str | None) -> list[str]:
     """The options, as they were given, without which the next command would read the log otherwise."""
-    given = {"--time-unit": time_unit, "--decimal": decimal}
-    return [f"{option} {value}" for option, value in given.items() if value]
+    typed = {"--time-unit": time_unit, "--decimal": decimal}
+    return [f"{option} {value}" for option, value in typed.items() if value]
 
 
 def look_at(
     path: Path, time: str | None = None, time_unit: str | None = None, decimal: str | None = None
 ) -> LogLook:
-    """Raises InputError: no such file, another format, damaged, no such column."""
+    """What a log holds, before anything is identified from it.
+
+    Parameters
+    ----------
+    path : Path
+        Of a log, or of a frequency response.
+    time : str, optional
+        Name of the time column; None: by the names of the columns.
+    time_unit, decimal : str, optional
+        Unit of its stamps, and decimal sign of a text file, where they are stated.
+
+    Raises
+    ------
+    InputError
+        One line: no such file, another format, damaged, no such column.
+    """
     with naming(str(path)):
         table = read_table(path).with_decimal(decimal)
         if time is not None and time not in table.names:
@@ -117,7 +194,8 @@ def look_at(
     response = None if time is not None else _response(table)
     times = times_in(table) if response is None else []
     time = time or (times[0] if times else None)
-    roles, unclear = None, ""
+    roles = None
+    unclear = ""
     try:
         log = " ".join([path_as_typed(path), *options_typed(time_unit, decimal)])
         roles = roles_of(table, log, "identify", time=time) if response is None else None
@@ -126,22 +204,34 @@ def look_at(
     columns = tuple(_column(table, name) for name in table.names if name != time)
     long = [values for values in table.raw.values() if isinstance(values, tuple) or np.ndim(values)]
     rows = max(map(len, long), default=0)
-    about, doubts, runs = None, list[Finding](), table.runs(time)
+
+    # Time: where it starts again in a log, the most uneven part is described.
+    about = None
+    doubts = list[Finding]()
+    runs = table.runs(time)
     if time is not None:
         # Of a table with rows of their own the stamps of the output's; where it is not known, of those with
         # the most.
         moved = roles.output if roles else None
-        own = max((n for n in table.clocks if n != time), key=lambda n: table.clocks[n].size, default=None)
-        looks = [_time(run, time, time_unit, (moved or own) if table.sparse else None, moved) for run in runs]
-        about, doubts = max(looks, key=lambda one: (one[0].why, one[0].option, one[0].jitter))
+        busiest = max(
+            (name for name in table.clocks if name != time),
+            key=lambda name: table.clocks[name].size,
+            default=None,
+        )
+        rows_of = (moved or busiest) if table.sparse else None
+        looks = [_time(run, time, time_unit, rows_of, moved) for run in runs]
+        about, doubts = max(looks, key=lambda look: (look[0].why, look[0].option, look[0].jitter))
         about = replace(about, runs=tuple(run.run for run in runs if run.run))
+
+    # Doubts about each signal, in the role that it has.
     for column in columns if response is None else ():
         if column.values is not None:
-            inputs, outputs = (
-                ([column.name], []) if roles and column.name == roles.input else ([], [column.name])
-            )
-            if table.sparse and inputs and roles is not None:
-                outputs = [roles.output]
+            inputs: list[str] = []
+            outputs = [column.name]
+            if roles and column.name == roles.input:
+                inputs = [column.name]
+                # An input's rows are read at those of the output where columns have rows of their own.
+                outputs = [roles.output] if table.sparse else []
             for run in runs:
                 values = {name: run.columns([name])[name] for name in (*inputs, *outputs)}
                 doubts += reading_notes(run, values, inputs, outputs)
@@ -173,8 +263,11 @@ def _response(table: Table) -> ResponseLook | None:
 def _time(
     table: Table, name: str, unit: str | None, rows_of: str | None, moved: str | None
 ) -> tuple[TimeLook, list[Finding]]:
-    """rows_of: the column whose rows count in a table whose columns have rows of their own; moved: the
-    output."""
+    """How a time column is sampled, and what is doubtful of it.
+
+    rows_of: the column whose rows count in a table whose columns have rows of their own; moved: the output,
+    None where it is not known.
+    """
     try:
         stamps, column = table.stamps(name, rows_of, unit)
         steps = np.diff(stamps)
@@ -190,22 +283,24 @@ def _time(
     jitter = jitter_of(stamps)
     rounded = jitter > _EXACT and only_rounded(stamps)
     row = int(np.argmax(steps))
-    found = TimeLook(
+    look = TimeLook(
         name,
-        column.unit,
-        float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
-        0.0 if rounded or jitter <= _EXACT else jitter,
-        rounded,
-        int(np.sum(counts - 1)) if jitter <= LARGEST_JITTER else 0,
-        float(steps[row]),
-        table.place(row + 1),
-        option_for(stamps),
+        unit=column.unit,
+        period_s=float((stamps[-1] - stamps[0]) / steps.size) if rounded else period,
+        jitter=0.0 if rounded or jitter <= _EXACT else jitter,
+        rounded=rounded,
+        missing=int(np.sum(counts - 1)) if jitter <= LARGEST_JITTER else 0,
+        gap_s=float(steps[row]),
+        gap_place=table.place(row + 1),
+        option=option_for(stamps),
     )
     doubts = [column.doubt(period)] if column.doubtful else []
     if column.wraps:
         doubts.append(column.timer(str(table.path)))
     # Of uneven stamps the look says what they are itself.
-    return found, [*doubts, *(clock_doubts(stamps, str(table.path)) if not found.option else ())]
+    if not look.option:
+        doubts += clock_doubts(stamps, str(table.path))
+    return look, doubts
 
 
 def _column(table: Table, name: str) -> ColumnLook:

@@ -29,9 +29,12 @@ from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
 from workflow.text.templates import said
 
-_SLEW_SHARE = 0.6  # of the voltage limit that the slew is predicted to use
-_OVERDRIVEN = 2.0  # times the voltage limit that the large step would need
-_PUSH_S = 0.1  # half a period of 5 Hz: it excites the first modes
+# Share of the voltage limit that the slew is predicted to use. Chosen, so that other conditions have room.
+_SLEW_SHARE = 0.6
+# Voltage that the large step would need, over the limit. Chosen; at 1 the limit would not act.
+_OVERDRIVEN = 2.0
+# Length of the push [s]: half a period of 5 Hz, which excites the first modes.
+_PUSH_S = 0.1
 
 
 def condition_run(
@@ -119,7 +122,8 @@ class ConditionBench:
     def slew(self) -> ConditionRun:
         """A smooth move, as large as the voltage allows."""
         n = self.reference.size
-        start, length = n // 20, max(2, round(0.4 * n))
+        start = n // 20
+        length = max(2, round(0.4 * n))
         x = np.clip((np.arange(n) - start) / length, 0.0, 1.0)
         shape = x**3 * (10 - 15 * x + 6 * x**2)
         size = 4 * self.step
@@ -130,8 +134,10 @@ class ConditionBench:
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
-        dt, n = self.controller.dt_s, self.reference.size
-        start, length = n // 20, max(2, round(_PUSH_S / dt))
+        dt = self.controller.dt_s
+        n = self.reference.size
+        start = n // 20
+        length = max(2, round(_PUSH_S / dt))
         force = np.zeros(n)
         force[start : start + length] = np.sin(np.pi * (np.arange(length) + 0.5) / length)[: n - start]
         effects = parse_effects(self.effects.values())
@@ -168,26 +174,26 @@ class ConditionBench:
 
     def late(self) -> ConditionRun:
         """One sample of delay more."""
-        own = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
-        late = {"input_delay": {"name": "input_delay", "delay_s": own + self.controller.dt_s}}
-        return self._run("late", said("more_delay", 1e3 * self.controller.dt_s), effects=late)
+        delay_s = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
+        longer = {"input_delay": {"name": "input_delay", "delay_s": delay_s + self.controller.dt_s}}
+        return self._run("late", said("more_delay", 1e3 * self.controller.dt_s), effects=longer)
 
     def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
-        own = {name: effect for name, effect in self.effects.items() if EFFECTS[name].friction}
-        if not own:
+        frictions = {name: effect for name, effect in self.effects.items() if EFFECTS[name].friction}
+        if not frictions:
             return []
 
         def scaled(factor: float) -> dict[str, dict[str, Any]]:
             # Torques, and coefficients that make torques of speeds.
             return {
                 name: {key: factor * value if "_Nm" in key else value for key, value in effect.items()}
-                for name, effect in own.items()
+                for name, effect in frictions.items()
             }
 
         return [
-            self._run("no friction", said("other_friction", list(own), 0), effects=scaled(0.0)),
-            self._run("double friction", said("other_friction", list(own), 2), effects=scaled(2.0)),
+            self._run("no friction", said("other_friction", list(frictions), 0), effects=scaled(0.0)),
+            self._run("double friction", said("other_friction", list(frictions), 2), effects=scaled(2.0)),
         ]
 
     def coarse(self) -> ConditionRun:
@@ -208,10 +214,11 @@ class ConditionBench:
         free = self._unlimited
         peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
-        kept, ignored = (said("overdriven", _OVERDRIVEN, known) for known in (True, False))
+        limit_known = said("overdriven", _OVERDRIVEN, True)
+        limit_ignored = said("overdriven", _OVERDRIVEN, False)
         return [
-            self._run("voltage limit", kept, reference),
-            self._run("no anti-windup", ignored, reference, law=free, clip=limit),
+            self._run("voltage limit", limit_known, reference),
+            self._run("no anti-windup", limit_ignored, reference, law=free, clip=limit),
         ]
 
     @property

@@ -16,17 +16,28 @@ from workflow.tasks.results import MeasuredPeak, SensitivityCheck
 from workflow.tasks.simulated_rig import loop_of_arm
 from workflow.tasks.stage import StageInput
 
-LEAD_IN = 0.05  # share of a run before its step, so that the picture shows rest
+# Share of a run before its step, so that the picture shows rest.
+LEAD_IN = 0.05
 # A run counts as settled when at its end it moves by less than this share of the step and, where tracking is
 # asked for, has arrived within it. Within one count of the sensor no controller sees it.
 SETTLED = 0.1
-_DRAWS = 3  # of random phases: the fewest that show a spread
-_PERIODS_SMALL = 4  # sensor noise weighs ten times as much there, too
-SMALL = 0.1  # of the large excitation: friction weighs ten times as much
-_INPUT_SHARE = 0.7  # of the input's rms in the records of the fit that the loop's command may take
-_CREST = 4.0  # peak over rms that a multisine's command stays below
-_LINES_BELOW_PEAK = 20  # the peak is read to 5 % of its frequency
-_SHORTEST, _LONGEST = 500, 4000  # samples of a period
+# Draws of random phases: the fewest that show a spread.
+_DRAWS = 3
+# Periods at the small size: sensor noise weighs ten times as much there as at the large one.
+_PERIODS_SMALL = 4
+# The small size over the large one: friction weighs ten times as much.
+SMALL = 0.1
+# Rms of the loop's command over that of the input in the records of the fit. Chosen, below 1: the model was
+# fitted there.
+_INPUT_SHARE = 0.7
+# Peak over rms that a multisine's command stays below.
+_CREST = 4.0
+# Lines up to the predicted peak: it is read to 5 % of its frequency.
+_LINES_BELOW_PEAK = 20
+# Samples of a period at least.
+_SHORTEST = 500
+# Samples of a period at most: each is simulated on the nonlinear arm.
+_LONGEST = 4000
 
 
 def rms_of(signals: Sequence[RealArray]) -> float:
@@ -35,14 +46,30 @@ def rms_of(signals: Sequence[RealArray]) -> float:
 
 
 def settling_samples(pole_radius: float, shortest: int, longest: int) -> int:
-    """Of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7)."""
-    return int(min(max(round(2 * 7 / -np.log(min(max(pole_radius, 0.5), 1 - 1e-9))), shortest), longest))
+    """Samples of a trial in two halves, in either of which the slowest closed-loop pole dies out (to e^-7).
+
+    pole_radius: its modulus, below 1; the result lies between shortest and longest.
+    """
+    radius = min(max(pole_radius, 0.5), 1 - 1e-9)
+    samples = round(2 * 7 / -np.log(radius))
+    return int(min(max(samples, shortest), longest))
 
 
 @dataclass(frozen=True)
 class SensitivityPlan:
-    """How S is excited: band around the predicted peak, period, lead-in, size of the large excitation; and
-    the nominal peak it is compared with."""
+    """How S is excited, and the nominal peak that it is compared with.
+
+    Attributes
+    ----------
+    band_rad_s : tuple of two float
+        Around the predicted peak [rad/s].
+    period_samples, lead_in_periods : int
+        Period of the multisine, and how many of them are left out.
+    rms : float
+        Of the reference at the large size, in units of the output.
+    nominal_peak, nominal_omega_rad_s : float
+        Largest |S| of the nominal loop, and where.
+    """
 
     band_rad_s: tuple[float, float]
     period_samples: int
@@ -66,8 +93,20 @@ class SensitivityPlan:
 def plan_sensitivity(
     controller: Controller, plant: UncertainPlant, input_rms: float, transient_samples: int
 ) -> SensitivityPlan:
-    """From a twentieth of the predicted peak's frequency to ten times it, lines a twentieth of it apart; as
-    large as the rms of the input in the records and the voltage limit allow."""
+    """The excitation that measures the peak of S of this loop.
+
+    Its band reaches from a twentieth of the predicted peak's frequency to ten times it, with lines a
+    twentieth of it apart.
+
+    Parameters
+    ----------
+    controller : Controller
+    plant : UncertainPlant
+    input_rms : float
+        Of the records of the fit: the command stays below it, and below the voltage limit.
+    transient_samples : int
+        Samples in which the loop settles; they are left out.
+    """
     dt = controller.dt_s
     omega = np.geomspace(1e-3 / dt, plant.nyquist_rad_s, 8000)
     size = 1 / np.abs(1 + (controller.response(omega) * plant.channel.nominal_response(omega)))
@@ -93,10 +132,14 @@ def plan_sensitivity(
 
 
 def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityCheck:
-    """The peak of S on the simulated arm, large and small, beside prediction and certified bound."""
+    """The peak of S on the simulated arm, at a large and a small size, beside prediction and certified bound.
+
+    Also on the arm of the closed-loop check, where that has further effects. Needs a certificate.
+    """
     certificate = stage.results.certify.certificate
     assert certificate is not None
-    options, plan = stage.config.closed_loop, sensitivity_plan(stage, controller, transient_samples)
+    options = stage.config.closed_loop
+    plan = sensitivity_plan(stage, controller, transient_samples)
     certified = max(plant.worst_peak_sensitivity for plant in certificate.plants)
     arms: list[tuple[str, tuple[dict[str, Any], ...], float]] = [
         ("arm as identified", (), 1.0),
@@ -106,22 +149,22 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
         arms.append(("arm of the closed-loop check", options.effects, 1.0))
     rows = []
     for number, (name, effects, share) in enumerate(arms):
-        found = measured_on_arm(stage, controller, plan.excitation(share), str(number), effects)
-        peak, std, omega = found.peak
+        measurement = measured_on_arm(stage, controller, plan.excitation(share), str(number), effects)
+        peak, std, omega = measurement.peak
         rows.append(
             MeasuredPeak(
                 name=name,
-                reference_rms=found.reference_rms,
+                reference_rms=measurement.reference_rms,
                 peak=peak,
                 peak_std=std,
                 peak_omega_rad_s=omega,
                 off_nominal_percent=100 * (peak / plan.nominal_peak - 1),
                 off_certified_percent=100 * (peak / certified - 1) if np.isfinite(certified) else None,
-                peak_command=found.peak_command,
-                limited_fraction=found.limited_fraction,
-                omega_rad_s=found.omega_rad_s,
-                magnitude=np.abs(found.response),
-                std=found.std,
+                peak_command=measurement.peak_command,
+                limited_fraction=measurement.limited_fraction,
+                omega_rad_s=measurement.omega_rad_s,
+                magnitude=np.abs(measurement.response),
+                std=measurement.std,
             )
         )
     return SensitivityCheck(
@@ -130,7 +173,7 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
 
 
 def sensitivity_plan(stage: StageInput, controller: Controller, transient_samples: int) -> SensitivityPlan:
-    """For the plant and the records of the fit of a run."""
+    """The excitation for the plant of a run, as large as the records of its fit allow."""
     used = stage.results.records.fitted(stage.config.control_channel)
     return plan_sensitivity(
         controller, stage.plant, rms_of([record.input for record in used]), transient_samples
@@ -144,7 +187,10 @@ def measured_on_arm(
     name: str,
     effects: Sequence[Mapping[str, Any]] = (),
 ) -> MeasuredSensitivity:
-    """S on the simulated arm with further effects; the name tells its phases and its noise from others'."""
+    """S measured on the simulated arm with further effects.
+
+    excitation: keywords of `sensitivity_of`; name: its phases and noise are others than under another name.
+    """
     arm = loop_of_arm(stage.config, stage.rng("closed_loop", "sensitivity noise", name), effects)
     phases = stage.rng("closed_loop", "sensitivity", name)
     return measure_sensitivity(controller, rng=phases, **excitation, **arm)

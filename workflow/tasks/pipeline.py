@@ -46,21 +46,50 @@ def run_pipeline(
     earlier: RunDirectory | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Run every stage into `out` and return the table of numbers.
+    """Run every stage into a directory and return its numbers.
 
-    config_text: kept as config.toml (`called` in complaints); resume takes up a run that is there, replace
-    starts it afresh; page: the last stage, which writes the page; c_code: the fields of `Dialect` that are
-    stated, kept for when it is resumed; note: said once nothing refuses the run; read: the logs,
-    where they have been read. begun, earlier: runs whose stages are taken over where they were made from the
-    same, as those of the run itself are when it is resumed; begun is of this same call, earlier one that the
-    user names. A result that is not certified is no error.
+    Parameters
+    ----------
+    config : RunConfig or JointsConfig
+    out : Path
+        The run directory.
+    config_text : str
+        Kept as config.toml.
+    called : str
+        What complaints call the configuration.
+    resume, replace : bool
+        Go on with a run that is there, or start it afresh; otherwise `out` has to be free.
+    page : Stage, optional
+        The last stage, which writes the page.
+    c_code : mapping of str to value, optional
+        Fields of `Dialect` that are stated; kept for when the run is resumed.
+    note : str
+        A line that is said once nothing refuses the run.
+    read : sequence of Record
+        The logs, where they have been read.
+    begun, earlier : RunDirectory, optional
+        Runs whose stages are taken over where they were made from the same, as those of the run itself are
+        when it is resumed. `begun` is of this same call, `earlier` one that the user names.
+    progress : Progress, optional
 
-    Raises InputError (one line) for anything wrong with what the user gave; what this call created is removed
-    then, unless identification had already been paid for. Raises StageError when a computation fails.
+    Returns
+    -------
+    RunSummary
+        A result that is not certified is no error.
+
+    Raises
+    ------
+    InputError
+        One line: something wrong with what the user gave. What this call created is removed then, unless
+        identification had already been paid for.
+    StageError
+        A computation failed.
     """
     progress = progress or Progress()
-    run, stages = RunDirectory(Path(out)), stages_for(config, STAGES)
-    existed, given = run.path.exists(), _given(config, run, progress, called)
+    run = RunDirectory(Path(out))
+    stages = stages_for(config, STAGES)
+    existed = run.path.exists()
+    stage_input = _stage_input(config, run, progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
     inputs = input_digests(config, earlier)
     # Records are read before anything is written: a bad log leaves no directory behind.
@@ -74,7 +103,7 @@ def run_pipeline(
     if not (resume and existed) and not first_is_there:
         started = time.monotonic()
         with threadpool_limits(1):
-            ready = stages[0].run(changed(given, read=read)), time.monotonic() - started
+            ready = stages[0].run(changed(stage_input, read=read)), time.monotonic() - started
     # More threads round otherwise.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         run.begin_run(
@@ -85,10 +114,13 @@ def run_pipeline(
             resume=resume,
             replace=replace,
         )
-        kept = run.manifest().get("c_code", {})
+        kept_dialect = run.manifest().get("c_code", {})
         with naming(str(run.manifest_path)):
-            before = changed(Dialect(), **{k: kept[k] for k in ("prefix", "number") if k in kept})
-        dialect = changed(before, **(c_code or {}))  # as stated now, or else before
+            dialect_before = changed(
+                Dialect(), **{key: kept_dialect[key] for key in ("prefix", "number") if key in kept_dialect}
+            )
+        # A key that is not stated now is as it was stated when the run began.
+        dialect = changed(dialect_before, **(c_code or {}))
         run.record_status("running", c_code=asdict(dialect))
         stages = stages if page is None else (*stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
@@ -98,21 +130,24 @@ def run_pipeline(
             for stage in stages:
                 _perform(
                     stage,
-                    given,
+                    stage_input,
                     inputs,
                     ready if stage is stages[0] else None,
                     begun=begun,
                     earlier=earlier,
                 )
             _say_what_was_taken_over(run, progress)
-            written = _keep_files(given.results, config, dialect)
-            for name in KEPT_FILES:  # none of an earlier design stay
+            written = _keep_files(stage_input.results, config, dialect)
+            # No file of an earlier design stays.
+            for name in KEPT_FILES:
                 if run.path / name not in written:
                     (run.path / name).unlink(missing_ok=True)
-            summary = summarise(given.results, config)
+            summary = summarise(stage_input.results, config)
         except BaseException as error:
-            if isinstance(error, KeyboardInterrupt) or interrupts.came():  # a library may make anything of it
-                with suppress(InputError):  # a full disk, a directory that is gone
+            # A library may turn an interrupt into any other error, so that it is asked for, too.
+            if isinstance(error, KeyboardInterrupt) or interrupts.came():
+                # A full disk or a directory that is gone does not hide that the run was interrupted.
+                with suppress(InputError):
                     run.record_status("interrupted")
                 raise CommandInterruptedError(run.path) from None
             _fail(run, error, created=not existed)
@@ -129,47 +164,50 @@ def identify_only(
     earlier: RunDirectory | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """The stages up to the uncertain plant into `out`, which `flexlink design` reads; what is there is
-    replaced. earlier: a run whose stages are taken over where they were made from the same. Raises as a
-    run."""
-    given = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
+    """Run the stages up to the uncertain plant into `out`, which `flexlink design` reads.
+
+    What is there is replaced. earlier: a run whose stages are taken over where they were made from the same.
+    Raises InputError and StageError, see `run_pipeline`.
+    """
+    stage_input = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
     inputs = input_digests(config)
     stages = plant_stages(config)
-    with given.results.run.writing(replace=True), threadpool_limits(1):
-        given.results.run.begin_run(
+    with stage_input.results.run.writing(replace=True), threadpool_limits(1):
+        stage_input.results.run.begin_run(
             config_text=config_text,
             config=config.to_document(),
             seed=config.run.seed,
             inputs=inputs,
             replace=True,
         )
-        given.progress.plan([(stage.name, stage.expected_s) for stage in stages])
+        stage_input.progress.plan([(stage.name, stage.expected_s) for stage in stages])
         if earlier is not None:
             nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
-            _say_what_cannot_be_taken_over(earlier, nothing_because, given.progress)
+            _say_what_cannot_be_taken_over(earlier, nothing_because, stage_input.progress)
         for stage in stages:
-            _perform(stage, given, inputs, earlier=earlier)
+            _perform(stage, stage_input, inputs, earlier=earlier)
 
 
 def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
     """Perform the last stage again on a finished run. Raises InputError when a stage is missing."""
     config = any_config_of(run)
-    given = _given(config, run, progress or Progress())
-    given.progress.plan([(page.name, page.expected_s)])
+    stage_input = _stage_input(config, run, progress or Progress())
+    stage_input.progress.plan([(page.name, page.expected_s)])
     with run.locked():
-        _perform(page, given, {}, always=True)
-    return summarise(given.results, config)
+        _perform(page, stage_input, {}, always=True)
+    return summarise(stage_input.results, config)
 
 
-def _given(
+def _stage_input(
     config: AnyConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
 ) -> StageInput:
-    given: Any = config
-    return StageInput(given, RunResults(run), progress, called)
+    # Stages for several joints know that their configuration is a JointsConfig.
+    of_any_kind: Any = config
+    return StageInput(of_any_kind, RunResults(run), progress, called)
 
 
 def certified_for(results: RunResults, config: AnyConfig) -> str:
-    """What a certificate of the plant that was identified is about."""
+    """What a certificate of the identified plant covers, in words."""
     if isinstance(config, JointsConfig):
         models: Any = results.identify
         return f"{len(models.points)} operating points"
@@ -182,23 +220,25 @@ def config_of(run: RunDirectory) -> RunConfig:
     """The configuration a run of one loop was begun with. Raises InputError for one of several joints."""
     config = any_config_of(run)
     if isinstance(config, JointsConfig):
-        kept = path_as_typed(run.path / "config.toml")
+        config_file = path_as_typed(run.path / "config.toml")
         raise InputError(
             f"{run.path}: a run for several joints, and this command takes one loop; for other settings edit "
-            f"its config.toml and type: flexlink run --config {kept} --out OTHER"
+            f"its config.toml and type: flexlink run --config {config_file} --out OTHER"
         )
     return config
 
 
 def any_config_of(run: RunDirectory) -> AnyConfig:
-    """The same, of a run for several joints too."""
-    document, source = run.config_document(), str(run.path / "config.json")
-    return (JointsConfig if "joints" in document else RunConfig).from_document(document, source=source)
+    """The configuration that a run was begun with, of one loop or of several joints."""
+    document = run.config_document()
+    source = str(run.path / "config.json")
+    kind = JointsConfig if "joints" in document else RunConfig
+    return kind.from_document(document, source=source)
 
 
 def _perform(
     stage: Stage,
-    given: StageInput,
+    stage_input: StageInput,
     inputs: Mapping[str, str],
     ready: tuple[Any, float] | None = None,
     *,
@@ -211,13 +251,16 @@ def _perform(
     ready: its result where that is known already, and the seconds it took. begun, earlier: see
     `run_pipeline`; always: made again although it is there.
     """
-    run, progress = given.results.run, given.progress
-    input_hash = stage_input_hash(stage, given.config, run, inputs)
+    run = stage_input.results.run
+    progress = stage_input.progress
+    input_hash = stage_input_hash(stage, stage_input.config, run, inputs)
     progress.start(stage.name)
     if not always:
         # What a stage writes beside its own file is not in another run's stages.
-        others = () if stage.also_writes(run) else tuple(filter(None, (begun, earlier)))
-        origin = run.take_over(stage.name, input_hash, others)
+        other_runs: tuple[RunDirectory, ...] = ()
+        if not stage.also_writes(run):
+            other_runs = tuple(filter(None, (begun, earlier)))
+        origin = run.take_over(stage.name, input_hash, other_runs)
         if origin is not None and all(path.is_file() for path in stage.also_writes(run)):
             if origin is not run:
                 called = str(origin.path) if origin is earlier else None
@@ -225,11 +268,11 @@ def _perform(
             progress.finish(stage.name, 0.0, taken_up=True)
             return
     started = time.monotonic()
-    result, before_s = ready or (stage.run(given), 0.0)
+    result, before_s = ready or (stage.run(stage_input), 0.0)
     interrupts.check()
     run.save_stage(stage.name, result, input_hash)
     # The stages after it see what is on the disk, as they would in a resumed run: to the last digit.
-    given.results.read.pop(stage.name, None)
+    stage_input.results.read.pop(stage.name, None)
     seconds = time.monotonic() - started + before_s
     run.record_stage(stage.name, seconds, input_hash)
     progress.finish(stage.name, seconds, taken_up=False)
@@ -241,12 +284,13 @@ def input_digests(config: AnyConfig, earlier: RunDirectory | None = None) -> dic
     Raises InputError where a file cannot be read that `earlier` does not know.
     """
     noted = {} if earlier is None else earlier.manifest()["inputs"]
-    return {
-        str(path): noted[str(path)]
-        if str(path) in noted and not path.is_file()
-        else storage.sha256_of_file(path)
-        for path in config.input_files
-    }
+    digests = {}
+    for path in config.input_files:
+        if str(path) in noted and not path.is_file():
+            digests[str(path)] = noted[str(path)]
+        else:
+            digests[str(path)] = storage.sha256_of_file(path)
+    return digests
 
 
 def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: Mapping[str, str]) -> str:
@@ -312,18 +356,26 @@ def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs:
 
 def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> list[Path]:
     """controller.json, .mat, .c and .h; of one loop with those of its reference filter, and model.json."""
-    second, kept = ReferenceFilterResult(), list[Path]()
+    reference_filter = ReferenceFilterResult()
+    written = list[Path]()
     if isinstance(config, RunConfig):
-        second = results.reference_filter
-        found = results.uncertainty.seen_by_controller(config)[config.control_index]
-        kept = [results.run.path / "model.json"]
-        storage.write_together({kept[0]: model_bytes(kept[0], ModelFile(found.nominal, found.enclosing))})
-    if (controller := results.design.controller) is None:
-        return kept
-    law = Logged.of(config, results.records).law(second.law(controller))
-    about, certified = certified_for(results, config), results.certify.certified
-    return kept + write_controller(
-        results.run.path, law, second.filter, certified=certified, about=about, dialect=dialect
+        reference_filter = results.reference_filter
+        channel = results.uncertainty.seen_by_controller(config)[config.control_index]
+        model_file = results.run.path / "model.json"
+        content = model_bytes(model_file, ModelFile(channel.nominal, channel.enclosing))
+        storage.write_together({model_file: content})
+        written = [model_file]
+    controller = results.design.controller
+    if controller is None:
+        return written
+    law = Logged.of(config, results.records).law(reference_filter.law(controller))
+    return written + write_controller(
+        results.run.path,
+        law,
+        reference_filter.filter,
+        certified=results.certify.certified,
+        about=certified_for(results, config),
+        dialect=dialect,
     )
 
 

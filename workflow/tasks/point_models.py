@@ -22,10 +22,31 @@ Real = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class PointModel:
-    """What the records of one operating point say: model, ball (the factor Li as a state space of Li_a to
-    Li_d, radius), fits in per cent (records, outputs), whether each mode has one shape, balls for pictures.
-    later: samples by which each input acts later than in model and ball; their sizes are the same. fresh:
-    of every record that was kept back, how the model simulates each output.
+    """What the records of one operating point say, for Y outputs and U inputs.
+
+    Attributes
+    ----------
+    name : str
+        Of the operating point.
+    model : MimoModel
+    noise_std : (Y,) array
+        Standard deviation of each output's noise.
+    fit_percent : (records, Y) array
+    rank_one : tuple of bool
+        Whether each mode has one shape.
+    Lo : (Y, P) array
+        Left factor of the uncertainty ball (`ResponseBall`).
+    Li_a, Li_b, Li_c, Li_d : arrays
+        Its right factor as a state space.
+    radius : float
+        Of the ball.
+    shown : MatrixUncertainty
+        Balls at the frequencies of the pictures.
+    warnings : tuple of Finding
+    later : tuple of int
+        Samples by which each input acts later than in model and ball. Their sizes do not change with it.
+    fresh : tuple of tuples of FreshFit
+        For every record that was kept back, how the model simulates each output.
     """
 
     name: str
@@ -55,7 +76,10 @@ class PointModel:
         return len(self.model.state_space()[0])
 
     def plant(self, gain_error: float) -> MultivariablePlant:
-        """For design and certificate."""
+        """The plant that design and certificate see.
+
+        gain_error: share by which the gain of each input may be off, 0 for none.
+        """
         import control  # here, because it brings a plotting library with it
 
         Li = control.ss(
@@ -79,17 +103,18 @@ class PointModel:
     def modes(self) -> tuple[tuple[float, float, Real | None], ...]:
         """Frequency [rad/s], damping ratio, and motion of the outputs, largest 1, of every pole pair below
         the Nyquist frequency that has one shape (None: it has not)."""
-        found = []
-        residues, dt_s = self.model.residues(), self.model.dt_s
+        modes = []
+        residues = self.model.residues()
+        dt_s = self.model.dt_s
         for pole, residue in zip(residues.poles, residues.pole, strict=True):
             if not pole.imag:
                 continue
             s = np.log(pole) / dt_s
             left, sizes, _ = np.linalg.svd(residue)
-            one = sizes.size == 1 or sizes[1] < 1e-6 * sizes[0]
+            one_shape = sizes.size == 1 or sizes[1] < 1e-6 * sizes[0]
             moved = left[:, 0] / left[np.argmax(np.abs(left[:, 0])), 0]
-            found.append((float(abs(s)), float(-s.real / abs(s)), moved.real if one else None))
-        return tuple(sorted(found, key=lambda mode: mode[0]))
+            modes.append((float(abs(s)), float(-s.real / abs(s)), moved.real if one_shape else None))
+        return tuple(sorted(modes, key=lambda mode: mode[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +126,7 @@ class PointModels:
 
 @dataclass(frozen=True, eq=False)
 class JointsCertificate:
-    """None where there is no controller."""
+    """Certificate of a controller for several joints; None where there is no controller."""
 
     certificate: MultivariableCertificate | None
 

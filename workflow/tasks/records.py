@@ -27,15 +27,20 @@ if TYPE_CHECKING:
     from workflow.tasks.results import RecordsResult
     from workflow.tasks.stage import StageInput
 
-MOST_SAMPLES = 20_000_000  # of 4 kB each, 80 GB: more memory than most machines have
+# Samples of all records together: at 4 kB each 80 GB, more memory than most machines have.
+MOST_SAMPLES = 20_000_000
 
 
 def make_records(stage: StageInput) -> RecordsResult:
-    """All records of the configuration, in its order, simulated or read. Of several joints the `condition`
-    of a record names the operating point.
+    """All records of the configuration in its order, simulated or read.
 
-    Raises InputError: a file or an excitation that is none, sampling times that differ, or a record to
-    identify from whose inputs all stand still.
+    For several joints the `condition` of a record names the operating point.
+
+    Raises
+    ------
+    InputError
+        One line: a file or an excitation that is none, sampling times that differ, or a record to identify
+        from whose inputs all stand still.
     """
     # Late: logs are read and refused before what computes is loaded, which takes seconds.
     from ident.command_timing import with_equivalent_command
@@ -43,7 +48,8 @@ def make_records(stage: StageInput) -> RecordsResult:
     from workflow.tasks.results import RecordsResult, RunRecord
     from workflow.tasks.simulated_rig import simulated_records
 
-    source, made = stage.config.source, list(stage.read)
+    source = stage.config.source
+    made = list(stage.read)
     entries: Sequence[SimulatedRecord | FileRecord | OperatingPoint] = source.records
     if not isinstance(source, FileSource):
         made = simulated_records(stage.config, stage.called, partial(stage.progress.update, "records"))
@@ -82,16 +88,16 @@ def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channe
     outputs = list(dict.fromkeys(channel.output for channel in channels))
     references = entry.references if entry.references is not None else source.references
     # A record's own time base replaces the common one: dt_s here must not meet a time column there.
-    own = entry.time is not None or entry.dt_s is not None
+    own_time = entry.time is not None or entry.dt_s is not None
     units = {name: unit for name, unit in source.units.items() if name in (*inputs, *outputs)}
     with naming(str(entry.path)):
         record = Record.from_file(
             entry.path,
             inputs,
             outputs,
-            time=entry.time if own else source.time,
-            dt_s=entry.dt_s if own else source.dt_s,
-            time_unit=entry.time_unit or (None if own else source.time_unit),
+            time=entry.time if own_time else source.time,
+            dt_s=entry.dt_s if own_time else source.dt_s,
+            time_unit=entry.time_unit or (None if own_time else source.time_unit),
             references=list(references),
             name=record_name(entry),
             scale=source.scale,

@@ -17,8 +17,8 @@ from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.uncertainty import ResponsePosterior
 
+# Input at which a machine is clipped only so that a loop that runs away stays made of numbers.
 FINITE = 1e9
-"""Input at which a machine is clipped only so that a loop that runs away stays made of numbers."""
 
 
 def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.StateSpace:
@@ -27,9 +27,11 @@ def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.St
     A kernel of L taps is the basis of L poles at zero; both parts carry their own integrators and delay.
     Unstable poles are those of the draw, behind the sum: once, or what rounding leaves between would grow.
     """
-    n, direct = posterior.poles.order, int(posterior.has_feedthrough)
+    n = posterior.poles.order
+    direct = int(posterior.has_feedthrough)
     parts = [_part(posterior, posterior.poles, coefficients[:n], float(coefficients[n]) if direct else 0.0)]
-    if taps := posterior.fir_length:
+    taps = posterior.fir_length
+    if taps:
         shift = Poles(np.zeros(taps), np.zeros(0, dtype=np.complex128))
         parts.append(_part(posterior, shift, coefficients[n + direct :][:taps], 0.0))
     stable = reduce(add, parts)

@@ -43,8 +43,13 @@ from workflow.engine.randomness import stage_rng
 from workflow.tasks.results import IdentifiedChannel
 from workflow.tasks.sampled_plant import FINITE
 
-INPUT_NAME, REFERENCE_NAME = "voltage_V", "reference_rad"
+# Columns of a simulated log.
+INPUT_NAME = "voltage_V"
+# Its reference, where the arm was simulated in a loop.
+REFERENCE_NAME = "reference_rad"
+# Its outputs: hub angle and tip.
 OUTPUT_NAMES = SampledArm.output_names
+# Units of these columns.
 UNITS = {"voltage_V": "V", "hub_angle_rad": "rad", "tip_m": "m"}
 
 
@@ -61,7 +66,8 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
     their own, keyed by the record's name: a record stays as it is when others come or go.
     """
     rig = rig_of(source)
-    dt_s, rng = rig.sampling.dt_s, stage_rng(seed, "records", entry.name, "noise")
+    dt_s = rig.sampling.dt_s
+    rng = stage_rng(seed, "records", entry.name, "noise")
     voltage = entry.excitation.signal(dt_s, stage_rng(seed, "records", entry.name, "excitation"))
     reference = None
     if source.loop is None:
@@ -80,7 +86,8 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
         )
         reference = source.loop.reference_rad_per_V * voltage
         ran = simulate_loop(law, encoded_arm(source, (), rng), reference)
-        voltage, output = ran.command, ran.output
+        voltage = ran.command
+        output = ran.output
     return Record(
         name=entry.name,
         input=voltage[:, None],
@@ -100,13 +107,29 @@ def simulated_records(
     called: str,
     progress: Callable[[float, str], None] = lambda share, name: None,
 ) -> list[Record]:
-    """Every record of a configuration whose records are not files, told of as it is made. Raises InputError
-    that names the entry."""
-    source, key, made = config.source, "records", list[Record]()
+    """Every record of a configuration whose records are not files.
+
+    Parameters
+    ----------
+    config : RunConfig, JointsConfig or SimulationConfig
+    called : str
+        What a complaint calls the configuration.
+    progress : callable
+        Called with the share that is done and the name of the record that is made next.
+
+    Raises
+    ------
+    InputError
+        One line that names the entry.
+    """
+    source = config.source
+    key = "records"
+    made = list[Record]()
     entries: Sequence[Any] = source.records
     make: Callable[[Any], Record]
     if isinstance(config, JointsConfig) and isinstance(source, TwoJointSource):
-        key, make = "points", partial(simulate_point, config, source)
+        key = "points"
+        make = partial(simulate_point, config, source)
     else:
         assert isinstance(source, SimulatedSource)  # or nobody would have asked
         make = partial(simulate_record, source, seed=config.run.seed)
@@ -121,14 +144,20 @@ def simulate_point(config: JointsConfig, source: TwoJointSource, point: Operatin
     """The record of an operating point: independent multisines at both motors, from rest."""
     draw = partial(stage_rng, config.run.seed, "records", point.name)
     machine = machine_at(source, point, draw("noise"), coulomb_Nm=source.coulomb_Nm)
-    period, rng = source.samples, draw("excitation")
+    period = source.samples
+    rng = draw("excitation")
     lines = multisine_lines(period, source.dt_s, source.band_Hz)
     u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
-    inputs, outputs = ([getattr(joint, kind) for joint in config.joints] for kind in ("input", "output"))
     return Record(
-        point.name, u, machine.run(u), source.dt_s, tuple(inputs), tuple(outputs), input_units=("V",) * 2,
+        point.name,
+        u,
+        machine.run(u),
+        source.dt_s,
+        tuple(joint.input for joint in config.joints),
+        tuple(joint.output for joint in config.joints),
+        input_units=("V",) * 2,
         output_units=("rad",) * 2,
-    )  # fmt: skip
+    )
 
 
 def machine_at(
@@ -139,7 +168,10 @@ def machine_at(
     coulomb_Nm: tuple[float, float],
     extra_kg: float = 0.0,
 ) -> TwoLinkMachine:
-    """The simulated arm around an operating point."""
+    """The simulated two-link arm around an operating point.
+
+    coulomb_Nm: dry friction of both joints; extra_kg: payload beyond that of the point; rng: of the noise.
+    """
     arm = two_link_arm(point.payload_kg + extra_kg, coulomb_Nm, source.gravity_m_s2)
     return TwoLinkMachine(arm, (point.shoulder_rad, point.elbow_rad), source.dt_s, source.noise_rad, rng)
 
@@ -152,13 +184,25 @@ def encoded_arm(
     rig: Rig | None = None,
     tip_force_N: npt.NDArray[np.float64] | None = None,
 ) -> SampledArm:
-    """The simulated arm behind its encoder; extra_effects take the place of those of the source that have
-    their names."""
+    """The simulated arm behind its encoder.
+
+    Parameters
+    ----------
+    source : SimulatedSource
+    extra_effects : sequence of mappings
+        Take the place of the source's effects that have their names.
+    rng : Generator
+        Of the sensor noise.
+    rig : Rig, optional
+        In place of the source's.
+    tip_force_N : (T,) array, optional
+        A force at the tip.
+    """
     replaced = {effect["name"] for effect in extra_effects}
-    kept = [effect for effect in source.effects if effect["name"] not in replaced]
+    unchanged = [effect for effect in source.effects if effect["name"] not in replaced]
     return SampledArm(
         rig or rig_of(source),
-        parse_effects((*kept, *extra_effects)),
+        parse_effects((*unchanged, *extra_effects)),
         rng,
         n_modes=source.modes,
         encoder_step_rad=source.encoder_step_rad,
@@ -188,7 +232,9 @@ def loop_of_arm(
     }
 
 
+# Beside simulated logs: what they were simulated from.
 TRUTH_FILE = "truth.json"
+# Its format, so that a foreign file of that name is left alone.
 _TRUTH: Literal["flexlink truth 1"] = "flexlink truth 1"
 
 
@@ -206,13 +252,14 @@ class Truth(Section):
 
 
 def truth_of(source: SimulatedSource) -> Truth:
-    """One set of modes for all outputs: they differ in zeros alone."""
+    """Modes of the simulated arm below Nyquist, one set for all outputs: they differ in zeros alone."""
     machine = make_machine(rig_of(source), parse_effects(source.effects))
     machine = replace(machine, joint=replace(machine.joint, backlash_gap_rad=None))
     rig = machine.rig
     a = equations_of_motion(machine, source.modes or default_n_modes(rig)).state_matrix()
     poles = np.linalg.eigvals(a)
-    omega, zeta = np.abs(poles), -poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)
+    omega = np.abs(poles)
+    zeta = -poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)
     swings = (poles.imag > 0) & (zeta < LARGEST_DAMPING) & (omega < np.pi / rig.sampling.dt_s)
     order = np.argsort(omega[swings])
     pairs = zip(omega[swings][order].tolist(), zeta[swings][order].tolist(), strict=True)
@@ -236,11 +283,16 @@ def truth_beside(logs: Sequence[Path], output: str) -> tuple[TrueMode, ...]:
 
 
 def beside(found: IdentifiedChannel, true: Sequence[TrueMode]) -> tuple[TrueMode | None, ...]:
-    """For each pole pair that can be a mode the true one nearest in ratio; each is nearest to the other."""
+    """Beside each pole pair the true mode that it stands for; None where it stands for none.
+
+    found: an identified channel, of which only pairs that can be modes count. A pair and a true mode belong
+    together where each is the nearest of the other, by the ratio of frequencies.
+    """
     modes = [mode for mode in found.modes if found.is_mode(mode)]
     if not modes or not true:
         return (None,) * len(found.modes)
     distance = np.abs(np.log([[mode.frequency_Hz / other.frequency_Hz for other in true] for mode in modes]))
-    nearest, back = distance.argmin(axis=1).tolist(), distance.argmin(axis=0).tolist()
+    nearest = distance.argmin(axis=1).tolist()
+    back = distance.argmin(axis=0).tolist()
     matched = {modes[i]: true[j] for i, j in enumerate(nearest) if back[j] == i}
     return tuple(matched.get(mode) for mode in found.modes)

@@ -23,8 +23,19 @@ from workflow.tasks.results import RunResults
 
 @dataclass(frozen=True)
 class StageInput:
-    """What a stage may look at. results: of those before it; called: the configuration, in a complaint; read:
-    its logs, where they have been read."""
+    """What a stage may look at.
+
+    Attributes
+    ----------
+    config : RunConfig
+    results : RunResults
+        Of the stages before it.
+    progress : Progress
+    called : str
+        What a complaint calls the configuration.
+    read : sequence of Record
+        Its logs, where they have been read already.
+    """
 
     config: RunConfig
     results: RunResults
@@ -56,11 +67,23 @@ class StageInput:
 class Stage:
     """One step of a run.
 
-    `uses` and `except_for` name the part of the configuration the result depends on (pydantic's `include` and
-    `exclude`), `after` the stages whose files it reads: with the seed and the input files these make the
-    input hash. `expected_s` (two cores, warm) only shapes the progress bar. `also_writes` names files outside
-    `stages/` that belong to the result. several: what it does for several joints, and how long that takes;
-    None: there is no such step for them.
+    With the seed and the input files, `after`, `uses` and `except_for` make the input hash.
+
+    Attributes
+    ----------
+    name : str
+    after : tuple of str
+        Stages whose files it reads.
+    run : callable
+        Returns its result.
+    expected_s : float
+        How long it takes on two warm cores; only shapes the progress bar.
+    uses, except_for : mapping
+        The part of the configuration that the result depends on, as pydantic's `include` and `exclude`.
+    also_writes : callable
+        Files of a run outside `stages/` that belong to the result.
+    several : tuple of callable and float, or None
+        What it does for several joints, and its time; None: there is no such step for them.
     """
 
     name: str
@@ -101,9 +124,11 @@ def stages_for(config: AnyConfig, stages: Sequence[Stage]) -> tuple[Stage, ...]:
     """The stages of a run: those that there are for one loop, or for several joints."""
     if isinstance(config, RunConfig):
         return tuple(stages)
-    there = {stage.name: stage.several for stage in stages if stage.several is not None}
-    return tuple(
-        replace(stage, run=run, expected_s=s, after=tuple(name for name in stage.after if name in there))
-        for stage in stages
-        for run, s in filter(None, [stage.several])
-    )
+    of_joints = {stage.name for stage in stages if stage.several is not None}
+    for_joints = []
+    for stage in stages:
+        if stage.several is not None:
+            run, expected_s = stage.several
+            after = tuple(name for name in stage.after if name in of_joints)
+            for_joints.append(replace(stage, run=run, expected_s=expected_s, after=after))
+    return tuple(for_joints)

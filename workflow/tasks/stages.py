@@ -34,7 +34,7 @@ def design_controller(stage: StageInput) -> DesignResult:
     """Best controller found for the plant that was identified."""
     config = stage.config
 
-    def found(asked: Specification, *, advise: bool) -> DesignResult:
+    def design_for(asked: Specification, *, advise: bool) -> DesignResult:
         report = partial(stage.progress.update, "design")
         return find_design(
             stage.plants,
@@ -48,7 +48,9 @@ def design_controller(stage: StageInput) -> DesignResult:
 
     with naming("design"):
         # What a further try misses is not the user's to mend.
-        return soonest(stage, found(config.specification, advise=True), partial(found, advise=False))
+        return soonest(
+            stage, design_for(config.specification, advise=True), partial(design_for, advise=False)
+        )
 
 
 def find_achievable(stage: StageInput) -> AchievablePerformance:
@@ -61,8 +63,10 @@ def find_achievable(stage: StageInput) -> AchievablePerformance:
 
 def certify_controller(stage: StageInput) -> CertifyResult:
     """The controller checked independently of the optimiser that made it, or why there is none."""
-    design, config = stage.results.design, stage.config
-    law, rng = design.controller, stage.rng("certify")
+    design = stage.results.design
+    config = stage.config
+    law = design.controller
+    rng = stage.rng("certify")
     if law is None:
         return CertifyResult(None, certified=False, reason=design.reason)
     with naming("certify"):
@@ -71,22 +75,27 @@ def certify_controller(stage: StageInput) -> CertifyResult:
 
 def design_filter(stage: StageInput) -> ReferenceFilterResult:
     """Filter and friction feed-forward, where asked for; nothing where no controller is there."""
-    settings, law = stage.config.reference_filter, stage.results.design.controller
+    settings = stage.config.reference_filter
+    law = stage.results.design.controller
     if law is None:
         return ReferenceFilterResult(reason=None if settings is None else said("no_filter"))
     with naming("reference filter"):
-        found = find_filter(law, stage.plants, settings)
+        result = find_filter(law, stage.plants, settings)
     friction = stage.results.identify.friction
     if stage.config.closed_loop.friction_feedforward and friction is not None:
-        found = replace(found, feedforward=friction_feedforward(law, resampled_friction(friction, law.dt_s)))
-    return found
+        result = replace(
+            result, feedforward=friction_feedforward(law, resampled_friction(friction, law.dt_s))
+        )
+    return result
 
 
 _PLANT = ("identify", "uncertainty")
-PLANT = ("records", *_PLANT)  # up to the uncertain plant, which several designs may share
+# Stages up to the uncertain plant, which several designs may share.
+PLANT = ("records", *_PLANT)
 _PURPOSES = {"channels": {"__all__": {"purpose"}}}
 _COLUMNS = {"__all__": {"input", "output"}}
-_JOINTS = {"joints": True, "design": True, "identification": True}  # a balls' share of gain is in there
+# Of several joints the uncertainty of gains is part of the identification's settings.
+_JOINTS = {"joints": True, "design": True, "identification": True}
 
 STAGES: tuple[Stage, ...] = (
     Stage(

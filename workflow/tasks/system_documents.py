@@ -59,11 +59,24 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def stated_system(path: Path, document: Mapping[str, Any]) -> StatedSystem:
-    """A, B, C, D, or numerator and denominator in z, or zeros, poles and gain, and dt_s (or dt, Ts), of a
-    file; D may be left out. Raises InputError, one line."""
+    """The discrete system that a file states.
+
+    Parameters
+    ----------
+    path : Path
+        For complaints.
+    document : mapping of str to value
+        Its names and values: A, B, C and D (may be left out), or numerator and denominator in z, or zeros,
+        poles and gain; with dt_s (or dt, Ts).
+
+    Raises
+    ------
+    InputError
+        One line: a controller of flexlink, something missing, of another shape, or not finite.
+    """
     if str(document.get("format", "")).startswith("flexlink-controller"):
         raise InputError(f"{path}: holds a controller, expected a plant")
-    given = [name for name in _SAMPLING_TIME if name in document]
+    period_names = [name for name in _SAMPLING_TIME if name in document]
     polynomials = next((names for names in _POLYNOMIALS if document.keys() >= set(names)), None)
     roots = document.keys() >= set(_ROOTS)
     missing = [name for name in "ABC" if name not in document]
@@ -72,14 +85,16 @@ def stated_system(path: Path, document: Mapping[str, Any]) -> StatedSystem:
             f"{path}: no {missing[0]} in it: expected the matrices A, B, C, D, or numerator and denominator, "
             f"or zeros, poles and gain, and dt_s; found {', '.join(sorted(document)) or 'nothing'}"
         )
-    if not given:
+    if not period_names:
         raise InputError(
             f"{path}: no dt_s in it: the design is discrete, sample a continuous model first (c2d in MATLAB, "
             "sample in python-control)"
         )
-    period = _matrix(path, given[0], document[given[0]])
+    period = _matrix(path, period_names[0], document[period_names[0]])
     if period.size != 1 or not period.item() > 0:
-        raise InputError(f"{path}: {given[0]} must be one positive number, the sampling time in seconds")
+        raise InputError(
+            f"{path}: {period_names[0]} must be one positive number, the sampling time in seconds"
+        )
     dt_s = float(period.item())
     if polynomials is not None:
         above, below = (_numbers(path, name, document[name]).real for name in polynomials)
@@ -110,18 +125,22 @@ def _state_space(path: Path, document: Mapping[str, Any]) -> dict[str, RealArray
 
 
 def _numbers(path: Path, name: str, value: Any) -> ComplexArray:
-    """Numbers (n,); of complex pairs, in JSON [real part, imaginary part], one or both. Raises InputError."""
+    """Numbers (n,) with all conjugates; in JSON a complex one is [real part, imaginary part].
+
+    Of complex pairs the file may state one or both. Raises InputError.
+    """
     try:
-        each = value if isinstance(value, list) else np.ravel(value)
-        found = np.array([complex(*np.atleast_1d(one)) for one in each], dtype=np.complex128)
+        entries = value if isinstance(value, list) else np.ravel(value)
+        numbers = np.array([complex(*np.atleast_1d(entry)) for entry in entries], dtype=np.complex128)
     except (TypeError, ValueError):
         raise InputError(f"{path}: {name} must hold numbers") from None
-    if np.all(found.imag >= 0):  # one for both, as in fixed_poles
-        found = np.append(found, found[found.imag > 0].conj())
-    alike = np.allclose(np.sort_complex(found), np.sort_complex(found.conj()))
-    if not alike or not np.all(np.abs(found) < _LARGEST):
+    # Where no imaginary part is negative each complex number stands for a pair, as in fixed_poles.
+    if np.all(numbers.imag >= 0):
+        numbers = np.append(numbers, numbers[numbers.imag > 0].conj())
+    paired = np.allclose(np.sort_complex(numbers), np.sort_complex(numbers.conj()))
+    if not paired or not np.all(np.abs(numbers) < _LARGEST):
         raise InputError(f"{path}: {name} must be finite, complex numbers in conjugate pairs")
-    return found
+    return numbers
 
 
 def _matrix(path: Path, name: str, value: Any) -> RealArray:
@@ -137,8 +156,10 @@ def _matrix(path: Path, name: str, value: Any) -> RealArray:
 
 
 def stated_law(path: Path, document: Mapping[str, Any]) -> Controller | StatedSystem:
-    """The controller of a file, from error to command: one of ours, or what `stated_system` reads. Raises
-    InputError, one line."""
+    """The controller of a file, from error to command: one of flexlink, or what `stated_system` reads.
+
+    Raises InputError, one line, for a model in its place or a controller of several loops.
+    """
     if document.get("format") == FORMAT:
         raise InputError(f"{path}: holds a model, expected a controller")
     if document.get("format") != Controller.format_name():

@@ -38,24 +38,46 @@ def _state_space(stated: StatedSystem) -> control.StateSpace:
 
 
 def read_law(path: Path, dt_s: float, delay_samples: int = 0) -> Controller:
-    """The controller of a file: controller.json of a run, or what `stated_system` reads, from error to
-    command. delay_samples: of the computation, where the file does not say it. Raises InputError, also for
-    another sampling time."""
+    """The controller of a file, from error to command.
+
+    Parameters
+    ----------
+    path : Path
+        controller.json of a run, or what `stated_system` reads.
+    dt_s : float
+        Sampling time that it has to have [s].
+    delay_samples : int
+        Of the computation, where the file does not say it.
+
+    Raises
+    ------
+    InputError
+        One line: no controller, or another sampling time.
+    """
     document = read_document(path)
     law = stated_law(path, document)
     if isinstance(law, StatedSystem):
-        given = _state_space(law)
+        system = _state_space(law)
         late = np.ravel(document.get("computational_delay_samples", delay_samples))[0]
         with naming(str(path)):
             law = Controller(
-                given.A, given.B, given.C, given.D, given.dt, computational_delay_samples=late, name=path.stem
+                system.A,
+                system.B,
+                system.C,
+                system.D,
+                system.dt,
+                computational_delay_samples=late,
+                name=path.stem,
             )
     refuse_other_period(path, law.dt_s, dt_s)
     return law
 
 
 def read_controller(path: Path, dt_s: float) -> tuple[list[float], list[float]]:
-    """Numerator and denominator in z, with the delay, of a controller of `read_law`."""
+    """Numerator and denominator in z, highest power first, of the controller of a file, with its delay.
+
+    dt_s: sampling time that it has to have [s]. Raises InputError, see `read_law`.
+    """
     law = read_law(path, dt_s).to_control(include_delay=True)
     if not law.nstates:
         return [float(law.D[0, 0])], [1.0]

@@ -58,8 +58,10 @@ from workflow.tasks.results import (
 from workflow.tasks.stage import StageInput
 from workflow.text.templates import said, words
 
-_FEWEST_FREQUENCIES = 100  # over a band of the data, some decade: a nominal model has a tenth as many numbers
-_SHARE_INSIDE = 0.9  # of the ellipses: below it a nominal is no member of the set it stands for
+# Frequencies over a band of the data at least, some decade: a nominal model has a tenth as many numbers.
+_FEWEST_FREQUENCIES = 100
+# Share of the ellipses that hold a nominal model: below it the model is no member of the set it stands for.
+_SHARE_INSIDE = 0.9
 # A model explains nothing whose best fit to a log is below this, in percent: right ones had 90 and more,
 # wrong ones 75 and less.
 LEAST_FIT_PERCENT = 80.0
@@ -67,23 +69,27 @@ LEAST_FIT_PERCENT = 80.0
 # noise.
 _BEYOND_NOISE = 3.0
 
+# Bands of equal width on the log axis in which radii and scatter are summarised. Chosen for a short table.
 N_BANDS = 6
-"""Bands of equal width on the log axis in which radii and scatter are summarised."""
 
 
 def find_uncertainty(stage: StageInput) -> UncertaintyResult:
     """Posterior, ellipses on a display grid, residual tests and repeat scatter of every channel."""
-    config, records, identified = stage.config, stage.results.records, stage.results.identify
-    control, equivalent = config.control_index, None
+    config = stage.config
+    records = stage.results.records
+    identified = stage.results.identify
+    control = config.control_index
+    equivalent = None
     channels: dict[int, UncertainChannel] = {}
     # The control channel first: it says what the friction does at an amplitude, the same one for all.
     order = sorted(range(len(config.channels)), key=lambda k: k != control)
     for done, k in enumerate(order):
-        channel, result = config.channels[k], identified.channels[k]
+        channel = config.channels[k]
+        result = identified.channels[k]
         stage.progress.update("uncertainty", done / len(order), channel.label)
         with naming(f"channel {channel.label!r}"):
             friction = identified.friction if channel.uncertainty.friction_identified else None
-            found, equivalent = uncertainty_of(
+            uncertain, equivalent = uncertainty_of(
                 channel,
                 result,
                 records.fitted(channel),
@@ -93,9 +99,9 @@ def find_uncertainty(stage: StageInput) -> UncertaintyResult:
                 equivalent=equivalent,
                 timing=records.timing,
             )
-            bands = [(band.from_rad_s, band.to_rad_s) for band in found.bands]
+            bands = [(band.from_rad_s, band.to_rad_s) for band in uncertain.bands]
             scatter = scatter_of(channel, result, records.records, bands, friction)
-            channels[k] = replace(found, repeat_scatter=scatter)
+            channels[k] = replace(uncertain, repeat_scatter=scatter)
     return UncertaintyResult(tuple(channels[k] for k in sorted(channels)), equivalent)
 
 
@@ -111,22 +117,51 @@ def uncertainty_of(
     timing: CommandTiming | None = None,
     in_parts: bool = True,
 ) -> tuple[UncertainChannel, EquivalentFriction | None]:
-    """Ellipses of one channel, as `flexlink run` and `flexlink identify` have them, and the viscous friction
-    that acts like the dry one where they are about an amplitude.
+    """Ellipses and residual tests of one channel.
 
-    measured: SISO estimation records as recorded; friction: of the shaft, whose position the channel's output
-    is where at_shaft; equivalent: where it is known from the shaft; timing: of the command between two rows;
-    in_parts: a set that one ellipse holds badly may come in several parts.
-    Raises ValueError, one line, where the model explains nothing.
+    Parameters
+    ----------
+    channel : Channel
+    result : IdentifiedChannel
+        Its model.
+    measured : sequence of Record
+        The fit's records as recorded, one input and one output.
+    rng : Generator
+        Of the simulations behind an equivalent friction.
+    friction : FrictionFit, optional
+        Of the shaft.
+    at_shaft : bool
+        Whether the channel's output is the position of that shaft.
+    equivalent : EquivalentFriction, optional
+        Where it is known from the shaft's channel.
+    timing : CommandTiming, optional
+        Of the command between two rows.
+    in_parts : bool
+        Whether a set that one ellipse holds badly may come in several parts.
+
+    Returns
+    -------
+    channel : UncertainChannel
+    equivalent : EquivalentFriction or None
+        Viscous friction that acts like the dry one, where the ellipses describe an amplitude.
+
+    Raises
+    ------
+    ValueError
+        One line: the model explains nothing.
     """
-    poles, linear_poles, options = result.model.poles, result.model.poles, channel.embedding
+    poles = result.model.poles
+    linear_poles = result.model.poles
+    options = channel.embedding
     members: tuple[RateMember, ...] = ()
+
+    # The posterior: of the response as recorded, of the arm behind its friction, or at an amplitude.
     if friction is None:
         white = whiteness_test(result.identification.residuals).passed
 
         def posterior_behind(asked: UncertaintyOptions) -> tuple[ResponsePosterior, Tests]:
-            found = tangent(result.bounded, result.model, asked)
-            return found, residual_tests(found, result.bounded)
+            tangent_posterior = tangent(result.bounded, result.model, asked)
+            return tangent_posterior, residual_tests(tangent_posterior, result.bounded)
 
         if options.method == "tangent" or options.coloured_noise == "auto":
             (posterior, tests), options = with_noise_model(options, white, posterior_behind)
@@ -140,20 +175,25 @@ def uncertainty_of(
         find = without_friction if at_shaft else other_output_without_friction
 
         def arm_behind(asked: UncertaintyOptions) -> tuple[BehindFriction, Tests]:
-            found = find(measured, friction, result.model, asked)
+            arm = find(measured, friction, result.model, asked)
             if not at_shaft:
-                return found, residual_tests(found.response, result.bounded)
-            return found, residual_tests(found.response, measured, found.friction)
+                return arm, residual_tests(arm.response, result.bounded)
+            return arm, residual_tests(arm.response, measured, arm.friction)
 
         (behind, tests), _ = with_noise_model(options, white, arm_behind)
         linear = behind.shaft if at_shaft else behind.response
-        poles, linear_poles, posterior = behind.poles, behind.poles, behind.response
+        poles = behind.poles
+        linear_poles = behind.poles
+        posterior = behind.response
         if channel.uncertainty.response == "this amplitude":
             equivalent = equivalent or equivalent_friction(friction, measured, rng)
             posterior, poles = at_amplitude(behind, equivalent, rng)
         elif behind.members and (in_parts or len(behind.members) == 1):
             members = behind.members
-            posterior, poles = members[0].response, members[0].poles
+            posterior = members[0].response
+            poles = members[0].poles
+
+    # What widens it: friction of a shaft that the sensor does not see, and a timing that is not known.
     remote = result.remote
     if remote is not None:
         longest_s = max(record.n_samples for record in measured) * result.model.dt_s
@@ -163,12 +203,14 @@ def uncertainty_of(
         members = tuple(
             replace(member, response=with_unknown_timing(member.response, timing)) for member in members
         )
-    band, omega = result.data_band_rad_s, display_grid(result.model, result.bounded)
-    if band is not None:  # the nominal model has to be right there, and need not elsewhere
+    band = result.data_band_rad_s
+    omega = display_grid(result.model, result.bounded)
+    # In a band of the data the nominal model has to be right, and need not elsewhere.
+    if band is not None:
         omega = omega[(omega >= band[0]) & (omega <= band[1])]
         omega = omega if omega.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
     observer = friction is not None and friction.observed
-    found = uncertain_channel(
+    uncertain = uncertain_channel(
         channel.uncertainty.method,
         channel.uncertainty.level,
         posterior,
@@ -180,15 +222,17 @@ def uncertainty_of(
         members=members,
         tests=tests,
     )
-    # Friction is identified with a position; who records a speed is not told to record another signal.
+
+    # Refusals and advice. Friction is identified with a position; who records a speed is not told to record
+    # another signal.
     position = is_position(result.output, "".join(measured[0].output_units))
     if observer or (result.closed_loop is not None and result.closed_loop.kind is not FindingKind.DIRECT):
-        refuse_unexplained(result, found.agreement, friction, position=position)
+        refuse_unexplained(result, uncertain.agreement, friction, position=position)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and remote is None and result.closed_loop is not None and not white
     advice = residual_advice(
         *tests,
-        noise_order=found.noise_order,
+        noise_order=uncertain.noise_order,
         friction=friction is None and band is None and not result.increments and not rubs and position,
         observer=observer and at_shaft,
     )
@@ -208,7 +252,7 @@ def uncertainty_of(
         )
     elif rubs:
         advice.append(finding(FindingKind.UNTRIED_FRICTION, output=result.output, speed=not position))
-    return replace(found, advice=(*advice, *found.agreement.doubt)), equivalent
+    return replace(uncertain, advice=(*advice, *uncertain.agreement.doubt)), equivalent
 
 
 def uncertain_channel(
@@ -224,9 +268,33 @@ def uncertain_channel(
     linear: ResponsePosterior,
     linear_poles: Poles,
 ) -> UncertainChannel:
-    """Everything said about a posterior. omega (F,): shown, and where the nominal has to be right; tests: of
-    the residuals; poles: of the nominal; linear: posterior of the model, which has linear_poles twice;
-    members: parts of the set, the posterior that of the first."""
+    """A channel's posterior with its nominal model, ellipses, intervals and bands.
+
+    Parameters
+    ----------
+    method, level : str, float
+        Of the posterior, as the settings name them; probability of an ellipse.
+    posterior : ResponsePosterior
+        Of the first part of the set.
+    result : IdentifiedChannel
+    omega : (F,) array
+        Frequencies that are shown, and where the nominal has to be right [rad/s].
+    members : sequence of RateMember
+        Parts of the set; empty where it has one.
+    tests : Tests
+        Of the residuals.
+    poles : Poles
+        Of the nominal model.
+    linear : ResponsePosterior
+        Of the identified model, for intervals of its poles.
+    linear_poles : Poles
+        Of that model; `linear` has them twice.
+
+    Raises
+    ------
+    ValueError
+        One line: the posterior says nothing at these frequencies (`refuse_unanswered`).
+    """
     model = result.model
     doubts = [doubt for record in result.bounded for doubt in record.doubts]
     why = next((words(doubt) for doubt in doubts if doubt.kind is FindingKind.WRAPS), "")
@@ -236,7 +304,7 @@ def uncertain_channel(
     pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
     untold = [i for i, mode in enumerate(intervals.modes if intervals else ()) if not mode.told]
     nominal = nominal_of(posterior, poles, omega, pairs[untold])
-    others = tuple(
+    further_parts = tuple(
         UncertainMember(
             said("rate_part", member.from_rad_s, member.to_rad_s),
             member.response,
@@ -262,21 +330,21 @@ def uncertain_channel(
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
-        about=said("rate_part", members[0].from_rad_s, members[0].to_rad_s) if others else "",
-        others=others,
+        about=said("rate_part", members[0].from_rad_s, members[0].to_rad_s) if further_parts else "",
+        others=further_parts,
     )
 
 
 def bands_of(frequency: FrequencyUncertainty) -> tuple[Band, ...]:
-    """Size of ellipses in bands of equal ratio over their frequencies."""
+    """Size of ellipses in `N_BANDS` bands of equal ratio over their frequencies, lowest first."""
     omega = frequency.omega_rad_s
     relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
-    bands = pairwise(np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist())
-    return tuple(
-        Band(low, high, float(np.median(inside)), float(np.max(inside)))
-        for low, high in bands
-        for inside in [relative[(omega >= low) & (omega < high)]]
-    )
+    edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
+    bands = []
+    for low, high in pairwise(edges):
+        radii = relative[(omega >= low) & (omega < high)]
+        bands.append(Band(low, high, float(np.median(radii)), float(np.max(radii))))
+    return tuple(bands)
 
 
 def refuse_unexplained(
@@ -286,16 +354,33 @@ def refuse_unexplained(
     *,
     position: bool = True,
 ) -> None:
-    """Raises ValueError, one line, where the model of logs made in a loop explains nothing, so that no number
-    of it means anything. friction: of the fit, None where none was identified; position: of the output."""
-    found = result.identification
+    """Nothing, for a model of logs made in a loop that explains them.
+
+    Parameters
+    ----------
+    result : IdentifiedChannel
+    agreement : NominalAgreement
+        Of the nominal model with the ellipses.
+    friction : FrictionFit or None
+        Where one was identified.
+    position : bool
+        Whether the output is a position.
+
+    Raises
+    ------
+    ValueError
+        One line: the nominal lies outside most of its ellipses, or, with friction, the best fit is poor and
+        leaves much more than the sensor's noise. No number of such a model means anything.
+    """
+    identification = result.identification
     best = result.best_fit_percent
     why = ""
     if agreement.share_inside_percent < MOST_INSIDE_PERCENT:
-        outside, at = 100 - agreement.share_inside_percent, agreement.at_rad_s
+        outside = 100 - agreement.share_inside_percent
+        at = agreement.at_rad_s
         why = f"it lies outside {outside:.0f} % of its own ellipses, most near {at:.3g} rad/s"
     elif friction is not None and best < LEAST_FIT_PERCENT:
-        times = found.noise_std / friction.noise_std
+        times = identification.noise_std / friction.noise_std
         if times > _BEYOND_NOISE:
             why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     if why:
@@ -305,7 +390,10 @@ def refuse_unexplained(
 def posterior_of(
     model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions
 ) -> ResponsePosterior:
-    """One library call, by method."""
+    """The posterior of a model by the method of the options.
+
+    Raises ValueError, one line, where the method needs more records than there are.
+    """
     if options.method == "tangent":
         return tangent(bounded, model, options)
     if len(bounded) < 4:
@@ -319,20 +407,23 @@ def posterior_of(
 def nominal_of(
     posterior: ResponsePosterior, poles: Poles, omega: RealArray, untold: ComplexArray
 ) -> GobfModel:
-    """Nearest model on the identified poles without the pairs (P,) that the records do not tell, with them,
-    or as `nominals_near` goes on: the first that stays in its ellipses, else the second.
+    """The nominal model: nearest to the posterior on the identified poles.
+
+    Tried without the pairs (P,) that the records do not tell (`untold`), with them, and as `nominals_near`
+    goes on; the first that stays in its ellipses at omega (F,), else the one with all identified poles.
 
     The nominal gives the design its closed-loop poles, so it should be a member of the set it stands for;
     but a pole taken twice is a mode listed twice, and one that is not told or was not given may be none, so
     they have to earn that.
     """
-    told, ellipses = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)]), posterior.at(omega)
-    inside = (
-        model
-        for model in chain([nominal_near(posterior, told, omega)], nominals_near(posterior, poles, omega))
-        if np.mean(ellipses.contains(model.frequency_response(omega))) >= _SHARE_INSIDE
-    )
-    return next(inside, None) or nominal_near(posterior, poles, omega)
+    told_poles = Poles(poles.real, poles.pairs[~np.isin(poles.pairs, untold)])
+    ellipses = posterior.at(omega)
+    candidates = chain([nominal_near(posterior, told_poles, omega)], nominals_near(posterior, poles, omega))
+    for model in candidates:
+        share_inside = np.mean(ellipses.contains(model.frequency_response(omega)))
+        if share_inside >= _SHARE_INSIDE:
+            return model
+    return nominal_near(posterior, poles, omega)
 
 
 def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
@@ -344,22 +435,29 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
         for omega, zeta in zip(poles.omega_rad_s(model.dt_s), poles.zeta(), strict=True)
         if zeta < 0.4
     ]
-    low, high = 2 * np.pi / longest_s, np.pi / model.dt_s
+    low = 2 * np.pi / longest_s
+    high = np.pi / model.dt_s
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
 
 
 def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> Intervals | None:
-    """Of modes by frequency and decay rates, slowest first; None: only the tangent posterior has them."""
+    """Confidence intervals of modes by frequency, and of decay and growth rates.
+
+    None for a posterior that has none: only that of the tangent method does.
+    """
     try:
-        found = pole_intervals(posterior, poles, level)
+        intervals = pole_intervals(posterior, poles, level)
     except ValueError:
         return None
     by_frequency = np.argsort(poles.omega_rad_s(posterior.dt_s), kind="stable")
     slowest_first = [i for i in np.argsort(-poles.real, kind="stable") if poles.real[i] > 0]
     return Intervals(
         level,
-        tuple(ModeInterval(_interval(found.omega_rad_s[i]), _interval(found.zeta[i])) for i in by_frequency),
-        tuple(_interval(found.decay_per_s[i]) for i in slowest_first),
+        tuple(
+            ModeInterval(_interval(intervals.omega_rad_s[i]), _interval(intervals.zeta[i]))
+            for i in by_frequency
+        ),
+        tuple(_interval(intervals.decay_per_s[i]) for i in slowest_first),
         tuple(_interval(ends) for ends in growth_intervals(posterior, level)),
     )
 
@@ -375,15 +473,28 @@ def empirical_response(
     level: float = 0.95,
     band_rad_s: tuple[float, float] | None = None,
 ) -> FrequencyUncertainty | None:
-    """Response without a model: at the excited lines of the largest amplitude where records are periodic and
-    several realisations, else from the largest set of equally long records; None if they are too short.
+    """The response without a model; None where the records are too short for one.
 
-    integrators: as often the differences from sample to sample are taken first, of input and output, unless
-    the records are confined to a band.
+    At the excited lines of the largest amplitude where records are periodic and several realisations, else
+    from the largest set of equally long records.
+
+    Parameters
+    ----------
+    records : sequence of Record
+        One input, one output.
+    integrators : int
+        How often differences from sample to sample are taken first, of input and output, unless the records
+        are confined to a band.
+    level : float
+        Probability of an ellipse.
+    band_rad_s : tuple of two float, optional
+        To which the records are confined [rad/s].
     """
     periodic = None
-    with suppress(ValueError):  # records that do not go together there may do so here
-        periodic = next((found.response(level) for found in reversed(distortion_of(records))), None)
+    # Records that are not periodic alike are no error: they may do together below.
+    with suppress(ValueError):
+        responses = (distortion.response(level) for distortion in reversed(distortion_of(records)))
+        periodic = next(responses, None)
     if periodic is not None:
         return periodic
     by_length: dict[int, list[Record]] = {}
@@ -391,13 +502,15 @@ def empirical_response(
         by_length.setdefault(record.n_samples, []).append(record)
     alike = max(by_length.values(), key=len)
     if band_rad_s is None:
-        for _ in range(integrators):  # an integrated output ends elsewhere than it began and leaks everywhere
+        # An integrated output ends elsewhere than it began, and leaks everywhere.
+        for _ in range(integrators):
             alike = [increments(record) for record in alike]
     low, high = band_rad_s or (None, None)
     try:
         return empirical_frf(alike, level=level, omega_min_rad_s=low, omega_max_rad_s=high)
     except ValueError:
-        return None  # a picture the records are too short for; the identification stands without it
+        # The records are too short for this picture; the identification stands without it.
+        return None
 
 
 def scatter_of(
@@ -407,8 +520,21 @@ def scatter_of(
     bands: Sequence[tuple[float, float]],
     friction: FrictionFit | None,
 ) -> tuple[ScatterRow, ...] | None:
-    """Scatter of repeats, by half decades of the data, against what the other repeats predict (what each
-    record's own noise does, where there are two), or None without repeats."""
+    """Scatter of repeats, by half decades of the data, against what the other repeats predict.
+
+    Where there are two it is compared with what each record's own noise does. None without repeats.
+
+    Parameters
+    ----------
+    channel : Channel
+    result : IdentifiedChannel
+    records : sequence of RunRecord
+        All of the run; those that share a condition are repeats.
+    bands : sequence of tuples of two float
+        Of the ellipses [rad/s], for the range of frequencies.
+    friction : FrictionFit or None
+        That is taken off the records.
+    """
     bounded = {record.name: record for record in result.bounded}
     groups: dict[str, list[Record]] = {}
     for item in records:
