@@ -29,8 +29,19 @@ from workflow.engine.errors import shortened
 T = TypeVar("T")
 AnyArray = npt.NDArray[Any]
 
+# Name under which the document travels among the arrays of an archive.
 DOCUMENT = "_document"
-_TAGS = _ARRAY, _FLOAT, _COMPLEX, _TYPE = "$array", "$float", "$complex", "$type"
+# Key of an object that stands for an array: its value is the array's name in the archive.
+_ARRAY = "$array"
+# Key of an object that stands for a number that is not finite.
+_FLOAT = "$float"
+# Key of an object that stands for a complex number.
+_COMPLEX = "$complex"
+# Key under which the fields of a dataclass name their class.
+_TYPE = "$type"
+# Keys that no stored mapping may use.
+_TAGS = (_ARRAY, _FLOAT, _COMPLEX, _TYPE)
+# Both ways to write "one of these types".
 _UNIONS = (Union, types.UnionType)
 
 
@@ -46,12 +57,15 @@ def pack(value: Any) -> tuple[Any, dict[str, AnyArray]]:
 
 def unpack(kind: type[T], document: Any, arrays: Mapping[str, AnyArray]) -> T:
     """Inverse of `pack`. Raises CodecError naming the place in the document."""
-    found: T = _unpack(kind, document, arrays, getattr(kind, "__name__", "result"))
-    return found
+    value: T = _unpack(kind, document, arrays, getattr(kind, "__name__", "result"))
+    return value
 
 
 def to_arrays(value: Any) -> dict[str, AnyArray]:
-    """The same as arrays alone, for one npz file: the document travels as UTF-8 text."""
+    """A value as named arrays alone, for one npz file: the document travels as UTF-8 text under `DOCUMENT`.
+
+    Raises TypeError for what cannot be stored.
+    """
     document, arrays = pack(value)
     # As bytes: a unicode array would drop trailing NULs and take four bytes each.
     text = json.dumps(document, ensure_ascii=False).encode("utf-8")
@@ -70,9 +84,11 @@ def from_arrays(kind: type[T], arrays: Mapping[str, AnyArray]) -> T:
 
 
 def plain(value: Any, *, arrays: bool = True) -> Any:
-    """For programs that read our JSON: the same as nested lists and objects, arrays and tuples as lists,
-    complex numbers as [re, im], numbers that are not finite as null. arrays: False leaves out the fields of
-    dataclasses that are arrays."""
+    """A value as nested lists and objects, for other programs that read JSON; it is not read back.
+
+    Arrays and tuples become lists, complex numbers [re, im], numbers that are not finite null. arrays: False
+    leaves out the fields of dataclasses that are arrays.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         items = {name: getattr(value, name) for name in stored_fields(type(value))}
         return {
@@ -293,20 +309,20 @@ def _unpack_plain(document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any
 
 def _member(union: Any, document: Any, at: str) -> Any:
     """The member of a union that a document is of: null, by its tag, a tuple for a list, else the first
-    whose type fits."""
+    whose type fits. Raises CodecError where a tag is of none of them."""
     members = tuple(_members(union))
     if document is None and type(None) in members:
         return type(None)
-    rest = [member for member in members if member is not type(None)]
+    candidates = [member for member in members if member is not type(None)]
     if isinstance(document, dict) and _TYPE in document:
-        rest = [member for member in rest if getattr(member, "__name__", None) == document[_TYPE]]
+        candidates = [member for member in candidates if getattr(member, "__name__", None) == document[_TYPE]]
     elif isinstance(document, list):
-        rest = [member for member in rest if get_origin(member) is tuple] or rest
-    elif len(rest) > 1:
-        rest = [m for m in rest if isinstance(m, type) and isinstance(document, m)] or rest
-    if not rest:
+        candidates = [member for member in candidates if get_origin(member) is tuple] or candidates
+    elif len(candidates) > 1:
+        candidates = [m for m in candidates if isinstance(m, type) and isinstance(document, m)] or candidates
+    if not candidates:
         raise CodecError(f"{at}: {shown(document.get(_TYPE))} is not one of {union}")
-    return rest[0]
+    return candidates[0]
 
 
 def _members(union: Any) -> Iterator[Any]:

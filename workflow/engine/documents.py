@@ -42,10 +42,9 @@ def at_once(path: str, flags: int) -> int:
 
 def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     """Text and content of a TOML file. Raises InputError naming the file, for syntax with line and column."""
-    if (ending := Path(path.name.lower().removesuffix(".gz")).suffix) not in (
-        ".toml",
-        *_ANY_TEXT,
-    ) and path.is_file():
+    # A log in its place is told by its ending, before its content is taken for TOML.
+    ending = Path(path.name.lower().removesuffix(".gz")).suffix
+    if ending not in (".toml", *_ANY_TEXT) and path.is_file():
         from ident.data.record_files import READERS  # numpy, which a configuration can do without
 
         if ending in READERS:
@@ -54,7 +53,8 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
             command = f"flexlink init {path_as_typed(path)} --out my.toml"
             raise InputError(f"{path}: a log, not a TOML file; write one: {command}")
     text = read_text(path, MOST_TOML_BYTES)
-    if (longest := max(map(len, text.splitlines()), default=0)) > _LONGEST_TOML_LINE:
+    longest = max(map(len, text.splitlines()), default=0)
+    if longest > _LONGEST_TOML_LINE:
         raise InputError(f"{path}: a line of {longest} characters, at most {_LONGEST_TOML_LINE} are read")
     return text, _parsed(tomllib.loads, text, str(path), "TOML")
 

@@ -55,7 +55,10 @@ def cut_inside(text: str, most: int = LONGEST_LINE) -> str:
         return cut(text, most)
     # Words before the command that tell the reader what it is: 'type', 'name it'.
     words = max(text.rfind(sign, 0, at) for sign in ";,.?(:")
-    tail = text[words + 1 if at - words < _WORDS_BEFORE_COMMAND else at + 1 :].lstrip()
+    start = at + 1
+    if at - words < _WORDS_BEFORE_COMMAND:
+        start = words + 1
+    tail = text[start:].lstrip()
     room = max(most - 5 - len(tail), _LEAST_BEFORE_COMMAND)
     return f"{text[:room]} ... {tail}" if len(text) > room + 5 + len(tail) else text
 

@@ -39,13 +39,19 @@ R = TypeVar("R")
 Report = Callable[[float, str], None]
 Watch = Callable[[int, float, str], None]
 
-MOST_ATTEMPTS = 3  # the second and third alone, when the others are done
-CONNECT_S = 10.0  # a scheduler in the same network answers in milliseconds
-# Work that cannot go on says so within a minute.
+# How often a task is begun whose process dies: the second and third time alone, when the others are done.
+MOST_ATTEMPTS = 3
+# Seconds in which a scheduler has to answer: one in the same network does so in milliseconds.
+CONNECT_S = 10.0
+# Seconds without any worker after which a cluster is given up: work that cannot go on says so in a minute.
 WITHOUT_WORKERS_S = 50.0
-SILENT_S = 40.0  # within the minute above, less the last `CONNECT_S` and `_ASK_S`
-_LOOK_S = 0.05  # short beside any task
-_ASK_S = 2.0  # often beside `SILENT_S`, seldom beside what a scheduler can answer
+# Seconds without an answer after which a scheduler is lost: within that minute, less the last `CONNECT_S` and
+# `_ASK_S`.
+SILENT_S = 40.0
+# Seconds between looks at whether the pool lives: short beside any task.
+_LOOK_S = 0.05
+# Seconds between questions to a scheduler: often beside `SILENT_S`, seldom beside what it can answer.
+_ASK_S = 2.0
 
 # CasADi and numba's caches are used by one thread at a time, whatever a worker was started with; processes
 # are begun with variables of the environment that are put back.
@@ -87,11 +93,28 @@ class Executor:
     """Tasks on a pool of `concurrent.futures`, about `width` at once; `close` gives it up."""
 
     def __init__(self, pool: futures.Executor, width: int) -> None:
-        self.pool, self.width = pool, width
+        self.pool = pool
+        self.width = width
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """Position and result of every task, as they finish. watch: told position, share done and a word,
-        where known. Raises StageError: the pool is lost."""
+        """Position and result of every task, in the order in which they finish.
+
+        Parameters
+        ----------
+        tasks : sequence of Task
+        watch : callable, optional
+            Called with position, share done and a word, where a task tells of its progress.
+
+        Yields
+        ------
+        tuple of int and result or Failure
+            What goes wrong inside a task is its result.
+
+        Raises
+        ------
+        StageError
+            The pool is lost.
+        """
         events: queue.SimpleQueue[tuple[int, Any, str]] = queue.SimpleQueue()
         attempts = [0] * len(tasks)
         running: set[int] = set()
@@ -107,7 +130,8 @@ class Executor:
             begin(index)
         again: deque[int] = deque()
         while running or again:
-            if not running:  # alone, so that there is as much memory for it as can be
+            # A task whose process died runs alone, so that there is as much memory for it as can be.
+            if not running:
                 begin(again.popleft())
             try:
                 index, what, word = events.get(timeout=_LOOK_S)
@@ -120,15 +144,15 @@ class Executor:
                 continue
             running.remove(index)
             try:
-                found = what.result()
+                result = what.result()
             except futures.BrokenExecutor:
                 if attempts[index] < MOST_ATTEMPTS:
                     again.append(index)
                     continue
-                found = Failure(f"the process computing it died {attempts[index]} times (out of memory?)")
+                result = Failure(f"the process computing it died {attempts[index]} times (out of memory?)")
             except (futures.CancelledError, Exception) as error:
-                found = self._failure(error)
-            yield index, found
+                result = self._failure(error)
+            yield index, result
 
     def _submit(self, task: Task[Any], report: Report) -> futures.Future[Any]:
         """Given to the pool; what has no way to tell of its progress does not."""
@@ -141,7 +165,7 @@ class Executor:
         """Asked while nothing comes. Raises StageError."""
 
     def _failure(self, error: BaseException) -> Failure:
-        """Of a task that did not run to its end: what goes wrong inside one is its result."""
+        """The failure of a task that did not run to its end; here the error goes on."""
         raise error
 
     def close(self) -> None:
@@ -193,9 +217,12 @@ class LocalProcesses(Executor):
                 _begin(process)
                 self._processes.add(process)
             try:
-                while (message := ours.recv())[0] is not None:
-                    report(*message)
-                return message[1]
+                while True:
+                    share, content = ours.recv()
+                    # Without a share it is the result.
+                    if share is None:
+                        return content
+                    report(share, content)
             except (EOFError, OSError) as error:
                 raise futures.BrokenExecutor from error
             finally:
@@ -207,7 +234,8 @@ class LocalProcesses(Executor):
     def close(self) -> None:
         """End whatever is still running."""
         with _ONE_AT_A_TIME:
-            ended, self._processes = self._processes or set(), None
+            ended = self._processes or set()
+            self._processes = None
         for process in ended:
             process.terminate()
         super().close()
@@ -331,10 +359,13 @@ class DaskCluster(Executor):
         self._restore()
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
-        """As of every executor. Raises StageError when the scheduler is lost or silent, or has no workers."""
+        """Position and result of every task, see `Executor.run`.
+
+        Raises StageError when the scheduler is lost or silent, or has no workers.
+        """
         self._asked_s = self._heard_s = self._staffed_s = time.monotonic()
-        for found in super().run(tasks, watch):
-            yield found
+        for result in super().run(tasks, watch):
+            yield result
             self._heard_s = self._staffed_s = time.monotonic()  # what finishes tells of both
 
     def _see_that_it_lives(self) -> None:

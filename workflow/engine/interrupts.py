@@ -73,7 +73,8 @@ def _remember(number: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-_AGAIN_S = 0.02  # after the callback has returned, before anybody notices
+# Seconds until an interrupt comes again: after the callback has returned, before anybody notices.
+_AGAIN_S = 0.02
 
 
 def _again(event: sys.UnraisableHookArgs) -> None:

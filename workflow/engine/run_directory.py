@@ -40,12 +40,18 @@ from workflow.engine.store import Store
 # them were stated: resumed, such a run would give another answer.
 LAYOUT_VERSION = 10
 T = TypeVar("T")
-_INPUT_HASH, _DIGEST = "_input_hash", "_sha256"
+# Key of the input hash in a stage's file.
+_INPUT_HASH = "_input_hash"
+# Key of the digest of its content.
+_DIGEST = "_sha256"
+# Key of the result in a JSON file.
 _RESULT = "result"
+# Packages whose versions the manifest notes: numbers depend on them.
 _PACKAGES = ("flexlink", "numpy", "scipy", "control", "casadi", "nlopt", "numba", "pydantic", "matplotlib")
 
-
+# Formats in which a run keeps its controller.
 CONTROLLER_SUFFIXES = (".json", ".mat", ".c", ".h")
+# Files that a run keeps for other programs.
 KEPT_FILES = (
     "model.json",
     *(f"controller{of}{suffix}" for of in ("", "_reference_filter") for suffix in CONTROLLER_SUFFIXES),
@@ -53,7 +59,10 @@ KEPT_FILES = (
 
 
 class _StageEntry(BaseModel):
-    """Of a finished stage. taken_over_from: the run that it was made in, where that is another one."""
+    """What the manifest notes of a finished stage: its time, input hash and date.
+
+    taken_over_from: the run that it was made in, where that is another one.
+    """
 
     seconds: float
     input_sha256: str
@@ -115,8 +124,25 @@ class RunDirectory(Store):
         resume: bool = False,
         replace: bool = False,
     ) -> Self:
-        """As `begin`. config: what the configuration states, JSON-able; inputs: every input file as the user
-        named it, with its SHA-256."""
+        """Make the directory with configuration and manifest, or take up the run that is there.
+
+        Parameters
+        ----------
+        config_text : str
+            Kept as config.toml.
+        config : mapping
+            What the configuration states, JSON-able.
+        seed : int
+        inputs : mapping of str to str
+            Every input file as the user named it, with its SHA-256.
+        resume, replace : bool
+            Take up what is there, or start afresh (`Store.begin`). Hold the lock.
+
+        Raises
+        ------
+        InputError
+            One line, see `Store.begin`.
+        """
         manifest = {
             "layout": LAYOUT_VERSION,
             "status": "running",
@@ -158,7 +184,8 @@ class RunDirectory(Store):
         return None
 
     def _finished(self, name: str) -> Path:
-        if (path := self.stage_file(name)) is None:
+        path = self.stage_file(name)
+        if path is None:
             raise InputError(f"{self.path}: stage {name} is not there; type: {_resumed(self.path)}")
         return path
 
@@ -247,16 +274,18 @@ class RunDirectory(Store):
 
     def refuse_other_inputs(self, inputs: Mapping[str, str]) -> None:
         """Raise InputError where this run was made from other files than these (name to SHA-256)."""
-        own = self.manifest()["inputs"]
-        if dict(own) == dict(inputs):
+        own_inputs = self.manifest()["inputs"]
+        if dict(own_inputs) == dict(inputs):
             return
-        changed = [name for name in inputs if name in own and own[name] != inputs[name]]
+        changed = [name for name in inputs if name in own_inputs and own_inputs[name] != inputs[name]]
         if changed:
             why = f"{changed[0]} has changed since"
         else:
             # Without their folders, where that tells them apart.
-            short = {Path(name).name for name in own} != {Path(name).name for name in inputs}
-            why = f"it was made from {_names(own, short=short)}, not from {_names(inputs, short=short)}"
+            short = {Path(name).name for name in own_inputs} != {Path(name).name for name in inputs}
+            why = (
+                f"it was made from {_names(own_inputs, short=short)}, not from {_names(inputs, short=short)}"
+            )
         raise InputError(f"--from {self.path}: {why}: no stage can be taken over; leave --from out")
 
     # -- manifest --------------------------------------------------------------------------------------------
@@ -278,7 +307,8 @@ class RunDirectory(Store):
         document = storage.read_json(path)
         try:
             same = hash_of(document) == self.manifest()["config_sha256"]
-        except TypeError:  # another file's content, whose keys we keep for ourselves
+        except TypeError:
+            # Content of another file, with keys that the codec keeps for itself.
             same = False
         if not same:
             raise InputError(f"{path}: damaged, or changed since the run began; start a new run")
@@ -348,9 +378,11 @@ def _digest(content: Mapping[str, Any]) -> str:
     for name in sorted(content):
         value = content[name]
         if isinstance(value, np.ndarray):
-            about, data = f"{value.dtype.str}{value.shape}", np.ascontiguousarray(value).tobytes()
+            about = f"{value.dtype.str}{value.shape}"
+            data = np.ascontiguousarray(value).tobytes()
         else:
-            about, data = "", json.dumps(value, sort_keys=True).encode()
+            about = ""
+            data = json.dumps(value, sort_keys=True).encode()
         digest.update(f"{name}\0{about}\0{len(data)}\0".encode() + data)
     return digest.hexdigest()
 
@@ -384,7 +416,8 @@ def _now() -> str:
 def default_directory(name: str, parent: Path = Path("runs")) -> Path:
     """`runs/<name>-<local date and time>`; a number is appended while that is taken."""
     base = parent / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S}"
-    candidate, number = base, 1
+    candidate = base
+    number = 1
     while candidate.exists():
         number += 1
         candidate = base.with_name(f"{base.name}-{number}")

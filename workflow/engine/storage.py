@@ -24,7 +24,8 @@ from workflow.engine import codec, documents
 from workflow.engine.errors import InputError, cannot, naming
 
 TEMPORARY_SUFFIX = ".part"
-_EPOCH = (1980, 1, 1, 0, 0, 0)  # earliest date a zip entry can carry; a constant makes the bytes reproducible
+# Earliest date a zip entry can carry; a constant makes the bytes reproducible.
+_EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -34,11 +35,25 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
     """Replace files that belong together: none where the disk has no room for all of them, each atomically.
-    Of a link the file that it names is replaced; a device or pipe gets its content before.
 
-    Raises InputError (one line) where the disk refuses.
+    For a link the file that it names is replaced; a device or pipe gets its content before.
+
+    Parameters
+    ----------
+    contents : mapping of Path to bytes
+
+    Raises
+    ------
+    InputError
+        One line: the disk refuses.
     """
-    places = {path: place for path in contents if (place := _replaced(path)) is not None}
+    places = {}
+    for path in contents:
+        place = _replaced(path)
+        if place is not None:
+            places[path] = place
+
+    # All are written beside their places and flushed before the first one is renamed.
     temporary = {path: _temporary(place) for path, place in places.items()}
     try:
         for path, whole in temporary.items():
@@ -57,6 +72,7 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
             with suppress(OSError):  # what went wrong first is what is said
                 leftover.unlink(missing_ok=True)
         raise
+    # The renaming itself is on the disk once the folder is flushed.
     for folder in {place.parent for place in places.values()}:
         with cannot("write", folder):
             descriptor = os.open(folder, os.O_RDONLY)
@@ -111,11 +127,13 @@ def refuse_in_the_way(read: Iterable[Path], written: Iterable[tuple[str, Path]])
     another output, or out of reach."""
     seen = dict[str, str]()
     for path in read:
-        if (place := os.path.realpath(path)) in seen:
+        place = os.path.realpath(path)
+        if place in seen:
             raise InputError(f"{path}: given twice; every source counts once")
         seen[place] = "a source"
     for option, target in written:
-        if (place := os.path.realpath(target)) in seen:
+        place = os.path.realpath(target)
+        if place in seen:
             raise InputError(f"{option} {target}: that is {seen[place]} already")
         seen[place] = option
         check_writable(target)
@@ -128,7 +146,8 @@ def write_text(path: Path, content: str) -> None:
 
 def write_new_directory(out: Path, texts: Mapping[str, str]) -> list[Path]:
     """Files by name in a directory, made where it is absent: all of them or none. Raises InputError."""
-    existed, files = out.is_dir(), {out / name: text.encode() for name, text in texts.items()}
+    existed = out.is_dir()
+    files = {out / name: text.encode() for name, text in texts.items()}
     try:
         with naming(f"cannot write {out}"):
             out.mkdir(parents=True, exist_ok=True)
@@ -142,7 +161,8 @@ def write_new_directory(out: Path, texts: Mapping[str, str]) -> list[Path]:
 
 def csv_text(columns: Mapping[str, codec.AnyArray]) -> str:
     """Signals (T,) as CSV with one header line; nine digits, far below any sensor's noise."""
-    stream, table = io.StringIO(), np.column_stack(list(columns.values()))
+    stream = io.StringIO()
+    table = np.column_stack(list(columns.values()))
     np.savetxt(stream, table, "%.9g", ",", header=",".join(columns), comments="")
     return stream.getvalue()
 
@@ -182,10 +202,7 @@ def npz_bytes(arrays: Mapping[str, codec.AnyArray]) -> bytes:
 
 
 def read_npz(path: Path) -> dict[str, codec.AnyArray]:
-    """All arrays of an npz file, read without pickle.
-
-    Raises InputError naming the file.
-    """
+    """Arrays of an npz file by name, read without pickle. Raises InputError naming the file."""
     with naming(str(path)), cannot("read", path):
         arrays = npz_arrays(content_of(path))
     for name, array in arrays.items():

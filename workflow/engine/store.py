@@ -21,8 +21,18 @@ from workflow.engine.errors import InputError, cannot, naming, shortened
 
 @dataclass(frozen=True)
 class Store:
-    """Files of a command in one directory: `what` they are, the name of their manifest, their folders, the
-    files that are there from the beginning, all others."""
+    """Files of a command in one directory.
+
+    Attributes
+    ----------
+    path : Path
+    what : str
+        What they are called in complaints.
+    manifest_name : str
+        The file by which the directory is known.
+    folders, first_files, own_files : tuples of str
+        Names of folders, of files that are there from the beginning, and of all others.
+    """
 
     path: Path
 
@@ -62,19 +72,19 @@ class Store:
         if resume and replace:
             raise InputError("--resume and --replace contradict each other")
         held = self.held()
-        there = self.manifest_name in held
-        strangers = held if there else held - set(self.own_entries())
-        if strangers and not there:
+        has_manifest = self.manifest_name in held
+        strangers = held if has_manifest else held - set(self.own_entries())
+        if strangers and not has_manifest:
             what = f"no {self.what} is there" if resume or replace else "not empty"
             raise InputError(f"{self.path}: {what} (it holds {min(strangers)!r}); choose another --out")
-        if not there and not any(any((self.path / name).iterdir()) for name in held & {*self.folders}):
+        if not has_manifest and not any(any((self.path / name).iterdir()) for name in held & {*self.folders}):
             held -= {*self.folders}  # of a command that ended before it had begun
         if held and not (resume or replace):
             raise InputError(
                 f"{self.path}: not empty, an earlier {self.what} is there; choose another --out, continue it "
                 "with --resume or start it afresh with --replace"
             )
-        return there
+        return has_manifest
 
     @contextmanager
     def writing(self, *, resume: bool = False, replace: bool = False) -> Iterator[None]:
@@ -114,7 +124,9 @@ class Store:
         if not self.prepare(resume=resume, replace=replace):
             document = begun_with if manifest is None else manifest
             self.write({**(first_files or {}), self.manifest_name: storage.json_bytes(document)})
-        elif changed := first_difference(self.begun_with(), begun_with):
+            return self
+        changed = first_difference(self.begun_with(), begun_with)
+        if changed:
             raise InputError(
                 f"{self.path}: cannot resume, changed since the {self.what} began: {changed}; choose another "
                 "--out or start it afresh with --replace"
@@ -122,7 +134,7 @@ class Store:
         return self
 
     def write(self, files: Mapping[str, bytes]) -> None:
-        """All of them or none. Raises InputError."""
+        """Write files by their names in the directory: all of them or none. Raises InputError."""
         storage.write_together({self.path / name: content for name, content in files.items()})
 
     def discard_if_empty(self) -> None:
@@ -137,13 +149,13 @@ class Store:
         Returns whether an earlier one is there now, to be continued. Raises InputError: see
         `refuse_unless_free`.
         """
-        there = self.refuse_unless_free(resume=resume, replace=replace)
+        has_earlier = self.refuse_unless_free(resume=resume, replace=replace)
         if replace:
             self.clear()
         with cannot("write", self.path):
             for folder in ("", *self.folders):
                 (self.path / folder).mkdir(parents=True, exist_ok=True)
-        return there and not replace
+        return has_earlier and not replace
 
     def locked(self) -> AbstractContextManager[None]:
         """Hold the directory against a second writer."""
@@ -170,11 +182,13 @@ class Store:
 
 def first_difference(old: Any, new: Any) -> str | None:
     """Dotted key of the first difference between two JSON-able values with both values, or None."""
-    before, after = dict(_leaves(old)), dict(_leaves(new))
+    before = dict(_leaves(old))
+    after = dict(_leaves(new))
     for key in before | after:
         # repr tells 1 from 1.0 and True, and nan from nan is no difference.
         if key not in before or key not in after or repr(before[key]) != repr(after[key]):
-            was, now = (shortened(one[key]) if key in one else "absent" for one in (before, after))
+            was = shortened(before[key]) if key in before else "absent"
+            now = shortened(after[key]) if key in after else "absent"
             return f"{key} (was {was}, now {now})"
     return None
 
