@@ -113,15 +113,23 @@ class DesignFile(Section):
 
 
 def read_design_file(path: Path) -> DesignFile:
-    """TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
-    [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]; of a run's
-    configuration all of these but the first two are taken. Raises InputError."""
+    """The design file at a path.
+
+    TOML with the keys of [specification], in a table of that name or at the top, and optionally [plant],
+    [uncertainty], [synthesis], [certificate], [achievable_performance] and [reference_filter]. From a run's
+    configuration those tables that a design has are taken.
+
+    Raises
+    ------
+    InputError
+        File, dotted key and what was expected, in one line.
+    """
     _, document = read_toml(path)
     known = DesignFile.model_fields.keys()
     if "specification" not in document:
         document["specification"] = {key: document.pop(key) for key in document.keys() - known}
     elif "channels" in document:
         document = {key: value for key, value in document.items() if key in known}
-    found = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
-    found._name = str(path)
-    return found
+    file = check(DesignFile, document, source=str(path), context={"base": path.absolute().parent})
+    file._name = str(path)
+    return file

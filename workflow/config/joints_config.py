@@ -149,10 +149,12 @@ class JointsConfig(AnyRun):
     @model_validator(mode="after")
     def _fit_together(self) -> Self:
         for kind in ("input", "output"):
-            if (name := repeated([getattr(joint, kind) for joint in self.joints])) is not None:
+            name = repeated([getattr(joint, kind) for joint in self.joints])
+            if name is not None:
                 raise ValueError(f"two joints have the {kind} {name!r}: each needs its own")
-        if both := {joint.input for joint in self.joints} & {joint.output for joint in self.joints}:
-            raise ValueError(f"{min(both)!r} is an input and an output: give each signal its own column")
+        ambiguous = {joint.input for joint in self.joints} & {joint.output for joint in self.joints}
+        if ambiguous:
+            raise ValueError(f"{min(ambiguous)!r} is an input and an output: give each signal its own column")
         for number, joint in enumerate(self.joints):
             if joint.input_limit is None:
                 raise ValueError(
@@ -162,7 +164,8 @@ class JointsConfig(AnyRun):
         if isinstance(self.source, TwoJointSource):
             if len(self.joints) != 2:
                 raise ValueError(f"the simulated arm has two joints; got {len(self.joints)}")
-            if (name := repeated([point.name for point in self.source.points])) is not None:
+            name = repeated([point.name for point in self.source.points])
+            if name is not None:
                 raise ValueError(f"two operating points are called {name!r}: give them different names")
         else:
             if self.closed_loop.extra_payload_kg or self.closed_loop.coulomb_Nm is not None:
@@ -192,7 +195,8 @@ class JointsConfig(AnyRun):
             raise ValueError(f"closed_loop.step needs one value for each of {len(self.joints)} joints")
         if self.closed_loop.step is not None and not any(self.closed_loop.step):
             raise ValueError("closed_loop.step is zero for every joint: give at least one a step")
-        self.specification()  # refuses keys that no design of several joints reads
+        # Made to refuse keys that no design of several joints reads.
+        self.specification()
         return self
 
     def specification(self) -> MultivariableSpecification:
@@ -206,7 +210,7 @@ class JointsConfig(AnyRun):
 
     @property
     def dead_times(self) -> tuple[int, ...]:
-        """Of each input, in samples."""
+        """Delay of each input, in samples."""
         stated = self.identification.input_delay_samples
         return (stated,) * len(self.joints) if isinstance(stated, int) else stated
 
@@ -233,7 +237,9 @@ AnyConfig = RunConfig | JointsConfig
 def load_any(path: Path) -> tuple[AnyConfig, str]:
     """Configuration of one loop or of several joints, and its text. Raises InputError: file, dotted key and
     what was expected in one line."""
-    return loaded(JointsConfig, path) if "joints" in read_toml(path)[1] else loaded(RunConfig, path)
+    if "joints" in read_toml(path)[1]:
+        return loaded(JointsConfig, path)
+    return loaded(RunConfig, path)
 
 
 def load_simulation(path: Path) -> AnyConfig | SimulationConfig:

@@ -205,9 +205,10 @@ class Channel(Section):
     @property
     def embedding(self) -> UncertaintyOptions:
         """The uncertainty's settings with what the identification knows of the order."""
-        given = self.uncertainty.order_given
-        known = self.identification.n_pairs is not None if given is None else given
-        return self.uncertainty.model_copy(update={"order_given": known})
+        order_given = self.uncertainty.order_given
+        if order_given is None:
+            order_given = self.identification.n_pairs is not None
+        return self.uncertainty.model_copy(update={"order_given": order_given})
 
     @model_validator(mode="after")
     def _one_filter(self) -> Self:
@@ -424,7 +425,8 @@ class RunConfig(AnyRun):
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
         labels = [channel.label for channel in self.channels]
-        if (label := repeated(labels)) is not None:
+        label = repeated(labels)
+        if label is not None:
             raise ValueError(f"two channels are called {label!r}: give them different names")
         control = [label for index, label in enumerate(labels) if self.purpose_of(index) == "control"]
         if len(control) != 1:
@@ -433,7 +435,8 @@ class RunConfig(AnyRun):
             )
         if len({channel.input for channel in self.channels}) > 1:
             raise ValueError("all channels must have the same input: the controller drives one actuator")
-        if (name := repeated(self.record_names)) is not None:
+        name = repeated(self.record_names)
+        if name is not None:
             raise ValueError(f"two records are called {name!r}: give them different names")
         if not any(record.role == "estimation" for record in self.source.records):
             raise ValueError("no record has role 'estimation': there is nothing to identify from")
@@ -503,8 +506,12 @@ class RunConfig(AnyRun):
     @property
     def input_files(self) -> list[Path]:
         """Every file the run reads besides its configuration."""
-        more = getattr(self.source, "rig", None), self.closed_loop_data.controller_file
-        return sorted({*super().input_files, *(path for path in more if isinstance(path, Path))})
+        files = set(super().input_files)
+        # A rig may be a preset's name, which is no file.
+        for path in (getattr(self.source, "rig", None), self.closed_loop_data.controller_file):
+            if isinstance(path, Path):
+                files.add(path)
+        return sorted(files)
 
     @property
     def columns(self) -> tuple[Channel, ...]:
@@ -528,7 +535,14 @@ def load_config(path: Path) -> tuple[RunConfig, str]:
 
 
 def loaded(kind: type[RunT], path: Path) -> tuple[RunT, str]:
-    """The same of another kind of run.
+    """Configuration of a kind of run, and its text.
+
+    Parameters
+    ----------
+    kind : type
+        A configuration's class.
+    path : Path
+        A TOML file.
 
     Returns
     -------

@@ -27,14 +27,30 @@ class Section(BaseModel):
 
 
 def repeated(values: Sequence[T]) -> T | None:
-    """The first that is there more than once, if any."""
+    """The first value that is there more than once, None where each is there once."""
     return next((value for value in values if values.count(value) > 1), None)
 
 
 def check(
     model: type[ModelT], document: Any, *, source: str, context: Mapping[str, Any] | None = None
 ) -> ModelT:
-    """`document` as a `model`. Raises InputError: `source`, dotted key and what was expected in one line."""
+    """A document as settings.
+
+    Parameters
+    ----------
+    model : type
+        Class of the settings.
+    document : JSON-able value
+    source : str
+        File or option, with which a complaint begins.
+    context : mapping, optional
+        Of the validation, see `resolve`.
+
+    Raises
+    ------
+    InputError
+        `source`, dotted key and what was expected, in one line.
+    """
     try:
         # As JSON, whose strict reading takes `true` for no 1.0 and "2" for no 2, but a list for a tuple.
         return model.model_validate_json(
@@ -49,24 +65,38 @@ def expand(text: str) -> str:
 
     def value(match: re.Match[str]) -> str:
         name = match.group(1)
-        found = os.environ.get(name)
-        if not found:
+        content = os.environ.get(name)
+        if not content:
             raise ValueError(
                 f"environment variable {name} is not set; set it to the folder meant by {text!r}"
             )
-        return found
+        return content
 
     return _VARIABLE.sub(value, text)
 
 
 def resolve(path: Path, info: ValidationInfo, *, kind: str = "file") -> Path:
-    """With variables of the environment expanded, relative to the `base` of the validation context; must be a
-    file unless `may_be_gone` is set there.
+    """A path of a configuration as a path that can be opened.
 
-    Raises ValueError saying what was found instead.
+    Variables of the environment are expanded.
+
+    Parameters
+    ----------
+    path : Path
+    info : ValidationInfo
+        Its context may hold `base`, the folder that the path is relative to, and `may_be_gone`: then the file
+        need not be there.
+    kind : str
+        What the file is called in a complaint.
+
+    Raises
+    ------
+    ValueError
+        One line: no such file, or a directory.
     """
     context = info.context or {}
-    base, path = context.get("base"), Path(expand(str(path)))
+    base = context.get("base")
+    path = Path(expand(str(path)))
     resolved = Path(os.path.normpath(Path(base) / path)) if base else path
     # os.path answers for names that no file can have, too.
     if not context.get("may_be_gone") and not os.path.isfile(resolved):

@@ -73,14 +73,17 @@ def numbers_of(results: RunResults, config: AnyConfig) -> dict[str, Number]:
     """Numbers of a point from the results of its stages; None where there is none."""
     from workflow.engine.codec import plain
 
-    found: dict[str, Number] = {**dict.fromkeys(COLUMNS), "design_gamma": plain(results.design.gamma)}
-    return found | (
-        _of_joints(results) if isinstance(config, JointsConfig) else _of_one_loop(results, config)
-    )
+    numbers: dict[str, Number] = dict.fromkeys(COLUMNS)
+    numbers["design_gamma"] = plain(results.design.gamma)
+    if isinstance(config, JointsConfig):
+        return numbers | _of_joints(results)
+    return numbers | _of_one_loop(results, config)
 
 
 def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
-    """Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
+    """Numbers of a point of one loop; a column that has none is left out.
+
+    Closed-loop numbers are the worst over the runs. The mode is the least damped one of the nominal closed
     loop, inside the band of the specification where it names one. The measured peak of S is that of the arm
     that was identified, at the larger of two sizes.
     """
@@ -89,70 +92,94 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
-    gamma, certify = results.design.gamma, results.certify
-    bracket, joint = bracket_numbers(results.achievable_performance, gamma), certify.sampled.joint
-    found: dict[str, Number] = {
+    gamma = results.design.gamma
+    certify = results.certify
+    bracket = bracket_numbers(results.achievable_performance, gamma)
+    joint = certify.sampled.joint
+    numbers: dict[str, Number] = {
         "any_order_gamma": bracket["reached"],
         "above_any_order_percent": bracket["above_percent"],
     }
-    if (used := results.design.specification) is not None:
-        found["design_bandwidth_rad_s"] = used.bandwidth_rad_s
+    used_specification = results.design.specification
+    if used_specification is not None:
+        numbers["design_bandwidth_rad_s"] = used_specification.bandwidth_rad_s
     if joint is not None:
-        shares = 100.0 * joint.coverage_given, 100.0 * joint.stable_share
-        found["whole_held_percent"], found["whole_stable_percent"] = shares
-    if (prefilter := results.reference_filter.filter) is not None:
-        found["matching_error"] = prefilter.error_after
-        found["matching_error_unfiltered"] = prefilter.error_before
-    if (certificate := certify.certificate) is not None:
-        verdict, bound = certificate.plants[0], certificate.gamma_bound
+        numbers["whole_held_percent"] = 100.0 * joint.coverage_given
+        numbers["whole_stable_percent"] = 100.0 * joint.stable_share
+    prefilter = results.reference_filter.filter
+    if prefilter is not None:
+        numbers["matching_error"] = prefilter.error_after
+        numbers["matching_error_unfiltered"] = prefilter.error_before
+    certificate = certify.certificate
+    if certificate is not None:
+        verdict = certificate.plants[0]
+        bound = certificate.gamma_bound
         # Of several plants a stated number is the least, and an unstable one has none.
         least_margins = reduce(Margins.worse, (plant.worst_margins for plant in certificate.plants))
-        found |= _margins("", least_margins) | _margins("nominal_", verdict.nominal_margins)
-        found["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
-        found["bandwidth_rad_s"] = min(plant.bandwidth_rad_s for plant in certificate.plants)
+        numbers |= _margins("", least_margins) | _margins("nominal_", verdict.nominal_margins)
+        numbers["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
+        numbers["bandwidth_rad_s"] = min(plant.bandwidth_rad_s for plant in certificate.plants)
         low, high = config.specification.mode_band_rad_s or (0.0, math.inf)
         modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
-        if least := min(modes, key=lambda mode: mode.zeta, default=None):
-            found["mode_damping"], found["mode_omega_rad_s"] = least.zeta, least.omega_rad_s
-    if (check := results.closed_loop.check) is not None:
+        least_damped = min(modes, key=lambda mode: mode.zeta, default=None)
+        if least_damped is not None:
+            numbers["mode_damping"] = least_damped.zeta
+            numbers["mode_omega_rad_s"] = least_damped.omega_rad_s
+    check = results.closed_loop.check
+    if check is not None:
         # A run that never gets there has no time: neither has the point.
-        worst = "settling_time_s", "rise_time_s", "overshoot_percent", "peak_command", "disturbance_peak"
-        found |= {name: check.spread_of(name)[-1] for name in worst}
-        found["settled_draws"], found["draws"] = check.settled_draws, check.draws
+        for metric in (
+            "settling_time_s",
+            "rise_time_s",
+            "overshoot_percent",
+            "peak_command",
+            "disturbance_peak",
+        ):
+            numbers[metric] = check.spread_of(metric)[-1]
+        numbers["settled_draws"] = check.settled_draws
+        numbers["draws"] = check.draws
         if check.friction is not None:
-            found["settling_time_with_friction_s"] = check.friction.settling.worst_s
-        if (loop := check.sensitivity) is not None:
-            peaks = loop.nominal_peak, loop.measured[0].peak
-            found["predicted_peak_sensitivity"], found["measured_peak_sensitivity"] = peaks
-    return found
+            numbers["settling_time_with_friction_s"] = check.friction.settling.worst_s
+        sensitivity = check.sensitivity
+        if sensitivity is not None:
+            numbers["predicted_peak_sensitivity"] = sensitivity.nominal_peak
+            numbers["measured_peak_sensitivity"] = sensitivity.measured[0].peak
+    return numbers
 
 
 def _of_joints(results: Any) -> dict[str, Number]:
-    """Worst over the operating points, over sensors and actuators, and, in closed
-    loop, over runs and joints. disk_margin is that of the nominal loop."""
+    """Numbers of a point of several joints; a column that has none is left out.
+
+    Each is the worst over the operating points, over sensors and actuators, and, in closed loop, over runs
+    and joints. disk_margin is that of the nominal loop.
+    """
     from workflow.engine.codec import plain
 
-    found: dict[str, Number] = {}
-    certificate, runs = results.certify.certificate, results.closed_loop.runs
+    numbers: dict[str, Number] = {}
+    certificate = results.certify.certificate
+    runs = results.closed_loop.runs
     if certificate is not None:
         verdicts = certificate.verdicts
         bounds = max(bound for verdict in verdicts for bound in verdict.bounds.values())
-        found["worst_gamma"] = plain(bounds if math.isfinite(bounds) else certificate.gamma)
+        numbers["worst_gamma"] = plain(bounds if math.isfinite(bounds) else certificate.gamma)
         if all(verdict.stable for verdict in verdicts):
-            disks = [disk.alpha for one in verdicts for disk in (one.input_disk, one.output_disk)]
-            found["disk_margin"] = min(disks)
+            numbers["disk_margin"] = min(
+                min(verdict.input_disk.alpha, verdict.output_disk.alpha) for verdict in verdicts
+            )
     if runs:
-        found["settled_draws"], found["draws"] = sum(run.settled for run in runs), len(runs)
+        numbers["settled_draws"] = sum(run.settled for run in runs)
+        numbers["draws"] = len(runs)
         if all(run.settled for run in runs):
-            found["overshoot_percent"] = 100.0 * max(0.0, *(float(run.overshoot.max()) for run in runs))
-    return found
+            numbers["overshoot_percent"] = 100.0 * max(0.0, *(float(run.overshoot.max()) for run in runs))
+    return numbers
 
 
 def _margins(prefix: str, margins: Margins) -> dict[str, Number]:
-    """Infinite ones are None."""
+    """Columns of margins, their names behind a prefix; an infinite one is None."""
     sides = [margins.gain_up] if math.isfinite(margins.gain_up) else []
     sides += [1.0 / margins.gain_down] if margins.gain_down else []
-    phase, delay = margins.phase_rad, margins.delay_s
+    phase = margins.phase_rad
+    delay = margins.delay_s
     return {
         f"{prefix}modulus_margin": margins.modulus,
         f"{prefix}gain_margin_dB": 20 * math.log10(min(sides)) if sides and min(sides) > 0 else None,

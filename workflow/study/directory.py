@@ -47,8 +47,23 @@ class StudyDirectory(Store):
     own_files = ("study.html", "table.csv", "table.json", "pareto.svg")
 
     def begin_study(self, *, text: str, base: Base, resume: bool, replace: bool = False) -> Self:
-        """As `begin`, held to the base: axes may change, points are found again by their content. Raises
-        InputError also with `replace` where the base is a run of the study that would be deleted."""
+        """Begin or resume the study, which is held to its base: axes may change, as points are found again by
+        their content.
+
+        Parameters
+        ----------
+        text : str
+            The study file, kept as study.toml.
+        base : Base
+        resume, replace : bool
+            See `Store.begin`.
+
+        Raises
+        ------
+        InputError
+            One line: see `Store.begin`; also with `replace` where the base is a run of the study that would
+            be deleted.
+        """
         if replace and base.run is not None and self.path.resolve() in base.run.path.resolve().parents:
             raise InputError(
                 f"{self.path}: --replace would delete the base, {base.run.path}; choose another --out"

@@ -36,9 +36,19 @@ State = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Base:
-    """What every point starts from: a configuration, and the run whose plant is used where one was given.
+    """What every point starts from.
 
-    left_out: limits up to which requirements of the configuration gave way, where an axis sets these.
+    Attributes
+    ----------
+    config : RunConfig or JointsConfig
+    inputs : mapping of str to str
+        Its input files with their SHA-256.
+    run : RunDirectory or None
+        The run whose plant is used, where one was given.
+    folder : Path
+        What paths in changed values are relative to.
+    left_out : mapping of str to float
+        Limits up to which requirements of the configuration gave way, where an axis sets these.
     """
 
     config: AnyConfig
@@ -143,9 +153,12 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
         run = RunDirectory.open(base)
         config = any_config_of(run)
         for stage in plant_stages(config):
-            run.stage_digest(stage.name)  # says which one is missing
+            # Raises where a stage is missing, and names it.
+            run.stage_digest(stage.name)
     else:
         config, _ = load_any(base)
+
+    # Changes of the study, with the limits that an axis makes void.
     values: dict[str, Any] = dict(study.changes)
     left_out: dict[str, float] = {}
     axes = {axis.key for axis in study.axes}
@@ -169,7 +182,9 @@ class PointMaker:
     """Makes the points of a study, numbered in the order they are asked for."""
 
     def __init__(self, study: StudyConfig, study_path: Path, base: Base) -> None:
-        self._axes, self._path, self._base = study.axes, study_path, base
+        self._axes = study.axes
+        self._path = study_path
+        self._base = base
         self._original = None if base.run is None else any_config_of(base.run)
         self._digests = base.digests
         self._made = 0
@@ -186,6 +201,8 @@ class PointMaker:
             return PointRow(self._made, name, dict(values), "impossible", str(error))
         inputs = self._base.inputs_of(config)
         given = () if self._original is None else shared_stages(config, self._original)
+
+        # Keys by what results depend on: points of equal keys share them.
         plant = plant_stages(config)
         plant_key = hash_of(
             {
@@ -240,12 +257,14 @@ class PointMaker:
             self._base.changed({axis.key: value}, f"{self._path}: axes[{index}].{where}")
 
 
-def shared_stages(one: AnyConfig, other: AnyConfig) -> tuple[str, ...]:
-    """Stages of the plant before the first whose settings differ."""
-    same = itertools.takewhile(
-        lambda stage: hash_of(stage.settings(one)) == hash_of(stage.settings(other)), plant_stages(one)
-    )
-    return tuple(stage.name for stage in same)
+def shared_stages(config: AnyConfig, other: AnyConfig) -> tuple[str, ...]:
+    """Names of the plant's stages before the first whose settings differ between two configurations."""
+    shared = []
+    for stage in plant_stages(config):
+        if hash_of(stage.settings(config)) != hash_of(stage.settings(other)):
+            break
+        shared.append(stage.name)
+    return tuple(shared)
 
 
 def short(value: Any) -> str:

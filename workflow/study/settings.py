@@ -61,7 +61,8 @@ class StudyAxis(Section):
                 raise ValueError("values is empty: give one or more")
             if self.points is not None or self.log:
                 raise ValueError("points and log go with from and to")
-            if (twice := repeated([repr(value) for value in self.values])) is not None:
+            twice = repeated([repr(value) for value in self.values])
+            if twice is not None:
                 raise ValueError(f"the value {twice} is listed twice")
         elif self.from_ is None or self.to is None:
             raise ValueError("a range needs from and to")
@@ -90,7 +91,10 @@ class StudyAxis(Section):
             return tuple(range(int(self.from_), int(self.to) + 1))
         spread = np.geomspace if self.log else np.linspace
         numbers = [tidy(float(value)) for value in spread(self.from_, self.to, self.points)]
-        return tuple(dict.fromkeys(round(number) for number in numbers)) if self.whole else tuple(numbers)
+        if not self.whole:
+            return tuple(numbers)
+        # Neighbours may round to one whole number.
+        return tuple(dict.fromkeys(round(number) for number in numbers))
 
 
 def tidy(value: float) -> float:
@@ -152,7 +156,8 @@ class StudyConfig(Section):
             ("keys", [axis.key for axis in self.axes]),
             ("labels", [axis.name for axis in self.axes]),
         ):
-            if (name := repeated(names)) is not None:
+            name = repeated(names)
+            if name is not None:
                 raise ValueError(f"two axes have the same {kind[:-1]} {name!r}: give different {kind}")
         if self.study.seed is not None and any(axis.key == "run.seed" for axis in self.axes):
             raise ValueError("study.seed and an axis over run.seed contradict each other")
@@ -176,7 +181,7 @@ class StudyFile:
 
 
 def load_study(path: Path) -> StudyFile:
-    """Raises InputError: one line naming file, key and what was expected."""
+    """The study of a file. Raises InputError: one line naming file, key and what was expected."""
     text, document = read_toml(path)
     if "study" not in document and "specification" in document:
         raise InputError(

@@ -28,7 +28,7 @@ from workflow.tasks.stages import STAGES
 
 @dataclass(frozen=True, eq=False)
 class Done:
-    """What became of a point: stage files by name, seconds and input hash by stage."""
+    """A computed point: contents of its stage files by file name, seconds and input hash by stage."""
 
     files: Mapping[str, bytes]
     seconds: Mapping[str, float]
@@ -69,11 +69,16 @@ class PointTask:
         run.stages_path.mkdir(parents=True)
         for name, content in self.given.items():
             storage.write_bytes(run.stages_path / name, content)
-        seconds, hashes, results = {}, {}, RunResults(run)
-        for stage in (stage for stage in stages_for(point.config, STAGES) if stage.name in self.stages):
+        seconds = {}
+        hashes = {}
+        results = RunResults(run)
+        for stage in stages_for(point.config, STAGES):
+            if stage.name not in self.stages:
+                continue
             started = time.monotonic()
             wanted = stage_input_hash(stage, point.config, run, point.inputs)
             if run.take_over(stage.name, wanted, earlier) is None:
                 run.save_stage(stage.name, stage.run(StageInput(config, results, Progress())), wanted)
-            seconds[stage.name], hashes[stage.name] = time.monotonic() - started, wanted
+            seconds[stage.name] = time.monotonic() - started
+            hashes[stage.name] = wanted
         return Done(run.stage_files(self.stages), seconds, hashes)

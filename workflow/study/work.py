@@ -48,14 +48,34 @@ def run_study(
 ) -> RunSummary:
     """Compute every point of a study into `out`, then table and page; the table's numbers in the summary.
 
-    jobs: processes of this machine (default: one per processor). scheduler: address of a Dask scheduler whose
-    workers compute the points; what these share is computed here. resume takes up the study that is there,
-    replace deletes it first. A point that cannot be certified is a result.
+    Parameters
+    ----------
+    file : StudyFile
+    out : Path
+        The study's directory.
+    jobs : int, optional
+        Processes of this machine; default: one per processor.
+    scheduler : str, optional
+        Address of a Dask scheduler whose workers compute the points; what these share is computed here.
+    resume, replace : bool
+        Go on with the study that is there, or delete it first.
+    progress : Progress, optional
 
-    Raises InputError (one line) for anything wrong with what the user gave, StageError when points failed
-    (table and page are written all the same, and a resumed study tries them again) or the scheduler was lost.
+    Returns
+    -------
+    RunSummary
+        A point that cannot be certified is a result.
+
+    Raises
+    ------
+    InputError
+        One line: something wrong with what the user gave.
+    StageError
+        Points failed (table and page are written all the same, and a resumed study tries them again), or the
+        scheduler was lost.
     """
-    study, progress = file.config, progress or Progress()
+    study = file.config
+    progress = progress or Progress()
     base = load_base(study, file.path, file.base)
     maker = PointMaker(study, file.path, base)
     points = maker.grid()
@@ -67,10 +87,8 @@ def run_study(
         directory = StudyDirectory(out)
         with directory.writing(resume=resume, replace=replace):
             directory.begin_study(text=file.text, base=base, resume=resume, replace=replace)
-            plant_s, point_s = (
-                sum(stage.expected_s for stage in stages(base.config))
-                for stages in (plant_stages, controller_stages)
-            )
+            plant_s = sum(stage.expected_s for stage in plant_stages(base.config))
+            point_s = sum(stage.expected_s for stage in controller_stages(base.config))
             points_s = point_s * len(points) / executor.width
             progress.plan([("plant", plant_s), ("points", points_s), ("page", REPORT.expected_s)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, len(points))
@@ -109,21 +127,29 @@ class _Work:
     good: int = 0
 
     def make_base_plant(self) -> None:
-        there = self.directory.has_plant(self.base_point)
-        with self.progress.stage("plant", taken_up=there):
-            if not there:
-                given = {} if self.base.run is None else self.base.run.stage_files(self.base_point.given)
-                self._plants([(self.base_point, given)])
+        """Identify the plant of the base, unless the study has it. Raises InputError where that fails."""
+        is_made = self.directory.has_plant(self.base_point)
+        with self.progress.stage("plant", taken_up=is_made):
+            if not is_made:
+                files: Mapping[str, bytes] = {}
+                if self.base.run is not None:
+                    files = self.base.run.stage_files(self.base_point.given)
+                self._plants([(self.base_point, files)])
             reason = self.broken_plants.get(self.base_point.plant_key)
             if reason is not None:
                 raise InputError(f"the base cannot be identified: {reason}")
 
     def compute(self, points: Sequence[Point | PointRow]) -> list[PointRow]:
-        """The rows of the points: what is finished is kept, what shares a controller goes together."""
+        """The rows of the points, in their order.
+
+        What is finished is kept; points that share a controller go to one worker together.
+        """
         rows = {point.name: point for point in points if isinstance(point, PointRow)}
         valid = {point.name: point for point in points if isinstance(point, Point)}.values()
         lacking = {point.plant_key: point for point in valid if not self.directory.has_plant(point)}
         self._plants([(point, self._given(point)) for point in lacking.values()])
+
+        # What is known already, and groups of what is to be computed.
         groups: dict[str, list[Point]] = {}
         for point in valid:
             if point.plant_key in self.broken_plants:
@@ -140,14 +166,14 @@ class _Work:
             _task(group, self.directory.plant_files(group[0]), controller_stages(self.base.config))
             for group in groups.values()
         ]
-        for found in _done(self.executor, list(groups.values()), work):
-            for point, done in found:
+        for results in _done(self.executor, list(groups.values()), work):
+            for point, done in results:
                 if isinstance(done, Failure):
                     rows[point.name] = PointRow(point.number, point.name, point.values, "failed", done.reason)
                 else:
                     self.directory.save_point(point, done)
                     rows[point.name] = row_of(point, self.directory.point(point))
-            self._report([rows[point.name] for point, _ in found])
+            self._report([rows[point.name] for point, _ in results])
         # Two combinations may be the same point: each has its own number.
         return [replace(rows[point.name], number=point.number) for point in points]
 
@@ -156,16 +182,18 @@ class _Work:
         if not wanted:
             return
         work = []
-        for point, given in wanted:
-            there = {name.partition(".")[0] for name in given}
-            lacking = [stage for stage in plant_stages(self.base.config) if stage.name not in there]
-            work.append(_task([point], given, lacking))
-        given_of = {point.name: given for point, given in wanted}
+        for point, files in wanted:
+            stages_with_file = {name.partition(".")[0] for name in files}
+            lacking = [
+                stage for stage in plant_stages(self.base.config) if stage.name not in stages_with_file
+            ]
+            work.append(_task([point], files, lacking))
+        files_of = {point.name: files for point, files in wanted}
         for ((point, done),) in _done(self.here, [[point] for point, _ in wanted], work):
             if isinstance(done, Failure):
                 self.broken_plants[point.plant_key] = done.reason
             else:
-                self.directory.save_plant(point, given_of[point.name], done)
+                self.directory.save_plant(point, files_of[point.name], done)
 
     def _given(self, point: Point) -> Mapping[str, bytes]:
         """What a plant begins with: stages of a given run, else those it shares with the base's plant."""
@@ -193,10 +221,11 @@ def _done(
     executor: Executor, groups: Sequence[Sequence[Point]], tasks: Sequence[PointTask]
 ) -> Iterator[list[tuple[Point, Done | Failure]]]:
     """What became of the points of each task, as they finish."""
-    for index, found in executor.run(tasks):
+    for index, result in executor.run(tasks):
         points = groups[index]
-        each = [found] * len(points) if isinstance(found, Failure) else found
-        yield list(zip(points, each, strict=True))
+        # A task that failed as a whole is the failure of each of its points.
+        result_of_point = [result] * len(points) if isinstance(result, Failure) else result
+        yield list(zip(points, result_of_point, strict=True))
 
 
 def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequence[PointRow]) -> RunSummary:
@@ -225,7 +254,8 @@ def _units(directory: StudyDirectory, config: AnyConfig, rows: Sequence[PointRow
     run = next((run for run in runs if run.stage_file("records") is not None), None)
     if run is None or isinstance(config, JointsConfig):
         return {}
-    control, units = config.control_channel, RunResults(run).records.records[0].units
+    control = config.control_channel
+    units = RunResults(run).records.records[0].units
     return {
         "peak_command": units.get(control.input, ""),
         "disturbance_peak": units.get(control.output, ""),
