@@ -65,11 +65,33 @@ def worst_cases(certificate: Certificate, specification: Specification) -> dict[
 
 
 def against(found: Mapping[str, Any], path: Path, table: str) -> dict[str, tuple[float, float, str]]:
-    """What a baseline holds, by name: value found, value held, and how it stands. Raises InputError."""
+    """Numbers of a plant beside those of a baseline.
+
+    Parameters
+    ----------
+    found : mapping of str to number
+        Numbers of the plant's certificate.
+    path : Path
+        Of the baseline.
+    table : str
+        Of the plant in it.
+
+    Returns
+    -------
+    dict
+        By name: value found, value held, and "as before", "better" or "worse". Less than the tolerance apart
+        is as before; a smaller gamma is better, of all others a larger value.
+
+    Raises
+    ------
+    InputError
+        One line: no such table, a name or a number that is none.
+    """
     held = read_toml(path)[1].get(table)
     if not isinstance(held, dict):
         raise InputError(f"{path}: no table [{table}]: write it with --write-baseline")
-    told, tolerances = dict[str, tuple[float, float, str]](), held.pop("tolerance", {})
+    compared = dict[str, tuple[float, float, str]]()
+    tolerances = held.pop("tolerance", {})
     for name, value in held.items():
         share = tolerances.get(name, 0.0)
         if name not in found:
@@ -78,20 +100,32 @@ def against(found: Mapping[str, Any], path: Path, table: str) -> dict[str, tuple
             raise InputError(f"{path}: [{table}] {name}: expected a number, and a tolerance from 0 to 1")
         within = value * (1 - share) <= found[name] <= value * (1 + share)
         better = found[name] < value if name == "gamma" else found[name] > value
-        told[name] = found[name], value, "as before" if within else "better" if better else "worse"
-    if forgotten := tolerances.keys() - held.keys():
+        if within:
+            verdict = "as before"
+        elif better:
+            verdict = "better"
+        else:
+            verdict = "worse"
+        compared[name] = found[name], value, verdict
+    forgotten = tolerances.keys() - held.keys()
+    if forgotten:
         raise InputError(f"{path}: [{table}.tolerance] {min(forgotten)}: no such number in [{table}]")
-    return told
+    return compared
 
 
 def write_baseline(path: Path, found: Mapping[str, Mapping[str, Any]]) -> None:
-    """The tables of a baseline anew; tolerances, and what else is there, are kept. Raises InputError."""
+    """Write the numbers of each plant into a baseline.
+
+    path: of the file; found: numbers by plant. Tolerances, and what else is in the file, are kept; of a table
+    that is there only the numbers it holds are written. Raises InputError.
+    """
     document = tomlkit.parse(read_toml(path)[0] if path.exists() else _HEADER)
     for name, numbers in found.items():
-        given, table = document.get(name, {}), tomlkit.table()
-        for key in [key for key in numbers if not given or key in given]:
+        earlier = document.get(name, {})
+        table = tomlkit.table()
+        for key in [key for key in numbers if not earlier or key in earlier]:
             table.add(key, numbers[key] if isinstance(numbers[key], bool) else float(f"{numbers[key]:.6g}"))
-        table.add("tolerance", given.get("tolerance", _TOLERANCES))
+        table.add("tolerance", earlier.get("tolerance", _TOLERANCES))
         document[name] = table
     storage.write_text(path, tomlkit.dumps(document))
 
@@ -122,8 +156,10 @@ def certify_controller(
     progress.plan([("plants", 5.0), ("certify", 5.0)])
     with progress.stage("plants"):
         sources, asked, specification = load_asked(paths, file or DesignFile())
-    specification, config = at_one_bandwidth(specification, of_run(paths)), sources[0].config
-    plants, logged = [source.plant for source in sources], sources[0].logged
+    specification = at_one_bandwidth(specification, of_run(paths))
+    config = sources[0].config
+    plants = [source.plant for source in sources]
+    logged = sources[0].logged
     law = read_law(controller, plants[0].dt_s, specification.computational_delay_samples)
     if logged is not None:
         law = law.in_units(1 / np.array(logged.error), 1 / np.array(logged.command))

@@ -63,7 +63,8 @@ def _design(
         if design.synthesis is None:
             return replace(design, reason=f"specification not met: {design.reason}"), none, *nothing
         achievable = find_bracket(plants, specification, asked.achievable_performance)
-        if (controller := design.controller) is None:
+        controller = design.controller
+        if controller is None:
             return design, none, achievable, nothing[1]
         certified = certify_asked(
             controller,
@@ -79,10 +80,22 @@ def _design(
 def load_asked(
     paths: Sequence[Path], file: DesignFile
 ) -> tuple[list[DesignSource], DesignFile, Specification]:
-    """The plants, the design file completed by a run's own configuration, and the one specification; all runs
-    scale their columns alike. Raises InputError."""
+    """The plants of a design, its file completed by a run's own configuration, and the one specification.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Files or run directories; all runs have to scale their columns alike.
+    file : DesignFile
+
+    Raises
+    ------
+    InputError
+        One line.
+    """
     sources = load_sources(paths, file)
-    asked, named = file.completed(sources[0].config), ", ".join(map(str, paths))
+    asked = file.completed(sources[0].config)
+    named = ", ".join(map(str, paths))
     specification = (file if len(paths) > 1 else asked).specification
     if specification is None:
         raise InputError(f"{named}: no specification for all: give --spec FILE")
@@ -93,7 +106,7 @@ def load_asked(
         specification.refuse_other_rate(plants)
         specification.refuse_sampling(plants[0].dt_s)
     logged = [source.logged for source in sources if source.logged is not None]
-    if len({(one.error, one.command) for one in logged}) > 1:
+    if len({(columns.error, columns.command) for columns in logged}) > 1:
         raise InputError(f"{named}: the runs scale their columns differently: no controller fits all")
     return sources, asked, specification
 
@@ -104,13 +117,16 @@ def of_run(paths: Sequence[Path]) -> RunResults | None:
     return RunResults(run) if run is not None and run.stage_file("design") else None
 
 
-def at_one_bandwidth(specification: Specification, found: RunResults | None) -> Specification:
-    """Of one whose requirements give way: as far as they did in its run, or what is tried first. A search for
-    that takes a dozen designs."""
+def at_one_bandwidth(specification: Specification, run: RunResults | None) -> Specification:
+    """The specification without limits to which requirements give way.
+
+    Each stands as far as it gave way in the run that is passed, else as it is tried first: to search for that
+    takes a dozen designs.
+    """
     known = specification.model_dump(include=set(Specification.model_fields), exclude_unset=True)
     for key, limit in GIVES_WAY.items():
-        if known.pop(limit, None) is not None and found is not None:
-            known[key] = getattr(found.design.specification or specification, key)
+        if known.pop(limit, None) is not None and run is not None:
+            known[key] = getattr(run.design.specification or specification, key)
     return Specification.model_validate(known)
 
 
@@ -124,20 +140,41 @@ def design_controller(
     dialect: Dialect | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Design and certify one controller for one or several plants (files: `workflow.tasks.design_source`).
+    """Design and certify one controller for one or several plants.
 
-    file: None takes the specification of a run directory. out: of the controller, by its ending as JSON, MAT
-    file or C source (as of dialect), and beside it of a reference filter. page: of the design, for the plant
-    of one run; report.html beside the files where `out` is a directory. A specification that no controller
-    can meet is a result: not certified, the reason in `verdict`. Raises InputError.
+    Parameters
+    ----------
+    paths : sequence of Path
+        Plants, see `workflow.tasks.design_source`.
+    file : DesignFile, optional
+        None takes the specification of a run directory.
+    out : Path, optional
+        Of the controller, by its ending as JSON, MAT file or C source, and beside it of a reference filter; a
+        directory: all of them.
+    page : Path, optional
+        Of the design, for the plant of one run; default: report.html beside the files in a directory.
+    seed : int
+    dialect : Dialect, optional
+        Of the C code.
+    progress : Progress, optional
+
+    Returns
+    -------
+    RunSummary
+        A specification that no controller can meet is a result: not certified, the reason in `verdict`.
+
+    Raises
+    ------
+    InputError
+        One line.
     """
-    name, file = (file.name, file) if file is not None else (str(paths[0]), DesignFile())
+    name = str(paths[0]) if file is None else file.name
+    file = file or DesignFile()
     written = [] if out is None else targets(out)
     if out is not None and not out.is_dir() and out.suffix.lower() not in SUFFIXES:
         raise InputError(f"--out {out}: the ending must be one of {', '.join(SUFFIXES)}, or a directory")
-    storage.refuse_in_the_way(
-        paths, [("--out", one) for path in written for one in (path, filter_file(path))]
-    )
+    outputs = [("--out", output) for path in written for output in (path, filter_file(path))]
+    storage.refuse_in_the_way(paths, outputs)
     progress = progress or Progress()
     if page is not None:
         storage.refuse_in_the_way(paths, [("--report", page)])
@@ -153,7 +190,8 @@ def design_controller(
     check_filter(asked.reference_filter, plants[0].dt_s, name)
     with progress.stage("design") as update:
         design, certify, achievable, prefilter = _design(plants, specification, asked, seed, update)
-    controller, gamma = design.controller, design.gamma
+    controller = design.controller
+    gamma = design.gamma
     order = (design.specification or specification).controller_order
     files: list[Path] = []
     # As the files have it.

@@ -18,7 +18,10 @@ from workflow.text.templates import RunSummary, rows_of
 if TYPE_CHECKING:
     from workflow.tasks.experiment import ExperimentLimits
 
-PLAN_FILE, PAGE_FILE = "plan.json", "plan.html"
+# The plan, beside the records.
+PLAN_FILE = "plan.json"
+# Its page.
+PAGE_FILE = "plan.html"
 
 
 def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settings: object) -> list[Path]:
@@ -29,30 +32,30 @@ def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settin
     from workflow.tasks.experiment import plan_experiment
 
     RunDirectory(out).refuse_unless_free()
-    found = plan_experiment(limits, seed=seed, **settings)
+    experiment = plan_experiment(limits, seed=seed, **settings)
     # Here: these take seconds to load, and limits that are refused do not need them.
     from workflow.report.rendering import render_page
     from workflow.tasks.simulated_rig import INPUT_NAME
 
-    time = np.arange(found.plan.n_samples) * limits.dt_s
-    signals = found.voltages_V.reshape(-1, time.size)
+    time = np.arange(experiment.plan.n_samples) * limits.dt_s
+    signals = experiment.voltages_V.reshape(-1, time.size)
     texts = {
         record.file: storage.csv_text({"time_s": time, INPUT_NAME: voltage})
-        for record, voltage in zip(found.records, signals, strict=True)
+        for record, voltage in zip(experiment.records, signals, strict=True)
     }
     texts[PLAN_FILE] = codec.plain_text(
         {
-            "plan": found.plan,
-            "seed": found.seed,
-            "dt_s": found.limits.dt_s,
-            "duration_s": found.duration_s,
-            "lines_Hz": found.lines_Hz,
-            "detection_lines_Hz": found.detection_Hz,
-            "expected_radius_rad_per_V": found.radii,
-            "records": found.records,
+            "plan": experiment.plan,
+            "seed": experiment.seed,
+            "dt_s": experiment.limits.dt_s,
+            "duration_s": experiment.duration_s,
+            "lines_Hz": experiment.lines_Hz,
+            "detection_lines_Hz": experiment.detection_Hz,
+            "expected_radius_rad_per_V": experiment.radii,
+            "records": experiment.records,
         }
     )
-    texts[PAGE_FILE] = render_page("experiment.html.j2", title="Planned experiment", found=found).html
+    texts[PAGE_FILE] = render_page("experiment.html.j2", title="Planned experiment", found=experiment).html
     return storage.write_new_directory(out, texts)
 
 
@@ -62,29 +65,45 @@ def write_reference(
     stated: Reading,
     **wanted: Any,
 ) -> RunSummary:
-    """Plan a reference for the loop that made these logs; one CSV (time_s and the reference) per record, and
-    the plan. wanted: as `plan_reference`. Raises InputError."""
+    """Plan a reference for the loop that made these logs; one CSV per record, and the plan.
+
+    Parameters
+    ----------
+    logs : sequence of Path
+    out : Path
+        A directory; each CSV has time_s and the reference.
+    stated : Reading
+        How the logs are read.
+    **wanted
+        Keywords of `plan_reference`.
+
+    Raises
+    ------
+    InputError
+        One line.
+    """
     RunDirectory(out).refuse_unless_free()
     read = read_channel("excite --closed-loop", logs, stated)
     from workflow.tasks.reference_plan import plan_reference  # takes seconds to load
 
     roles = read.roles
     position = is_position(roles.output, read.unit_of[roles.output])
-    found = plan_reference(read.records, position=position, **wanted)
-    column, time = roles.reference or "reference", np.arange(found.plan.n_samples) * found.dt_s
+    plan = plan_reference(read.records, position=position, **wanted)
+    column = roles.reference or "reference"
+    time = np.arange(plan.plan.n_samples) * plan.dt_s
     texts = {
-        f"{found.plan.realisations * level + k + 1:02d}_level_{level + 1}_realisation_{k + 1}.csv": (
-            storage.csv_text({"time_s": time, column: found.offset + signal})
+        f"{plan.plan.realisations * level + k + 1:02d}_level_{level + 1}_realisation_{k + 1}.csv": (
+            storage.csv_text({"time_s": time, column: plan.offset + signal})
         )
-        for level, signals in enumerate(found.references)
+        for level, signals in enumerate(plan.references)
         for k, signal in enumerate(signals)
     }
-    numbers = {key: value for key, value in vars(found).items() if key != "references"}
+    numbers = {key: value for key, value in vars(plan).items() if key != "references"}
     texts[PLAN_FILE] = codec.plain_text({"files": sorted(texts), "reference": column, **numbers})
     storage.write_new_directory(out, texts)
     return RunSummary(
         title=str(out),
-        sections=rows_of("summary/reference.j2", found=found, roles=roles, unit_of=read.unit_of),
+        sections=rows_of("summary/reference.j2", found=plan, roles=roles, unit_of=read.unit_of),
         numbers=codec.plain(numbers),
         verdict=f"play {column} of each file; log {column}, {roles.input} and {roles.output} from its start",
     )

@@ -37,12 +37,34 @@ def identify_logs(
     export: Path | None = None,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Identify one channel from logs (tangent uncertainty) and write what is asked for.
+    """Identify one channel from logs and write what is asked for.
 
-    out: npz with model and posterior, for `flexlink design`; report: HTML page; export: the model as .json
-    or .mat. Every file is written when everything is known, and whole. band_rad_s, described: as of
-    `identify_records`; where friction is identified the output is the position of the shaft it acts on.
-    loop: how to use logs made in closed loop. Raises InputError.
+    Every file is written when everything is known, and whole.
+
+    Parameters
+    ----------
+    logs : Logs
+    options : IdentOptions, optional
+        Of the pole search.
+    described : UncertaintyOptions, optional
+        What the ellipses describe. Where friction is identified the output is the position of the shaft on
+        which it acts.
+    band_rad_s : tuple of two float, optional
+        The data are confined to this band [rad/s].
+    loop : ClosedLoopData, optional
+        How logs that were made in closed loop are used.
+    out : Path, optional
+        npz with model and posterior, for `flexlink design`.
+    report : Path, optional
+        HTML page.
+    export : Path, optional
+        The model as .json or .mat.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line.
     """
     progress = progress or Progress()
     described = described or UncertaintyOptions()
@@ -66,7 +88,10 @@ def identify_logs(
     from workflow.tasks.simulated_rig import beside, truth_beside
     from workflow.tasks.summary import model_numbers, uncertainty_numbers
 
-    progress.plan((("identify", 2.0), ("uncertainty", 1.0), *((("report", 4.0),) if report else ())))
+    steps = [("identify", 2.0), ("uncertainty", 1.0)]
+    if report:
+        steps.append(("report", 4.0))
+    progress.plan(steps)
     true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
     in_loop = loop is not None and loop.stated
     common = with_common_sampling_time(records)
@@ -107,7 +132,8 @@ def identify_logs(
     interrupts.check()
     storage.write_together(written)
     with speaking("identify"):
-        about, spread = result.about, result.spread
+        about = result.about
+        spread = result.spread
         return RunSummary(
             title=f"{about.input} to {about.output}",
             sections=rows_of("summary/identification.j2", result=result),

@@ -34,10 +34,30 @@ def identify_response(
     refused: Sequence[str] = (),
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Fit a model to a measured response with variances, or to repeated sweeps (in one file or several).
+    """Fit a model to a measured response with variances, or to repeated sweeps.
 
-    refused: options of logs that were given, which mean nothing here. out, export: as in `identify_logs`.
-    Raises InputError.
+    Parameters
+    ----------
+    paths : sequence of Path
+        One file or several of one response.
+    dt_s : float or None
+        Period at which the model runs [s]; None is refused.
+    level : float
+        Probability of an ellipse.
+    options : IdentOptions, optional
+        Of the pole search.
+    out : Path, optional
+        npz with model and posterior, for `flexlink design`.
+    export : Path, optional
+        The model as .json or .mat.
+    refused : sequence of str
+        Options of logs that were typed, which mean nothing here.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line.
     """
     if refused:
         raise InputError(
@@ -59,38 +79,37 @@ def identify_response(
                 "variance_real, variance_imag or more sweeps (flexlink identify SWEEP1 SWEEP2 SWEEP3); or a "
                 "stated uncertainty, [uncertainty] multiplicative = 0.1 in the file of flexlink design --spec"
             )
-        found = identify_frf(response, options)
+        fit = identify_frf(response, options)
     written: dict[Path, bytes] = {}
     if out is not None or export is not None:
         ends = response.omega_rad_s[response.omega_rad_s > 0]
         omega = np.geomspace(ends[0], ends[-1], FREQUENCIES)
         if out is not None:
-            nominal = nominal_near(found.posterior, found.model.poles, omega)
-            written[out] = storage.npz_bytes(
-                codec.to_arrays(IdentifiedPlant(nominal, found.posterior, level))
-            )
+            nominal = nominal_near(fit.posterior, fit.model.poles, omega)
+            written[out] = storage.npz_bytes(codec.to_arrays(IdentifiedPlant(nominal, fit.posterior, level)))
         if export is not None:
-            written[export] = model_bytes(export, ModelFile(found.model, found.posterior.at(omega, level)))
+            written[export] = model_bytes(export, ModelFile(fit.model, fit.posterior.at(omega, level)))
     interrupts.check()
     storage.write_together(written)
-    poles, dt_s = found.model.poles, found.model.dt_s
+    poles = fit.model.poles
+    dt_s = fit.model.dt_s
     return RunSummary(
         title=f"frequency response {paths[0].name}",
-        sections=rows_of("summary/response.j2", found=found, response=response),
+        sections=rows_of("summary/response.j2", found=fit, response=response),
         numbers={
-            "order": found.model.order,
+            "order": fit.model.order,
             "dt_s": dt_s,
             "real_poles_per_s": codec.plain(poles.decay_per_s(dt_s)),
             "modes": [
                 {"omega_rad_s": omega, "frequency_Hz": omega / (2 * np.pi), "damping": zeta}
                 for omega, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
             ],
-            "chi_square": found.rss,
-            "degrees_of_freedom": found.degrees_of_freedom,
-            "verdicts": [words(item) for item in found.verdicts],
-            "warnings": [words(item) for item in found.warnings],
+            "chi_square": fit.rss,
+            "degrees_of_freedom": fit.degrees_of_freedom,
+            "verdicts": [words(item) for item in fit.verdicts],
+            "warnings": [words(item) for item in fit.warnings],
             "file": None if out is None else str(out),
             "model_file": None if export is None else str(export),
         },
-        verdict=count(len(found.warnings), "warning"),
+        verdict=count(len(fit.warnings), "warning"),
     )

@@ -44,15 +44,39 @@ if TYPE_CHECKING:
     from workflow.tasks.draft import Draft
     from workflow.tasks.results import IdentifiedChannel, RunResults
 
-_NEARLY_ALL = 0.99  # rows of a held log: one may be missing
+# Share of the gaps between changes that are whole multiples of the usual one in a log that holds its rows:
+# one may be missing.
+_NEARLY_ALL = 0.99
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What the template of the configuration shows, of a command. scale, units: as stated, and the sign that
-    is turned; before: the draft that the logs were identified by, where `draft` is what followed; refused:
-    why no friction is identified at the sensor although it may be there; remote: friction is identified at a
-    shaft that the sensor does not see; typed: keys of the specification that the user stated."""
+    """What the template of the configuration shows.
+
+    Attributes
+    ----------
+    command : str
+        That drafts it.
+    logs : tuple of Path
+    file_name : str
+        Of the configuration, as one types it.
+    stated : Reading
+        How the user says that the logs are read.
+    read : ReadChannel
+    scale, units : mappings
+        By column: as stated, with the sign of an input that is turned.
+    draft : Draft
+    doubts : tuple of Finding
+        Of the way in which the logs were read.
+    before : Draft or None
+        The draft that the logs were identified by, where `draft` is what followed from the model.
+    refused : str
+        Why no friction is identified at the sensor although it may be there.
+    remote : bool
+        Friction is identified at a shaft that the sensor does not see.
+    typed : frozenset of str
+        Keys of the specification that the user stated.
+    """
 
     command: str
     logs: tuple[Path, ...]
@@ -77,15 +101,32 @@ def init(
     replace_file: bool = False,
     progress: Progress | None = None,
 ) -> RunSummary:
-    """Write the configuration of one channel of these logs, once they are identified. Raises InputError, one
-    line."""
+    """Write the configuration of one channel of these logs, once they are identified.
+
+    Parameters
+    ----------
+    logs : sequence of Path
+    out : Path
+        The configuration's file.
+    stated : Reading, optional
+        How the logs are read.
+    replace_file : bool
+        Write over a file that is there.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line.
+    """
     storage.refuse_in_the_way(logs, [("--out", out)])
     if out.is_file() and not replace_file:
         raise InputError(f"{out} exists: take another --out, or --replace to write over it")
     with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
         config, text, found = decided("init", logs, out, stated, progress, RunDirectory(Path(folder)))
     storage.write_text(out, text)
-    look, draft = found.draft.look, found.draft
+    look = found.draft.look
+    draft = found.draft
     return RunSummary(
         title=str(out),
         sections=rows_of("summary/init.j2", found=found, config=config),
@@ -173,7 +214,8 @@ def decided(
                         break
             else:
                 raise
-        results, at = RunResults(run), config.control_index
+        results = RunResults(run)
+        at = config.control_index
         if found.refused and not found.remote:
             found = replace(found, refused=found.refused + _best_linear(results.identify.channels[at]))
         draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
@@ -217,10 +259,11 @@ def _best_linear(channel: IdentifiedChannel) -> str:
     if "least_in_loop_percent" not in values:
         return ""
     modes = [f"{mode.omega_rad_s / (2 * np.pi):.3g}" for mode in channel.modes if channel.is_mode(mode)]
-    least, most = f"{values['least_in_loop_percent']:.0f}", f"{values['most_in_loop_percent']:.0f}"
-    share = least if least == most else f"{least} to {most}"
-    named = f", with modes at {', '.join(modes)} Hz" if modes else ", without a mode"
-    return f"; a linear model explains {share} % in a free run in the loop{named}"
+    worst_percent = f"{values['least_in_loop_percent']:.0f}"
+    best_percent = f"{values['most_in_loop_percent']:.0f}"
+    share = worst_percent if worst_percent == best_percent else f"{worst_percent} to {best_percent}"
+    modes_in_words = f", with modes at {', '.join(modes)} Hz" if modes else ", without a mode"
+    return f"; a linear model explains {share} % in a free run in the loop{modes_in_words}"
 
 
 def drafted(
@@ -230,14 +273,31 @@ def drafted(
     stated: Reading | None,
     progress: Progress | None = None,
 ) -> tuple[RunConfig, str, Found]:
-    """The configuration of one channel of these logs, to stand at `out`, its text, and what was seen; nothing
-    is written. command: what a complaint says to type again. Raises InputError, one line."""
+    """The configuration of one channel of these logs, its text, and what was seen; nothing is written.
+
+    Parameters
+    ----------
+    command : str
+        What a complaint says to type again.
+    logs : sequence of Path
+    out : Path
+        Where the configuration is to stand.
+    stated : Reading, optional
+        How the logs are read.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line.
+    """
     stated = stated or Reading()
     read = read_channel(command, logs, stated, progress, drafted=True)
     # A log that is refused does not wait for what looks at it: that takes seconds to load.
     from workflow.tasks.draft import draft_of
 
-    output, unit_of = read.roles.output, read.unit_of
+    output = read.roles.output
+    unit_of = read.unit_of
     with naming_readings(read.records), naming(command):
         draft = draft_of(
             read.records,
@@ -246,7 +306,8 @@ def drafted(
             controller_period_s=stated.controller_period_s,
             command_averaged=stated.command_averaged,
         )
-    scale, units = dict(stated.scale), dict(stated.units)
+    scale = dict(stated.scale)
+    units = dict(stated.units)
     if draft.look.turned:
         name = read.roles.input
         scale[name] = -scale.get(name, 1.0)
@@ -262,16 +323,28 @@ def written(found: Found, out: Path) -> tuple[RunConfig, str]:
     from workflow.config.settings import check
 
     text = configuration(found, _entries(found.read.tables, out, found.draft))
-    return (
-        check(RunConfig, tomllib.loads(text), source=str(out), context={"base": out.absolute().parent}),
-        text,
-    )
+    context = {"base": out.absolute().parent}
+    return check(RunConfig, tomllib.loads(text), source=str(out), context=context), text
 
 
 @dataclass(frozen=True, eq=False)
 class ReadChannel:
-    """One channel of logs as read. how: with what was found; unit_of: input and output; repeats: rows of the
-    logs that are alike, one after the other, 1 where each is its own. tables: of the records."""
+    """One channel of logs as read.
+
+    Attributes
+    ----------
+    roles : Roles
+        Columns of input, output, reference and time.
+    how : Reading
+        As stated, with what was found.
+    unit_of : dict
+        Units of input and output by column, "" where they are not known.
+    records : list of Record
+    repeats : int
+        Rows of the logs that are alike, one after the other; 1 where each is its own.
+    tables : list of Table
+        Of the records.
+    """
 
     roles: Roles
     how: Reading
@@ -289,9 +362,27 @@ def read_channel(
     *,
     drafted: bool = False,
 ) -> ReadChannel:
-    """Columns as names and units tell them, a reference among them, repaired and unwrapped where they need
-    it. command: what a complaint says to type again; drafted: a model is drafted from the logs, so that
-    hopeless ones are refused before that is loaded. Raises InputError."""
+    """One channel of logs by the names and units of their columns.
+
+    A reference is among them; the records are repaired, unwrapped and resampled where they need it.
+
+    Parameters
+    ----------
+    command : str
+        What a complaint says to type again.
+    logs : sequence of Path
+    stated : Reading
+        How the user says that the logs are read.
+    progress : Progress, optional
+        Told a line for each doubt.
+    drafted : bool
+        A model is drafted from the logs: hopeless ones are refused before that is loaded.
+
+    Raises
+    ------
+    InputError
+        One line that names file, column or line.
+    """
     tables = list[Table]()
     for path in logs:
         with naming(str(path)):
@@ -309,6 +400,8 @@ def read_channel(
             typed += "".join(f" --{role} {as_typed(name)}" for role, name in named.items() if name)
             ways = [f"--time {as_typed(name)}" for name in rising(tables[0])] or ["--dt-s SECONDS"]
             raise ValueError(f"no column looks like time; type: {typed} {ways[0]}")
+
+    # What time stamps and angles need so that the next command reads them alike.
     with naming(""):
         options = [
             option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])
@@ -353,14 +446,16 @@ def read_channel(
 
 def _repeats(record: Record) -> int:
     """Rows after which a logger that is faster than the controller writes new ones; 1 where it is not."""
-    columns = [record.input, record.output, *([] if record.reference is None else [record.reference])]
+    columns = [record.input, record.output]
+    if record.reference is not None:
+        columns.append(record.reference)
     gaps = np.diff(np.flatnonzero(np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1)))
     usual = int(np.median(gaps)) if gaps.size else 1
     return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
 
 
 def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
-    """The TOML text."""
+    """Text of the configuration (TOML). records: keys of each record."""
     filters = (
         ("toml", _toml),
         ("toml_key", lambda name: tomlkit.key(name).as_string()),
@@ -376,17 +471,23 @@ def _toml(value: Any) -> str:
 
 def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:
     """Keys of each record. The last log, or run, validates; of one the last part, where it is split."""
-    base, stems = out.absolute().parent, [table.path.stem for table in tables]
+    base = out.absolute().parent
+    stems = [table.path.stem for table in tables]
     paths = [Path(os.path.relpath(table.path.absolute(), base)).as_posix() for table in tables]
     if len(tables) == 1 and draft.split_sample is not None:
         first = {"path": paths[0], "name": f"{stems[0]}, first part", "stop_sample": draft.split_sample}
         last = {"path": paths[0], "name": f"{stems[0]}, last part", "start_sample": draft.split_sample}
         return [first, last | {"role": "validation"}]
-    alike, found = len(set(stems)) < len(stems), list[dict[str, Any]]()
+    alike = len(set(stems)) < len(stems)
+    entries = list[dict[str, Any]]()
     for k, (path, stem, table) in enumerate(zip(paths, stems, tables, strict=True)):
-        run = {"name": f"{stem}, {table.run}", "run": paths[:k].count(path)} if table.run else {}
-        named = {"name": f"{k + 1}: {stem}"} if alike and not run else {}
-        found.append(
-            {"path": path, **run, **named, **({"role": "validation"} if 0 < k == len(paths) - 1 else {})}
-        )
-    return found
+        entry: dict[str, Any] = {"path": path}
+        if table.run:
+            entry["name"] = f"{stem}, {table.run}"
+            entry["run"] = paths[:k].count(path)
+        elif alike:
+            entry["name"] = f"{k + 1}: {stem}"
+        if 0 < k == len(paths) - 1:
+            entry["role"] = "validation"
+        entries.append(entry)
+    return entries

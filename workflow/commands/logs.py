@@ -22,8 +22,10 @@ _NEEDED = {"init": ("--out my.toml",), "excite --closed-loop": ("--out experimen
 
 
 class Reading(LogReading):
-    """Columns of one channel and how they are read, as stated; the rest as in `Record.from_file`. doubts: of
-    how the columns were found."""
+    """Columns of one channel and how they are read, as stated; see `Record.from_file`.
+
+    doubts: of how the columns were found.
+    """
 
     input_name: str | None = Field(
         None, description="name of the input column; default: as names and units say"
@@ -81,9 +83,11 @@ class Reading(LogReading):
         return " ".join([*words, *_NEEDED.get(command, ())])
 
     def records(self, tables: Sequence[Table]) -> list[Record]:
-        """Of tables that are used together, where input and output are named; each column in one unit. Raises
-        InputError naming file, column or line."""
-        found = list[Record]()
+        """Records of tables that are used together, each column in one unit.
+
+        Input and output have to be named. Raises InputError naming file, column or line.
+        """
+        records = list[Record]()
         for table in tables:
             with naming(str(table.path)):
                 record = Record.from_file(
@@ -102,16 +106,30 @@ class Reading(LogReading):
                     unwrap=self.unwrap,
                     decimal=self.decimal,
                 )
-                found.append(replace(record, notes=(*record.notes, *self.doubts)))
+                records.append(replace(record, notes=(*record.notes, *self.doubts)))
         with naming(""):
-            found = in_one_unit(found)
+            records = in_one_unit(records)
             limit = self.input_limit
-            return found if limit is None else [record.limited(limit) for record in found]
+            return records if limit is None else [record.limited(limit) for record in records]
 
 
 @dataclass(frozen=True, eq=False)
 class Logs:
-    """Records as read, of the fit and kept for validation, and all their files."""
+    """Records as read.
+
+    Attributes
+    ----------
+    measured, fresh : tuples of Record
+        Of the fit, and kept for validation.
+    files : tuple of Path
+        All their files.
+    input_limit : float or None
+        Of the amplifier, as stated.
+    controller_period_s : float or None
+        Of the controller that made the logs, as stated [s].
+    command_averaged : bool
+        The drive logs the mean of its commands over each row.
+    """
 
     measured: tuple[Record, ...]
     fresh: tuple[Record, ...]
@@ -127,25 +145,40 @@ def to_type(logs: Sequence[Path]) -> str:
 
 
 def read_logs(logs: Sequence[Path], stated: Reading | None = None, validation: Sequence[Path] = ()) -> Logs:
-    """One channel of log files as stated; columns that are not named are found where names and units leave no
-    doubt. Raises InputError: one line naming file, column or line."""
-    how, tables = stated or Reading(), list[Table]()
+    """One channel of log files.
+
+    Columns that are not named are found where names and units leave no doubt.
+
+    Parameters
+    ----------
+    logs, validation : sequences of Path
+        Of the fit, and kept for validation.
+    stated : Reading, optional
+        How they are read.
+
+    Raises
+    ------
+    InputError
+        One line naming file, column or line.
+    """
+    how = stated or Reading()
+    tables = list[Table]()
     for path in (*logs, *validation):
         with naming(str(path)):
             tables.append(read_table(path).with_decimal(how.decimal))
     if how.input_name is None or how.output_name is None or (how.time is None and how.dt_s is None):
         with naming(str(logs[0])):
             roles = how.roles(tables[0], logs, "identify")
-        given: dict[str, Any] = {
+        found_columns: dict[str, Any] = {
             "input_name": roles.input,
             "output_name": roles.output,
             "doubts": roles.doubts,
         }
         if roles.reference and all(roles.reference in table.names for table in tables[1:]):
-            given["reference"] = roles.reference
+            found_columns["reference"] = roles.reference
         if how.time is None and how.dt_s is None:
-            given["time"] = roles.time
-        how = how.model_copy(update=given)
+            found_columns["time"] = roles.time
+        how = how.model_copy(update=found_columns)
     runs = [table.runs(how.time) for table in tables]
     records = tuple(how.records([run for parts in runs for run in parts]))
     n_measured = sum(map(len, runs[: len(logs)]))

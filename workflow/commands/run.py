@@ -131,7 +131,8 @@ def run_from_files(
     elif resume and out is not None and (out / "manifest.json").is_file():
         from workflow.tasks.pipeline import any_config_of
 
-        config, text = any_config_of(RunDirectory.open(out)), ""
+        config = any_config_of(RunDirectory.open(out))
+        text = ""
     elif resume and not replace:
         raise InputError(f"{out}: no run is there to resume; start one without --resume")
     else:
@@ -140,7 +141,8 @@ def run_from_files(
         if typed:
             config = config_with_typed(config, typed, called)
             text = config.to_toml()
-    place, read = out if out is not None else default_directory(config.run.name), list[Record]()
+    place = out if out is not None else default_directory(config.run.name)
+    read = list[Record]()
     # What is refused does not wait for what computes: that takes seconds to load.
     if isinstance(config.source, FileSource) and earlier is None and not (resume and place.exists()):
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)

@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from itertools import count
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -49,7 +48,8 @@ class TuneServer(ThreadingHTTPServer):
             super().__init__((HOST, port), _Request)
         except (OSError, OverflowError) as error:
             raise InputError(f"--port {port}: cannot be listened on ({error}); choose another") from error
-        self.session, self.token = session, secrets.token_urlsafe(24)
+        self.session = session
+        self.token = secrets.token_urlsafe(24)
         self.hosts = tuple(f"{name}:{self.server_port}" for name in (HOST, "localhost"))
         self.actions: dict[str, Handler] = {
             "/scaled": lambda asked: session.scaled(asked["settings"]),
@@ -90,9 +90,17 @@ class TuneServer(ThreadingHTTPServer):
                 unit=_of_script(f" [{unit}]" if unit else ""),
                 filtered=session.filter is not None,
                 out=session.out,
-                name=next(name for k in count(1) if not (session.out / (name := f"tuned-{k}")).exists()),
+                name=_free_name(session.out),
             )
         )
+
+
+def _free_name(folder: Path) -> str:
+    """First of "tuned-1", "tuned-2", ... that does not exist in a folder."""
+    number = 1
+    while (folder / f"tuned-{number}").exists():
+        number += 1
+    return f"tuned-{number}"
 
 
 def _of_script(value: Any) -> str:
@@ -104,7 +112,8 @@ class _Request(BaseHTTPRequestHandler):
     server: TuneServer
     protocol_version = "HTTP/1.1"
     timeout = 60
-    server_version, sys_version = "flexlink", ""
+    server_version = "flexlink"
+    sys_version = ""
 
     def do_GET(self) -> None:
         try:
@@ -150,8 +159,8 @@ class _Request(BaseHTTPRequestHandler):
         except InputError as error:
             self._refuse(HTTPStatus.BAD_REQUEST, one_line(error))
         except Exception as error:  # the page goes on, whatever a library raises
-            said = f"internal error: {type(error).__name__}: {one_line(error)}"
-            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, said)
+            reason = f"internal error: {type(error).__name__}: {one_line(error)}"
+            self._refuse(HTTPStatus.INTERNAL_SERVER_ERROR, reason)
         else:
             self._answer(HTTPStatus.OK, answer, "application/json")
 

@@ -52,18 +52,30 @@ from workflow.tasks.simulated_rig import converter_steps
 from workflow.text.formats import bound, si, unit
 from workflow.text.templates import rows_of, said
 
-CONFIDENCE = "confidence"  # a setting beside those of the specification: level of the ellipses
+# A setting beside those of the specification: level of the ellipses.
+CONFIDENCE = "confidence"
+# Names of directories that a user may save into.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}")
-_GAINS = np.geomspace(0.25, 4.0, 33)  # of the last controller, tried for settings that have no design yet
-_SAMPLES = 15  # posterior samples whose steps are shown
-_STEP_SAMPLES = 200, 1 << 14  # of two steps: a run's, as far as an answer comes soon
-_SHOWN = 1e-4  # share of the Nyquist frequency where pictures over frequency begin, or lower
-_NEAR = 3.0  # distance from 0 up to which the Nyquist curve is shown
-_ELLIPSES, _CORNERS = 60, 24
+# Factors of the last controller's gain that are tried for settings that have no design yet: two octaves
+# either way, an eighth of an octave apart.
+_GAINS = np.geomspace(0.25, 4.0, 33)
+# Posterior samples whose steps are shown.
+_SAMPLES = 15
+# Fewest and most samples of a step and its disturbance: a run's, as far as an answer comes soon.
+_STEP_SAMPLES = 200, 1 << 14
+# Share of the Nyquist frequency where pictures over frequency begin, or lower.
+_SHOWN = 1e-4
+# Distance from 0 up to which the Nyquist curve is shown.
+_NEAR = 3.0
+# Ellipses that are drawn along it.
+_ELLIPSES = 60
+# Corners of each of them.
+_CORNERS = 24
 
 
-# Of a setting in the JSON schema of the specification: the page's control, and ends of its range.
+# The page's control of a setting, by the type in the JSON schema of the specification.
 _KINDS = {"boolean": "switch", "enum": "choice", "integer": "count", "number": "number"}
+# Ends of its range, by the names of the schema.
 _ENDS = {"minimum": "ge", "exclusiveMinimum": "gt", "maximum": "le", "exclusiveMaximum": "lt"}
 
 Handler = Callable[[Mapping[str, Any]], dict[str, Any]]
@@ -87,31 +99,37 @@ class TuningSession:
     """
 
     def __init__(self, paths: Sequence[Path], file: DesignFile, out: Path, seed: int) -> None:
-        self.paths, self.out, self.seed = tuple(paths), out, seed
+        self.paths = tuple(paths)
+        self.out = out
+        self.seed = seed
         sources, self.file, specification = load_asked(paths, file)
-        found = of_run(self.paths)
-        self.specification = at_one_bandwidth(specification, found)
-        self._plants, self._units = [source.plant for source in sources], sources[0].units
+        run = of_run(self.paths)
+        self.specification = at_one_bandwidth(specification, run)
+        self._plants = [source.plant for source in sources]
+        self._units = sources[0].units
         self.drawable = all(level_can_change(plant) for plant in self._plants)
-        self._last = None if found is None else found.design.controller
+        self._last = None if run is None else run.design.controller
         self._performance_unit = ""
         config = sources[0].config
-        if found is not None and isinstance(config, RunConfig) and config.performance_index is not None:
+        if run is not None and isinstance(config, RunConfig) and config.performance_index is not None:
             performance_output = config.channels[config.performance_index].output
-            self._performance_unit = found.records.unit(performance_output)
+            self._performance_unit = run.records.unit(performance_output)
         # Overshoot, settling time and command are those of the run's reference step, through its filter.
-        self.step_size, self.filter = 1.0, None
+        self.step_size = 1.0
+        self.filter = None
         self._friction: FrictionStep | None = None
-        if found is not None and found.run.stage_file("closed_loop") and found.closed_loop.check is not None:
-            self.step_size = found.closed_loop.check.reference_step
-            self.filter = found.reference_filter.filter
-            friction = found.identify.friction
+        if run is not None and run.run.stage_file("closed_loop") and run.closed_loop.check is not None:
+            self.step_size = run.closed_loop.check.reference_step
+            self.filter = run.reference_filter.filter
+            friction = run.identify.friction
             if friction is not None and isinstance(config, RunConfig):
                 steps = converter_steps(config.closed_loop)
                 self._friction = FrictionStep(friction, self.step_size, steps)
         self.output_unit = self._units[1]
         self.step_words = si(self.step_size, self.output_unit or "in the unit of the output", 4)
-        self._newest, self._designing = 0, threading.Lock()
+        # Number of the newest design that was asked for: an older one ends when it sees another.
+        self._newest = 0
+        self._designing = threading.Lock()
 
     # -- settings --------------------------------------------------------------------------------------------
 
@@ -120,20 +138,25 @@ class TuningSession:
         fields = {**Specification.model_json_schema()["properties"]}
         for limit in GIVES_WAY.values():
             del fields[limit]
-        found = [_control(name, field, getattr(self.specification, name)) for name, field in fields.items()]
-        for one in found:
-            if one is not None and one["name"] in _SET_BY_STRUCTURE:
-                one["set_by_structure"] = {
-                    structure: _words_of_structure(self.specification, structure, one["name"])
+        settings = []
+        for name, field in fields.items():
+            setting = _control(name, field, getattr(self.specification, name))
+            if setting is None:
+                continue
+            if name in _SET_BY_STRUCTURE:
+                setting["set_by_structure"] = {
+                    structure: _words_of_structure(self.specification, structure, name)
                     for structure in _STRUCTURES
                 }
+            settings.append(setting)
         if self.drawable:
             words = "confidence of each ellipse: share of the probability inside"
             about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
-            found.append(about | {"ge": 0.5, "lt": 0.9999})
-        return [one | {"unit": unit_of(one["name"], *self._units)} for one in found if one is not None]
+            settings.append(about | {"ge": 0.5, "lt": 0.9999})
+        return [setting | {"unit": unit_of(setting["name"], *self._units)} for setting in settings]
 
     def _read(self, values: Mapping[str, Any]) -> tuple[Specification, list[UncertainPlant], float | None]:
+        """Specification, plants and level of the ellipses of these settings. Raises InputError."""
         stated = dict(values)
         level = stated.pop(CONFIDENCE, None) if self.drawable else None
         if level is not None:
@@ -162,22 +185,35 @@ class TuningSession:
     def scaled(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """The last controller, times the gain that suits these settings best; nothing is certified."""
         specification, plants, _ = self._read(values)
-        if (last := self._last) is None:
+        last = self._last
+        if last is None:
             raise InputError("no design yet: wait for the first")
-        data = [PlantData.build(p, specification, _grid(p, last, 120, 20)) for p in plants]
-        k = [last.response(one.ellipses.omega_rad_s, with_delay=False) for one in data]
+
+        # Worst case of every gain, on a grid that is coarse enough to answer while a slider moves.
+        plant_data = [PlantData.build(plant, specification, _grid(plant, last, 120, 20)) for plant in plants]
+        responses = [last.response(data.ellipses.omega_rad_s, with_delay=False) for data in plant_data]
         ranked = []
         for gain in _GAINS.tolist():
-            worst = [
-                WorstCase(d.ellipses.omega_rad_s, d.ellipses, gain * v * d.delay, d.weighted(gain * v))
-                for d, v in zip(data, k, strict=True)
+            worst_cases = [
+                WorstCase(
+                    data.ellipses.omega_rad_s,
+                    data.ellipses,
+                    gain * response * data.delay,
+                    data.weighted(gain * response),
+                )
+                for data, response in zip(plant_data, responses, strict=True)
             ]
-            gamma = max(float(np.max(worst_of(one.values))) for one in worst)
-            ranked.append((gamma, abs(math.log(gain)), gain, worst))
-        for gamma, _, gain, worst in sorted(ranked, key=itemgetter(0, 1)):
+            gamma = max(float(np.max(worst_of(worst_case.values))) for worst_case in worst_cases)
+            ranked.append((gamma, abs(math.log(gain)), gain, worst_cases))
+
+        # The best one whose loop is stable; of two equal ones the one that changes less.
+        for gamma, _, gain, worst_cases in sorted(ranked, key=itemgetter(0, 1)):
             law = replace(last, C=gain * last.C, D=gain * last.D, anti_windup_gain=None)
             if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
-                margins = [loop_margins(law, p, one)[1:3] for p, one in zip(plants, worst, strict=True)]
+                margins = [
+                    loop_margins(law, plant, worst_case)[1:3]
+                    for plant, worst_case in zip(plants, worst_cases, strict=True)
+                ]
                 numbers = {"gain": gain, "gamma": gamma, "certified": None}
                 at_limits = said("limits_not_looked_at")
                 seen = self._seen(law, plants, specification, gamma, margins, at_limits, settles=False)
@@ -185,16 +221,36 @@ class TuningSession:
         raise InputError("no gain keeps the last controller stable with these settings")
 
     def near(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """As `design`, from the last controller alone: soon, and seldom worse. Empty where that leads
-        nowhere."""
+        """A design that is sought from the last controller alone, with its certificate.
+
+        It comes sooner than `design`, and is seldom worse. Empty where that leads nowhere.
+        """
         if self._last is None or self.file.certificate.calibrate:
             return {}
-        found = self.design(values, self._last)
-        return found if found["plants"] else {}
+        design = self.design(values, self._last)
+        return design if design["plants"] else {}
 
     def design(self, values: Mapping[str, Any], like: Controller | None = None) -> dict[str, Any]:
-        """A new design with its certificate, `like` a controller or whole. Raises SupersededError where a
-        newer one is asked for."""
+        """A new design with its certificate.
+
+        Parameters
+        ----------
+        values : mapping of str to value
+            Settings of the page.
+        like : Controller, optional
+            The search begins there and nowhere else; None: the whole search of `flexlink design`.
+
+        Returns
+        -------
+        dict
+            Numbers, curves of each plant, and in one line how it stands; without plants where there is no
+            controller.
+
+        Raises
+        ------
+        SupersededError
+            A newer design is asked for meanwhile.
+        """
         asked = self.completed(values)
         specification, plants, _ = self._read(values)
         self._newest += 1
@@ -206,9 +262,10 @@ class TuningSession:
 
         with self._designing:
             still()
-            options, rng = asked.synthesis, stage_rng(self.seed, "design")
+            options = asked.synthesis
+            rng = stage_rng(self.seed, "design")
             if like is None:
-                found = find_design(
+                design = find_design(
                     plants, specification, options, asked.certificate, rng, still, advise=False
                 )
             else:
@@ -216,14 +273,17 @@ class TuningSession:
                     near = synthesise_near(like, plants, specification, options, rng=rng, progress=still)
                 except SpecificationError as impossible:
                     return {"certified": False, "gamma": None, "reason": str(impossible), "plants": []}
-                found = DesignResult(near, near.gamma <= 1.0, "")
+                design = DesignResult(near, near.gamma <= 1.0, "")
             still()
-            law, used = found.controller, found.specification or specification
-            numbers: dict[str, Any] = {"certified": False, "gamma": None, "reason": found.reason}
-            if found.synthesis is not None:
-                active = next(iter(found.synthesis.blocking), None)
-                words = active and f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
-                numbers |= {"gamma": found.synthesis.gamma, "active": words or ""}
+            law = design.controller
+            used = design.specification or specification
+            numbers: dict[str, Any] = {"certified": False, "gamma": None, "reason": design.reason}
+            if design.synthesis is not None:
+                active = next(iter(design.synthesis.blocking), None)
+                words = ""
+                if active is not None:
+                    words = f"{active.weight} of {active.plant} at {active.omega_rad_s:.4g} rad/s"
+                numbers |= {"gamma": design.synthesis.gamma, "active": words}
             if law is None:
                 return {**_finite(numbers), "plants": []}
             certificate = certify(law, plants, used, between_own_points=asked.plant.between_points)
@@ -247,8 +307,9 @@ class TuningSession:
     def bound(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """What a controller of any order could reach with these settings."""
         specification, plants, _ = self._read(values)
-        found = bracket_numbers(find_bracket(plants, specification, self.file.achievable_performance), None)
-        return _finite({name: found[name] for name in ("reached", "floor", "reason")})
+        bracket = find_bracket(plants, specification, self.file.achievable_performance)
+        numbers = bracket_numbers(bracket, None)
+        return _finite({name: numbers[name] for name in ("reached", "floor", "reason")})
 
     def save(self, values: Mapping[str, Any], name: str) -> dict[str, Any]:
         """Design file and controller files into `out`/name, the latter by `flexlink design`.
@@ -286,13 +347,16 @@ class TuningSession:
         *,
         settles: bool = True,
     ) -> dict[str, Any]:
-        """Numbers (words, value) and curves of a loop. margins: over the ellipses of each plant, with its
-        bandwidth [rad/s]. at_limits: what is said of the loop at the controller's limits. settles: settling
-        times with friction are wanted, too, which take a dozen simulations."""
+        """Numbers (words, value) and curves of a loop.
+
+        margins: over the ellipses of each plant, with its bandwidth [rad/s]. at_limits: what is said of the
+        loop at the controller's limits. settles: settling times with friction are wanted, too, which take a
+        dozen simulations.
+        """
         runs = [self._steps(law, plant) for plant in plants]
         friction = ""
         if self._friction is not None and settles:
-            friction = self._friction.settling(law, self._given(law, plants[0]))
+            friction = self._friction.settling(law, self._reference_step(law, plants[0]))
         numbers = engineers_numbers(law)
         if numbers is not None:
             numbers = replace(numbers, gain_unit=gain_unit_of(*self._units))
@@ -313,7 +377,13 @@ class TuningSession:
             y = nominal.measured
             # The step until it hardly moves: beyond its settling to 2 %.
             away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self.step_size)
-            shown = min(y.size, max(40, int(1.5 * (away[-1] + 1)) if away.size else 40))
+            shown = 40
+            if away.size:
+                shown = max(shown, int(1.5 * (away[-1] + 1)))
+            shown = min(y.size, shown)
+            friction_curves = []
+            if self._friction is not None:
+                friction_curves = self._friction.curves(law, shown, self._reference_step(law, plant))
             curves.append(
                 {
                     "name": plant.name,
@@ -325,30 +395,30 @@ class TuningSession:
                         "end": float(nominal.time_s[shown - 1]),
                         "nominal": line(nominal, shown),
                         "samples": [line(run, shown) for run in drawn],
-                        "friction": []
-                        if self._friction is None
-                        else self._friction.curves(law, shown, self._given(law, plant)),
+                        "friction": friction_curves,
                     },
                 }
             )
         return {"numbers": table[0].rows, "plants": curves}
 
-    def _given(self, law: Controller, plant: UncertainPlant) -> Real:
-        """The reference step (T,) as long as the loop on the nominal model needs, through the run's filter if
-        it has one."""
+    def _reference_step(self, law: Controller, plant: UncertainPlant) -> Real:
+        """The reference step (T,) as the loop gets it: through the run's filter, where there is one.
+
+        It lasts as long as the loop on the nominal model needs.
+        """
         radius = float(np.max(np.abs(closed_loop_poles(law, plant)), initial=0.0))
         step = np.full(settling_samples(radius, *_STEP_SAMPLES) // 2, self.step_size)
         return step if self.filter is None else self.filter.filtered(step)
 
     def _steps(self, law: Controller, plant: UncertainPlant) -> list[ClosedLoopTrajectory]:
-        """The reference step on the nominal model, and on models drawn from the posterior where there is one;
-        as a run predicts it (`workflow.tasks.closed_loop`)."""
-        given = self._given(law, plant)
-        step = np.full(given.size, self.step_size)
+        """The reference step on the nominal model, or, where there is a posterior, on its mean and on models
+        drawn from it; as a run predicts it (`workflow.tasks.closed_loop`)."""
+        reference = self._reference_step(law, plant)
+        step = np.full(reference.size, self.step_size)
         models = [plant.nominal]
         if isinstance(plant.uncertainty, ResponsePosterior):
             models = _models(plant.uncertainty, self.seed)
-        runs = [simulate_plant(law, model, given, clip=FINITE) for model in models]
+        runs = [simulate_plant(law, model, reference, clip=FINITE) for model in models]
         return [replace(run, reference=step) for run in runs]
 
 
@@ -356,7 +426,7 @@ class TuningSession:
 def _models(posterior: ResponsePosterior, seed: int) -> list[control.StateSpace]:
     """The mean, and models drawn from the posterior, the same at every call."""
     drawn = posterior.sample(stage_rng(seed, "tune"), _SAMPLES)
-    return [realise(posterior, one) for one in (posterior.mean, *drawn)]
+    return [realise(posterior, coefficients) for coefficients in (posterior.mean, *drawn)]
 
 
 def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> Real:
@@ -364,8 +434,12 @@ def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> 
     if plant.own_grid is not None:
         return plant.own_grid[plant.own_grid > 0]
     modes = (*plant.modes, *modes_of(closed_loop_poles(law, plant), plant.dt_s))
-    light = [Mode(m.omega_rad_s, max(abs(m.zeta), 1e-3)) for m in modes if m.zeta < 0.3]
-    return checked_grid(plant, [m for m in light if m.omega_rad_s < plant.nyquist_rad_s], n_log, per_mode)
+    light = [
+        Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-3))
+        for mode in modes
+        if mode.zeta < 0.3 and mode.omega_rad_s < plant.nyquist_rad_s
+    ]
+    return checked_grid(plant, light, n_log, per_mode)
 
 
 def _shown_grid(law: Controller, plant: UncertainPlant, specification: Specification) -> Real:
@@ -400,15 +474,15 @@ def _gains(
     )
     return [
         {
-            "symbol": one.symbol,
-            "meaning": one.meaning,
-            "unit": one.unit,
-            "x": short(one.omega_rad_s),
-            "nominal": short(one.nominal),
-            "worst": short(np.where(one.worst < 1e200, one.worst, np.nan)),
-            "limit": short(one.limit),
+            "symbol": curve.symbol,
+            "meaning": curve.meaning,
+            "unit": curve.unit,
+            "x": short(curve.omega_rad_s),
+            "nominal": short(curve.nominal),
+            "worst": short(np.where(curve.worst < 1e200, curve.worst, np.nan)),
+            "limit": short(curve.limit),
         }
-        for one in curves
+        for curve in curves
     ]
 
 
@@ -424,13 +498,14 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
     at = near[np.unique(np.linspace(0, near.size - 1, _ELLIPSES).astype(int))] if near.size else near
     turn = np.exp(2j * np.pi * np.arange(_CORNERS) / _CORNERS)
     part = ellipses.subset(at)
-    major, minor = part.semi_major[:, None] * turn.real, part.semi_minor[:, None] * turn.imag
+    major = part.semi_major[:, None] * turn.real
+    minor = part.semi_minor[:, None] * turn.imag
     outline = k[at, None] * (part.centre[:, None] + part.direction[:, None] * (major + 1j * minor))
     line = np.where(np.abs(loop) < 2 * _NEAR, loop, np.nan)
     return {
         "re": short(line.real),
         "im": short(line.imag),
-        "ellipses": [[short(one.real), short(one.imag)] for one in outline],
+        "ellipses": [[short(ellipse.real), short(ellipse.imag)] for ellipse in outline],
     }
 
 
@@ -446,20 +521,20 @@ def _words_of_structure(specification: Specification, structure: _Structure, key
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:
     """The page's control of a field by its JSON schema; None for a pair or a weight, which stays as it is."""
     parts = schema.get("anyOf", [schema])
-    found: dict[str, Any] = {"name": name, "words": schema["description"], "value": value}
-    found["optional"] = {"type": "null"} in parts
+    setting: dict[str, Any] = {"name": name, "words": schema["description"], "value": value}
+    setting["optional"] = {"type": "null"} in parts
     if "const" in parts[-1]:
-        found |= {"optional": True, "unasked": parts[-1]["const"]}
+        setting |= {"optional": True, "unasked": parts[-1]["const"]}
     kind = _KINDS.get("enum" if "enum" in parts[0] else parts[0].get("type", ""))
     if kind is None:
         return None
     if kind == "choice":
-        found["choices"] = parts[0]["enum"]
-    return {
-        **found,
-        "kind": kind,
-        **{short: parts[0][long] for long, short in _ENDS.items() if long in parts[0]},
-    }
+        setting["choices"] = parts[0]["enum"]
+    setting["kind"] = kind
+    for schema_name, page_name in _ENDS.items():
+        if schema_name in parts[0]:
+            setting[page_name] = parts[0][schema_name]
+    return setting
 
 
 def toml_of(file: DesignFile) -> str:

@@ -78,19 +78,19 @@ def roots(law: Controller, plant: UncertainPlant) -> dict[str, list[list[float |
     """Poles of the nominal loop, poles and zeros of controller and nominal plant, in z: [real parts,
     imaginary parts] each, those of a modulus below `_LARGEST_ROOT`."""
     without_delay = law.to_control()
-    of = {
+    roots_by_name = {
         "loop poles": closed_loop_poles(law, plant),
         "controller poles": law.poles,
         "controller zeros": without_delay.zeros(),
         "plant poles": plant.poles,
         "plant zeros": plant.zeros,
     }
-    found = {}
-    for name, values in of.items():
+    drawn = {}
+    for name, values in roots_by_name.items():
         z: Complex = np.asarray(values, dtype=np.complex128)
         near = z[np.abs(z) < _LARGEST_ROOT]
-        found[name] = [short(near.real), short(near.imag)]
-    return found
+        drawn[name] = [short(near.real), short(near.imag)]
+    return drawn
 
 
 @dataclass(frozen=True)
@@ -119,15 +119,15 @@ class FrictionStep:
         """
         friction = resampled_friction(self.friction, law.dt_s)
         reference = np.pad(given, (0, max(samples - given.size, 0)), mode="edge")[:samples]
-        found = []
+        curves = []
         for words, feedforward in (
             ("with friction", None),
             ("with friction and its feed-forward", friction_feedforward(law, friction)),
         ):
             loop = FrictionLoop.of(replace(law, feedforward=feedforward), friction, **self.steps)
             run = loop.run(reference)
-            found.append({"words": words, **line(run, samples)})
-        return found
+            curves.append({"words": words, **line(run, samples)})
+        return curves
 
     def settling(self, law: Controller, given: Real) -> str:
         """Settling times of steps of half to twice the size, in words: with friction one size says little.
