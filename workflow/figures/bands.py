@@ -51,7 +51,9 @@ def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
     keep = uncertainty.omega_rad_s > 0
     ellipse = uncertainty.ellipse()
     centre = uncertainty.centre[keep]
-    s1, s2, u1 = ellipse.semi_major[keep], ellipse.semi_minor[keep], ellipse.direction[keep]
+    s1 = ellipse.semi_major[keep]
+    s2 = ellipse.semi_minor[keep]
+    u1 = ellipse.direction[keep]
     origin = -centre * np.conj(u1)
     low = nearest_distance(origin, s1, s2)
     phase = unwrapped_degrees(centre)
@@ -126,8 +128,9 @@ def outline(time_s: Real, signal: Real, columns: int = _COLUMNS, *, hold: bool =
         parts = np.pad(signal, (0, first.size * length - signal.size), mode="edge").reshape(-1, length)
         extremes = [first + parts.argmin(axis=1), first + parts.argmax(axis=1)]
         index = np.unique(np.minimum(np.concatenate([first, last, *extremes]), signal.size - 1))
-    kept = (_held if hold else _straight)(time_s[index], signal[index], _STRAIGHT * float(np.ptp(signal)))
-    return time_s[index[kept]], signal[index[kept]]
+    joined = _held if hold else _straight
+    places = joined(time_s[index], signal[index], _STRAIGHT * float(np.ptp(signal)))
+    return time_s[index[places]], signal[index[places]]
 
 
 def extremes(x: Real, y: Real, edges: Real) -> npt.NDArray[np.int64]:
@@ -143,14 +146,14 @@ def extremes(x: Real, y: Real, edges: Real) -> npt.NDArray[np.int64]:
 def _straight(x: Real, y: Real, tolerance: float) -> list[int]:
     """Places of points (N,) whose joining lines pass all points within a vertical tolerance, in one walk: a
     line from the last kept point goes on as long as its slope suits all points it passes."""
-    kept = [0]
+    places = [0]
     steepest = np.inf
     flattest = -np.inf
     for place in range(1, x.size):
-        run = x[place] - x[kept[-1]]
-        rise = y[place] - y[kept[-1]]
+        run = x[place] - x[places[-1]]
+        rise = y[place] - y[places[-1]]
         if not flattest <= rise / run <= steepest:
-            kept.append(place - 1)
+            places.append(place - 1)
             run = x[place] - x[place - 1]
             rise = y[place] - y[place - 1]
             steepest = np.inf
@@ -158,19 +161,19 @@ def _straight(x: Real, y: Real, tolerance: float) -> list[int]:
         steepest = min(steepest, (rise + tolerance) / run)
         flattest = max(flattest, (rise - tolerance) / run)
     if x.size > 1:
-        kept.append(x.size - 1)
-    return kept
+        places.append(x.size - 1)
+    return places
 
 
 def _held(x: Real, y: Real, tolerance: float) -> list[int]:
     """Places of points (N,) whose held values differ from all values by no more than a tolerance."""
-    kept = [0]
+    places = [0]
     for place in range(1, x.size):
-        if abs(y[place] - y[kept[-1]]) > tolerance:
-            kept.append(place)
-    if kept[-1] < x.size - 1:
-        kept.append(x.size - 1)
-    return kept
+        if abs(y[place] - y[places[-1]]) > tolerance:
+            places.append(place)
+    if places[-1] < x.size - 1:
+        places.append(x.size - 1)
+    return places
 
 
 def smooth_grid(omega_rad_s: Real, locus: Callable[[Real], Complex]) -> Real:

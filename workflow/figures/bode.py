@@ -46,7 +46,8 @@ def draw_channel(channel: ChannelView, name: str, part: UncertainMember | None =
 
     part: the further part of its set that is shown.
     """
-    found, spread = channel.found, channel.spread
+    found = channel.found
+    spread = channel.spread
     if part is not None:
         frequency = part.posterior.at(spread.frequency.omega_rad_s, spread.level)
         spread = replace(spread, nominal=part.nominal, frequency=frequency)
@@ -66,7 +67,8 @@ def draw_response(channel: ChannelView) -> Picture:
 
     The bands are drawn enlarged where that of the gain is too narrow to be seen.
     """
-    found, spread = channel.found, channel.spread
+    found = channel.found
+    spread = channel.spread
     picture, (gain, phase) = new_picture(4.4, 1, 2, width_in=12.0)
     for panel, quantity in ((gain, "gain{}"), (phase, "phase{}_deg")):
         band = draw_enlarged(panel, spread.frequency, quantity)
@@ -139,12 +141,14 @@ def draw_bode(
         phase.plot(x(omega), degrees_near(response, band.phase_deg), **_NOMINAL)
     _frame(gain, phase, style.plain(unit, 24), band, measured=measured, dB=dB, Hz=Hz)
     gain.set_title(title)
-    relative = 100 * uncertainty.ellipse().semi_major[uncertainty.omega_rad_s > 0] / band.gain
+    above_zero = uncertainty.omega_rad_s > 0
+    relative = 100 * uncertainty.ellipse().semi_major[above_zero] / band.gain
     size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
     size.plot(x(omega), relative, color=style.UNCERTAIN, lw=1.3)
     size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
     size.set(yscale="log")
-    finite = relative[np.isfinite(relative) & (relative > 0)]
+    can_be_drawn = np.isfinite(relative) & (relative > 0)
+    finite = relative[can_be_drawn]
     if finite.size:
         size.set(ylim=(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max()))))
     size.set(xlabel=phase.labels[X], ylabel="ellipse / gain [%]")
@@ -167,7 +171,8 @@ def draw_comparison(
     lines = ("-", (0, (5, 2)), (0, (1, 1.5)))
     bands = []
     for k, (name, response) in enumerate(responses.items()):
-        colour, dashes = colours[k % len(colours)], lines[k // len(colours) % len(lines)]
+        colour = colours[k % len(colours)]
+        dashes = lines[k // len(colours) % len(lines)]
         drawn: dict[str, Any] = {"color": colour, "lw": 1.4, "ls": dashes, "label": style.plain(name, 40)}
         filled: dict[str, Any] = {"color": colour, "alpha": 0.25, "lw": 0}
         bands.append(_draw(gain, phase, response, drawn, filled, dB=dB, Hz=Hz))
@@ -202,8 +207,8 @@ def draw_loop(run: RunView) -> Picture:
 
 def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
     """Crossovers of a nominal loop, with its gain and phase margin as python-control finds them."""
-    found = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
-    factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in found)
+    margins = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
+    factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in margins)
     limits: dict[str, Any] = {"color": style.MEASURED, "lw": 0.8, "ls": ":"}
     gain.axhline(1, **limits)
     look: dict[str, Any] = {"lw": 1.6, "marker": "o", "ms": 4}
@@ -236,7 +241,8 @@ def _draw(
     Hz: bool = False,
 ) -> ResponseBand:
     """Line and, of an uncertain response, band of gain and phase. measured: gains that are in view too."""
-    band, (x, y) = response_band(response), _units(dB, Hz)
+    band = response_band(response)
+    x, y = _units(dB, Hz)
     at = x(band.omega_rad_s)
     floor = _gain_floor(band.gain, measured)
     if np.any(response.covariance):
@@ -266,7 +272,13 @@ def _frame(
         panel.set(xlim=(min(ends), max(ends)))
     gain.set(ylim=(float(y(min(_gain_floor(band.gain, measured) for band in bands))), None))
     span = np.ptp(every)
-    phase.y.every = 90.0 if span < 400 else 180.0 if span < 1000 else 360.0
+    # A number of the phase axis every quarter, half or whole turn, as many as fit.
+    if span < 400:
+        phase.y.every = 90.0
+    elif span < 1000:
+        phase.y.every = 180.0
+    else:
+        phase.y.every = 360.0
     phase.set(ylim=pad_limits(float(every.min()), float(every.max()), 0.15))
     if not Hz:
         gain.hertz = True
@@ -277,8 +289,14 @@ def _frame(
 def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
     """Bottom of the gain axis: below the response, above the noise of an empirical response at a notch."""
     smallest = float(np.min(gain, where=gain > 0, initial=gain.max() or 1.0))
-    positive = gain if empirical is None else empirical[empirical > 0]
-    return min(smallest, float(np.percentile(positive, 2)) if positive.size else smallest) / 3
+    floor = smallest
+    positive = gain
+    if empirical is not None:
+        is_positive = empirical > 0
+        positive = empirical[is_positive]
+    if positive.size:
+        floor = min(smallest, float(np.percentile(positive, 2)))
+    return floor / 3
 
 
 @style.drawing("distortion")

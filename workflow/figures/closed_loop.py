@@ -22,7 +22,9 @@ _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
 @style.drawing("closed-loop")
 def draw_run(run: RunView) -> Picture:
     """The reference step and the disturbance of a run, predicted and on its machine."""
-    loop, channel, performance = run.results.closed_loop.check, run.config.control_channel, run.performance
+    loop = run.results.closed_loop.check
+    channel = run.config.control_channel
+    performance = run.performance
     assert loop is not None
     labels = {"output": (channel.output, run.output_unit)}
     if performance is not None:
@@ -68,10 +70,10 @@ def draw_closed_loop(
     between their extremes. onto: a picture and the panel of it to draw on, in
     place of a new picture; of one row and column.
     """
-    both = (predicted,) if others is None else (predicted, others)
+    all_runs = (predicted,) if others is None else (predicted, others)
     dt_s = float(time_s[1] - time_s[0])
     friction_s = float(time_s[0]) + dt_s * (max((line.size for line in with_friction), default=1) - 1)
-    onset, windows = _windows(time_s, reference, disturbance, labels, both, settled_s, friction_s)
+    onset, windows = _windows(time_s, reference, disturbance, labels, all_runs, settled_s, friction_s)
     grid: Any
     if onto is not None:
         picture = onto[0]
@@ -109,7 +111,8 @@ def draw_closed_loop(
         limits = () if kind != "command" or command_limit is None else (-command_limit, command_limit)
         for limit in limits:
             if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):  # near enough to matter
-                low, high = min(low, limit), max(high, limit)
+                low = min(low, limit)
+                high = max(high, limit)
                 for panel in row:
                     panel.axhline(limit, **style.LIMIT_LINE, label="saturation")
         row[0].set(ylim=pad_limits(low, high, 0.08))
@@ -150,7 +153,10 @@ def _samples(time_s: Real, window: _Window) -> slice:
     """Samples of the runs that a window shows."""
     stop = min(window.stop, window.runs_until)
     first, last = np.searchsorted(time_s, [window.start, stop])
-    return slice(int(first), int(last) + int(stop == time_s[-1]))
+    # The last sample of all belongs to the window that ends with it.
+    if stop == time_s[-1]:
+        last += 1
+    return slice(int(first), int(last))
 
 
 def _windows(
@@ -212,7 +218,8 @@ def _quiet_from(time_s: Real, runs: Real, tolerance: float) -> float:
 def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float]:
     """Range of a row: all runs, but a run that leaves the scene by more than `most` times the range asked for
     does not flatten the others."""
-    low, high = float(asked.min()), float(asked.max())
+    low = float(asked.min())
+    high = float(asked.max())
     span = high - low if high > low else max(abs(high), 1e-12)
     every = np.nan_to_num(np.concatenate([asked, *(np.ravel(run) for run in runs)]), nan=low)
     shown = np.clip(every, low - most * span, high + most * span)
@@ -235,7 +242,8 @@ def draw_measured_sensitivity(run: RunView) -> Picture | None:
         return None
     low, high = loop.sensitivity.band_rad_s
     high = min(1.1 * high, run.plant.nyquist_rad_s)
-    fine = run.loop_grid[(run.loop_grid > 0.9 * low) & (run.loop_grid < high)]
+    is_near = (run.loop_grid > 0.9 * low) & (run.loop_grid < high)
+    fine = run.loop_grid[is_near]
     curve = curves_of(run, np.union1d(np.geomspace(0.9 * low, high, 900), fine))[0]
     picture, panel = new_picture(4.4)
     draw_curve(panel, curve, run.level)
@@ -255,18 +263,19 @@ def draw_conditions(run: RunView) -> Picture | None:
 
     Nothing where none was tried.
     """
-    loop, columns = run.results.closed_loop.check, 3
+    loop = run.results.closed_loop.check
+    columns = 3
     if loop is None or not loop.conditions:
         return None
     time_s = loop.time_s[: loop.conditions[0].reference.size]
     picture, panels = small_multiples(len(loop.conditions), columns, 1.95, 0.8, sharex=True)
-    for panel, found in zip(panels, loop.conditions, strict=True):
-        achieved = outline(time_s, found.achieved)
+    for panel, condition in zip(panels, loop.conditions, strict=True):
+        achieved = outline(time_s, condition.achieved)
         panel.plot(*achieved, **style.ACHIEVED_LINE, label=MACHINE[loop.machine])
-        panel.plot(*outline(time_s, found.predicted), **_PREDICTED)
-        panel.plot(*outline(time_s, found.reference, hold=True), **_REFERENCE)
-        panel.set_title(found.name)
-        low, high = height(np.append(found.reference, found.predicted), [found.achieved], 1.0)
+        panel.plot(*outline(time_s, condition.predicted), **_PREDICTED)
+        panel.plot(*outline(time_s, condition.reference, hold=True), **_REFERENCE)
+        panel.set_title(condition.name)
+        low, high = height(np.append(condition.reference, condition.predicted), [condition.achieved], 1.0)
         panel.set(ylim=pad_limits(low, high, 0.08))
         panel.set(xlim=(float(time_s[0]), float(time_s[-1])))
     for panel in panels[::columns]:
@@ -282,19 +291,26 @@ def draw_friction(run: RunView) -> Picture | None:
     error on the sine. Nothing where friction was not identified."""
     if run.results.closed_loop.check is None or run.results.closed_loop.check.friction is None:
         return None
-    loop, found, unit = run.results.closed_loop.check, run.results.closed_loop.check.friction, run.output_unit
-    name, sine = run.config.control_channel.output, found.tracking
+    loop = run.results.closed_loop.check
+    friction = run.results.closed_loop.check.friction
+    unit = run.output_unit
+    name = run.config.control_channel.output
+    sine = friction.tracking
     picture, (peaks, errors) = new_picture(3.9, 1, 2)
     bars = {"color": style.UNCERTAIN, "lw": 5.0, "alpha": 0.7, "solid_capstyle": "butt"}
-    peaks.uprights(found.sizes, found.low, found.high, **bars, label="identified arm with friction, 95 %")
-    if found.measured is not None:
+    peaks.uprights(
+        friction.sizes, friction.low, friction.high, **bars, label="identified arm with friction, 95 %"
+    )
+    if friction.measured is not None:
         looks = {"color": style.ACHIEVED, "marker": "o", "ms": 4.0, "ls": "none"}
-        peaks.plot(found.sizes, found.measured, **looks, label=f"measured, {MACHINE[loop.machine]}")
-    peaks.axhline(found.nominal_peak, **style.PREDICTED_LINE, label="linear prediction")
-    if np.isfinite(found.certified_peak):
-        peaks.axhline(found.certified_peak, **style.LIMIT_LINE, label="certified")
-    if found.sticking_step > 0:
-        peaks.axvline(found.sticking_step, **style.REFERENCE_LINE, label="smaller steps do not move the arm")
+        peaks.plot(friction.sizes, friction.measured, **looks, label=f"measured, {MACHINE[loop.machine]}")
+    peaks.axhline(friction.nominal_peak, **style.PREDICTED_LINE, label="linear prediction")
+    if np.isfinite(friction.certified_peak):
+        peaks.axhline(friction.certified_peak, **style.LIMIT_LINE, label="certified")
+    if friction.sticking_step > 0:
+        peaks.axvline(
+            friction.sticking_step, **style.REFERENCE_LINE, label="smaller steps do not move the arm"
+        )
     peaks.set(xscale="log", title="Peak of |S| by size of the reference", ylabel="|S| [1]")
     peaks.set(xlabel=f"rms of the reference [{style.plain(unit, 12)}]")
     time_s = np.asarray(np.arange(sine.without.size) * run.plant.dt_s, dtype=np.float64)
@@ -303,9 +319,9 @@ def draw_friction(run: RunView) -> Picture | None:
         (sine.given, style.MODEL_LINE, "with friction feed-forward"),
     ):
         errors.plot(*outline(time_s, error), **look, label=words)
-    for sign in (-1, 1) if found.error_at_rest > 0 else ():
+    for sign in (-1, 1) if friction.error_at_rest > 0 else ():
         errors.axhline(
-            sign * found.error_at_rest, **style.LIMIT_LINE, label="largest error at rest (friction)"
+            sign * friction.error_at_rest, **style.LIMIT_LINE, label="largest error at rest (friction)"
         )
     errors.set(xlabel="time [s]", title="Error on a sine")
     errors.set(xlim=(0.0, float(time_s[-1])))

@@ -154,7 +154,8 @@ class Axis:
         values = np.concatenate([panel.data(self.which) for panel in self.panels] or [np.zeros(0)])
         values = values[np.isfinite(values)]
         if self.kind == "log":
-            values = values[values > 0]
+            is_positive = values > 0
+            values = values[is_positive]
             if not values.size:
                 ends = _EMPTY_LOG
             else:
@@ -170,20 +171,23 @@ class Axis:
 
     def even(self, values: Any) -> Real:
         """Values as lengths in which the axis is even; on a log axis what is not positive lies far below."""
-        found: Real = np.asarray(values, dtype=np.float64)
+        numbers: Real = np.asarray(values, dtype=np.float64)
         if self.kind == "lin":
-            return found
+            return numbers
         if self.kind == "log":
-            return np.asarray(np.log10(np.maximum(found, 1e-300)))
-        size = np.abs(found)
+            return np.asarray(np.log10(np.maximum(numbers, 1e-300)))
+        size = np.abs(numbers)
         # The linear part is as long as 10/9 of a decade, so that the slope has no jump where it ends.
-        beyond = 10 / 9 + np.log10(np.maximum(size, self.kind) / self.kind)
-        return np.asarray(np.where(size <= self.kind, found / self.kind * 10 / 9, np.sign(found) * beyond))
+        logarithmic = 10 / 9 + np.log10(np.maximum(size, self.kind) / self.kind)
+        linear = numbers / self.kind * 10 / 9
+        return np.asarray(np.where(size <= self.kind, linear, np.sign(numbers) * logarithmic))
 
     def shares(self, values: Any) -> Real:
         """How far along the axis values lie: 0 at its beginning, 1 at its end."""
         begin, end = (float(value) for value in self.even(self.limits()))
-        return np.asarray((self.even(values) - begin) / ((end - begin) or 1.0))
+        # An axis of no length has all values at its beginning.
+        length = (end - begin) or 1.0
+        return np.asarray((self.even(values) - begin) / length)
 
 
 class Panel:
@@ -228,9 +232,10 @@ class Panel:
         outlines = []
         for first, last in edges.reshape(-1, 2):
             part = slice(first, last)
-            there = np.column_stack([at[part], lower[part]])
-            back = np.column_stack([at[part], upper[part]])[::-1]
-            outlines.append(np.concatenate([there, back]))
+            # Along the lower edge and back along the upper one.
+            lower_edge = np.column_stack([at[part], lower[part]])
+            upper_edge = np.column_stack([at[part], upper[part]])[::-1]
+            outlines.append(np.concatenate([lower_edge, upper_edge]))
         self.fill(outlines, label=label, **look)
 
     def fill(
@@ -264,7 +269,8 @@ class Panel:
         **look: Any,
     ) -> None:
         """Bars at places (N,) along one axis, from `begins` to `ends` (N,) along the other."""
-        at, ends = np.atleast_1d(np.asarray(at, dtype=np.float64)), np.atleast_1d(ends)
+        at = np.atleast_1d(np.asarray(at, dtype=np.float64))
+        ends = np.atleast_1d(ends)
         corners = []
         for place, begin, end in zip(at, np.broadcast_to(begins, ends.shape), ends, strict=True):
             along = np.array([place - thick / 2, place + thick / 2, place + thick / 2, place - thick / 2])
@@ -339,18 +345,18 @@ class Panel:
 
     def data(self, which: int) -> Real:
         """All values (N,) along one axis that are drawn, by which it is scaled."""
-        found = [np.zeros(0)]
+        values = [np.zeros(0)]
         for mark in self.marks:
             if isinstance(mark, Curve):
                 if not (mark.across and which == Y):
-                    found.append(mark.y if which else mark.x)
+                    values.append(mark.y if which else mark.x)
             elif isinstance(mark, Area):
-                found += [outline[:, which] for outline in mark.outlines]
+                values += [outline[:, which] for outline in mark.outlines]
             elif isinstance(mark, Rule) and mark.axis == which:
-                found.append(np.array([mark.at]))
+                values.append(np.array([mark.at]))
             elif isinstance(mark, Span) and mark.axis == which:
-                found.append(np.array([mark.low, mark.high]))
-        return np.concatenate(found)
+                values.append(np.array([mark.low, mark.high]))
+        return np.concatenate(values)
 
     def layered(self) -> list[Mark]:
         """What is drawn, the lowest layer first."""

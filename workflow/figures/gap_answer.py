@@ -27,8 +27,9 @@ def draw_probabilities(found: Diagnosis) -> Picture:
     shown = [e for e in ranked if e.presence >= 0.005 and e.name not in ("none", "unknown")][:_MOST_BARS]
     names = [*(style.plain(in_words(e.name), 52) for e in shown), "something else is missing"]
     percent = [100 * p for p in (*(e.presence for e in shown), 1 - found.completeness.probability)]
-    own = gap_style.MODELS["repaired"]["color"]
-    colours = [own if e in found.present else gap_style.PALE for e in shown] + [gap_style.PALE]
+    present_colour = gap_style.MODELS["repaired"]["color"]
+    colours = [present_colour if effect in found.present else gap_style.PALE for effect in shown]
+    colours.append(gap_style.PALE)
     labels = ["under 0.1 %" if p < 0.1 else f"{p:.3g} %" for p in percent]
     return _bars(names, percent, labels, colours, "Is it present, given the records", "probability [%]")
 
@@ -39,18 +40,25 @@ def draw_waterfall(found: Diagnosis) -> Picture:
 
     Beside a model error: in per cent of the motion.
     """
-    gaps, floor = found.gaps, found.noise_floor
+    gaps = found.gaps
+    floor = found.noise_floor
     # Nothing beyond noise has no place on a logarithmic axis.
     rows = {
         name: {model: max(value, gap_style.LEAST * floor) for model, value in entry.items()}
         for name, entry in found.gap_by_experiment.items()
     }
     rough = found.case.model_error
-    words, line = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS, gap_style.floor_of(rough)
+    words = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS
+    line = gap_style.floor_of(rough)
     picture, (left, right) = new_picture(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
     for place, (model, value) in enumerate(gaps.items()):
         left.bars(place, value, 0.6, color=gap_style.MODELS[model]["color"])
-        digits = ".3g" if rough > 0 else ".3f" if value < 10 else ".1f"
+        if rough > 0:
+            digits = ".3g"
+        elif value < 10:
+            digits = ".3f"
+        else:
+            digits = ".1f"
         words_at = {"offset": (0.0, 3.0), "size": 9.5, "color": "#000", "horizontal": "center"}
         left.words(format(value, digits), place, value, **words_at)
     left.x.named = [(k, gap_style.WORDS[model].replace(" ", "\n")) for k, model in enumerate(gaps)]
@@ -77,7 +85,8 @@ def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Pict
     """Bars: share of the held-out gap that effects close by themselves."""
     names = [style.plain(listing([in_words(name) for name in effects]), 60) for effects, _ in partial]
     percent = [100 * share for _, share in partial]
-    labels, colours = [f"{p:.3g} %" for p in percent], [gap_style.PALE] * len(names)
+    labels = [f"{p:.3g} %" for p in percent]
+    colours = [gap_style.PALE] * len(names)
     what = "What effects close by themselves", "of the held-out gap closed [%]"
     return _bars(names, percent, labels, colours, *what)
 
@@ -107,7 +116,8 @@ def draw_case_gaps(cases: Sequence[Any]) -> Picture:
     """One line per case (`fleet.Machine`): RMS over noise with the nominal parameters, and with the effects
     added."""
     before, after = ([case.numbers[key] for case in cases] for key in ("gap_before", "gap_after"))
-    at, floor = np.arange(len(cases)), float(np.median([case.numbers["noise_floor"] for case in cases]))
+    at = np.arange(len(cases))
+    floor = float(np.median([case.numbers["noise_floor"] for case in cases]))
     picture, panel = new_picture(1.5 + 0.32 * len(cases))
     for place, ends in enumerate(zip(before, after, strict=True)):
         panel.plot(ends, [place, place], color="#999999", lw=1.0, zorder=1)
@@ -148,7 +158,7 @@ def draw_next_experiment(proposal: NextExperiment, difference: Real, names: Sequ
 def draw_controller_check(
     time_s: Real, reference_m: Real, tips_m: Sequence[Real], commands_V: Sequence[Real]
 ) -> Picture:
-    """The same step with the design on the nominal rig and on the repaired one, a column each.
+    """A reference step with the design on the nominal rig and on the repaired one, a column each.
 
     Runs in the order nominal predicted by its own model (dashed), nominal achieved on the repaired machine,
     repaired predicted, repaired achieved.

@@ -24,7 +24,8 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Picture:
 
     Of a model that fits hold near its records, the plain simulations from the recorded start.
     """
-    case, runs = found.case, found.replays
+    case = found.case
+    runs = found.replays
     worst = max(case.held_out, key=lambda e: pooled_rms(found.residuals_before[e.name]))
     time = np.arange(len(worst.output), dtype=np.float64) * case.dt_s
     picture, grid = new_picture(
@@ -33,11 +34,13 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Picture:
     for column, output in enumerate(case.outputs):
         words, unit, _ = gap_style.look_of(output)
         unit = style.plain(unit or case.units.get(output, ""), 16) or "as logged"
-        (above, below), measured = grid[:, column], worst.output[:, column]
+        (above, below) = grid[:, column]
+        measured = worst.output[:, column]
         # Broad and pale: a model that fits lies on top of it.
         above.plot(*outline(time, measured), color=gap_style.PALE, lw=3.0, label="measured")
         for model in dict.fromkeys(("stated", found.models[-1])):
-            look, name = gap_style.MODELS[model], gap_style.WORDS[model]
+            look = gap_style.MODELS[model]
+            name = gap_style.WORDS[model]
             residual = found.residuals[model][worst.name][:, column] * case.noise[column]
             if runs:
                 residual = measured - runs[model][worst.name][:, column]
@@ -60,7 +63,8 @@ def draw_residual_traces(found: Diagnosis) -> Picture:
 
     Beside a model error residuals are in per cent of the motion, and there is no band.
     """
-    case, models = found.case, dict.fromkeys(("stated", found.models[-1]))
+    case = found.case
+    models = dict.fromkeys(("stated", found.models[-1]))
     picture, grid = new_picture(
         0.9 + 1.25 * len(case.experiments),
         len(case.experiments),
@@ -126,7 +130,8 @@ def _spectrum(signals: Sequence[Real], dt_s: float) -> tuple[Real, Real]:
     from scipy.signal import welch  # half a second to load, which only this picture needs
 
     length = min(_SEGMENT, *(s.size for s in signals))
-    total, weight = np.zeros(length // 2 + 1), 0
+    total = np.zeros(length // 2 + 1)
+    weight = 0
     frequency = np.asarray(np.fft.rfftfreq(length, dt_s), dtype=np.float64)
     for signal in signals:
         _, power = welch(signal, 1 / dt_s, nperseg=length, detrend=False)

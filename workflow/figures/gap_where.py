@@ -44,7 +44,9 @@ def _of_band(where: Where, band: BandGap, model_error: float) -> tuple[float, Re
 
 
 def _look(where: Where, sensor: str) -> tuple[str, str]:
-    words, _, colour = gap_style.look_of(sensor, [one.sensor for one in where.sensors].index(sensor))
+    """Words and colour of a sensor in these pictures."""
+    sensors = [of_sensor.sensor for of_sensor in where.sensors]
+    words, _, colour = gap_style.look_of(sensor, sensors.index(sensor))
     return _LOOKS.get(sensor, (words, colour))
 
 
@@ -55,11 +57,12 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Pictur
     With 95 % intervals. Parts in which nothing is found beyond chance are drawn pale. The frequency panel
     ends at 0.05 noise deviations; less is drawn at its edge.
     """
-    experiments, (factor, words) = where.experiments, _size(model_error)
+    experiments = where.experiments
+    factor, words = _size(model_error)
     picture, (left, right) = new_picture(
         max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
     )
-    sensors = [one.sensor for one in where.sensors]
+    sensors = [of_sensor.sensor for of_sensor in where.sensors]
     apart = np.linspace(-1.0, 1.0, len(sensors)) if len(sensors) > 1 else np.zeros(1)
     for sensor, shift in zip(sensors, 1 + 0.03 * apart, strict=True):
         name, colour = _look(where, sensor)
@@ -110,17 +113,24 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Picture | None:
     floor = "the\nthreshold" if model_error > 0 else "the noise"
     picture, panels = small_multiples(len(findings), min(3, max(2, len(findings))), 2.6, 0.9)
     for panel, finding in zip(panels, findings, strict=True):
-        at, count = np.arange(len(finding.bins)), len(finding.bins)
-        low, high = np.array([one.interval for one in finding.bins]).T
+        at = np.arange(len(finding.bins))
+        count = len(finding.bins)
+        low, high = np.array([of_bin.interval for of_bin in finding.bins]).T
         panel.bars(at, high, 0.8, begins=low, color="#dddddd", label="95 % of what chance gives")
         name, colour = _look(where, finding.sensor)
         panel.plot(
-            at, [one.energy for one in finding.bins], marker="o", ls="none", ms=6, color=colour, label=name
+            at,
+            [of_bin.energy for of_bin in finding.bins],
+            marker="o",
+            ls="none",
+            ms=6,
+            color=colour,
+            label=name,
         )
         # The label where there is room for words, else the range on two lines.
         named = [
-            style.plain(one.label, 24) if count <= _FEW_BINS else f"{one.low:.2g}\nto {one.high:.2g}"
-            for one in finding.bins
+            style.plain(of_bin.label, 24) if count <= _FEW_BINS else f"{of_bin.low:.2g}\nto {of_bin.high:.2g}"
+            for of_bin in finding.bins
         ]
         panel.x.named = list(zip(at, named, strict=True))
         panel.tick_size[X] = 8.0
@@ -136,21 +146,24 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Picture | None:
 @style.drawing("gap_dependences")
 def draw_dependences(where: Where) -> Picture | None:
     """The missing force, or error of a reading, over what it depends on, two standard errors either side."""
-    found = where.dependences
-    if not found:
+    dependences = where.dependences
+    if not dependences:
         return None
-    picture, panels = small_multiples(len(found), 2, 2.9, 0.9)
-    for panel, one in zip(panels, found, strict=True):
-        plain = codec.plain(one)
-        at, value = np.array(one.centres), np.array(one.values)
-        error = 2 * np.array(one.standard_errors)
+    picture, panels = small_multiples(len(dependences), 2, 2.9, 0.9)
+    for panel, dependence in zip(panels, dependences, strict=True):
+        plain = codec.plain(dependence)
+        at = np.array(dependence.centres)
+        value = np.array(dependence.values)
+        error = 2 * np.array(dependence.standard_errors)
         panel.fill_between(at, value - error, value + error, **style.BAND, label="two standard errors")
         panel.plot(at, value, color=style.MODEL, lw=1.6, label="what is missing")
         panel.axhline(0, color="#555555", lw=0.8)
-        panel.set(xlabel=_with_unit(variable_words(plain).removeprefix("the "), one.unit))
-        panel.set(ylabel=_with_unit(missing_words(plain), one.value_unit.replace("Nm", "N m")))
+        panel.set(xlabel=_with_unit(variable_words(plain).removeprefix("the "), dependence.unit))
+        panel.set(ylabel=_with_unit(missing_words(plain), dependence.value_unit.replace("Nm", "N m")))
         panel.set_title(
-            f"{portion(one.share)} of the error on {one.judged_on} not used", size=9.5, bold=False
+            f"{portion(dependence.share)} of the error on {dependence.judged_on} not used",
+            size=9.5,
+            bold=False,
         )
     return picture
 

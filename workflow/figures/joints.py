@@ -37,10 +37,10 @@ def draw_joint_steps(run: AnyRunView) -> Picture | None:
         for panel, name, signal in zip(
             grid[:, k], (joint.output, joint.input), ("output", "command"), strict=True
         ):
-            lines = np.stack([getattr(one, signal)[:, k] for one in loop.runs])
+            lines = np.stack([getattr(loop_run, signal)[:, k] for loop_run in loop.runs])
             panel.fill_between(*envelope(loop.time_s, lines), **style.ACHIEVED_BAND, label="all runs")
-            for number, (one, line) in enumerate(zip(loop.runs, lines, strict=True)):
-                if one.condition == loop.runs[0].condition:
+            for number, (loop_run, line) in enumerate(zip(loop.runs, lines, strict=True)):
+                if loop_run.condition == loop.runs[0].condition:
                     look = style.ACHIEVED_LINE | {"label": None if number else "as identified"}
                     panel.plot(*outline(loop.time_s, line), **look)
             panel.set(ylabel=style.two_lines(name, run.results.records.unit(name)))
@@ -122,12 +122,15 @@ def draw_singular_values(run: AnyRunView) -> Picture:
 @style.drawing("joint-requirements")
 def draw_joint_requirements(run: AnyRunView) -> Picture | None:
     """Largest singular value of every weighted function, the worst over balls and operating points."""
-    if (law := run.results.design.controller) is None:
+    law = run.results.design.controller
+    if law is None:
         return None
-    asked, top = run.config.specification(), 0.999 * np.pi / law.dt_s
+    asked = run.config.specification()
+    top = 0.999 * np.pi / law.dt_s
     omega = np.geomspace(_LOW * top, top, 300)
-    s, K = tustin_s(omega, law.dt_s), law.response(omega, with_delay=False).reshape(-1, *law.D.shape)
-    found: dict[str, Real] = {}
+    s = tustin_s(omega, law.dt_s)
+    K = law.response(omega, with_delay=False).reshape(-1, *law.D.shape)
+    largest: dict[str, Real] = {}
     for point in run.results.identify.points:
         plant = point.plant(run.config.identification.gain_error)
         G, seen, entering = plant.blocks(omega, law.computational_delay_samples)
@@ -136,11 +139,11 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
             none = np.zeros_like(size)
             on_y, on_u = (size, none) if of == "y" else (none, size)
             worst = scaled_bound(BoundRows(G, seen, entering, on_y, on_u, False), K).gamma
-            found[name] = np.maximum(found.get(name, np.zeros(omega.size)), worst)
+            largest[name] = np.maximum(largest.get(name, np.zeros(omega.size)), worst)
     picture, grid = new_picture(2.9, 1, 1, squeeze=False)
     panel = grid[0, 0]
     colours = (style.MODEL, style.PREDICTED, style.ACHIEVED)
-    for (name, gamma), colour in zip(found.items(), colours, strict=False):
+    for (name, gamma), colour in zip(largest.items(), colours, strict=False):
         finite = np.where(np.isfinite(gamma), gamma, np.nan)
         panel.plot(omega, finite, color=colour, lw=1.4, label=_MEANING.get(name, name))
     panel.axhline(1.0, **style.LIMIT_LINE, label="stay below")
@@ -152,7 +155,7 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
 
 @style.drawing("joint-validation")
 def draw_joint_validation(run: AnyRunView) -> Picture | None:
-    """Of all records that were kept back the one that is met worst: every output, measured and simulated."""
+    """Every output, measured and simulated, of the record that the model meets worst of those kept back."""
     records = [(point, fits) for point in run.results.identify.points for fits in point.fresh]
     if not records:
         return None

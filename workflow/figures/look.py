@@ -35,24 +35,24 @@ def is_line(look: Look) -> bool:
 def stroke(look: Look) -> str:
     """Declarations of a line's look."""
     width = float(look.get("lw", _LINE_WIDTH))
-    said = [f"fill:none;stroke:{colour_of(look)};stroke-width:{width:g}"]
+    declarations = [f"fill:none;stroke:{colour_of(look)};stroke-width:{width:g}"]
     dashes = look.get("ls", "-")
     pattern = dashes[1] if isinstance(dashes, tuple) else _DASHES.get(str(dashes), ())
     if pattern:
-        said.append("stroke-dasharray:" + " ".join(f"{width * part:.3g}" for part in pattern))
+        declarations.append("stroke-dasharray:" + " ".join(f"{width * part:.3g}" for part in pattern))
     elif look.get("solid_capstyle") != "butt":
-        said.append("stroke-linecap:square")
-    return ";".join(said + _opacity(look))
+        declarations.append("stroke-linecap:square")
+    return ";".join(declarations + _opacity(look))
 
 
 def filling(look: Look) -> str:
     """Declarations of an area's look."""
-    said = [f"fill:{colour_of(look)}"]
+    declarations = [f"fill:{colour_of(look)}"]
     width = float(look.get("lw", 1.0))
     edge = look.get("edgecolor", look.get("color"))
     if width > 0 and edge:
-        said.append(f"stroke:{_hex(edge)};stroke-width:{width:g}")
-    return ";".join(said + _opacity(look))
+        declarations.append(f"stroke:{_hex(edge)};stroke-width:{width:g}")
+    return ";".join(declarations + _opacity(look))
 
 
 def marker(look: Look) -> tuple[str, str]:
@@ -62,10 +62,10 @@ def marker(look: Look) -> tuple[str, str]:
     edge = _hex(look.get("mec", colour_of(look)))
     face = "none" if kind in _OPEN else _hex(look.get("mfc", colour_of(look)))
     width = float(look.get("mew", 1.0))
-    said = [f"fill:{face}"]
+    declarations = [f"fill:{face}"]
     if width > 0:
-        said.append(f"stroke:{edge};stroke-width:{width:g}")
-    return ";".join(said + _opacity(look)), _outline(kind, size / 2)
+        declarations.append(f"stroke:{edge};stroke-width:{width:g}")
+    return ";".join(declarations + _opacity(look)), _outline(kind, size / 2)
 
 
 def key(mark: Mark) -> tuple[Any, ...]:

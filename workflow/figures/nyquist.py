@@ -24,7 +24,8 @@ _LOWEST_DB = -30.0  # below it a loop does nothing, and its phase takes all the 
 
 def loop_of(run: RunView) -> FrequencyUncertainty:
     """The certified loop of a run, fine enough for what its controller does to the modes."""
-    frequency, plant = run.control.spread.frequency, run.plant
+    frequency = run.control.spread.frequency
+    plant = run.plant
     if isinstance(plant.uncertainty, ResponsePosterior):
         frequency = plant.uncertainty.at(run.loop_grid, plant.level)
     return times(frequency, run.controller.response(frequency.omega_rad_s))
@@ -33,7 +34,8 @@ def loop_of(run: RunView) -> FrequencyUncertainty:
 @style.drawing("nyquist")
 def draw_run(run: RunView) -> Picture:
     """Nyquist curve of a run's loop, as far as it fits, beside its Nichols chart."""
-    loop, (picture, (whole, chart)) = loop_of(run), new_picture(6.2, 1, 2)
+    loop = loop_of(run)
+    picture, (whole, chart) = new_picture(6.2, 1, 2)
     draw_nyquist(whole, loop, run.specification.modulus_margin)
     draw_nichols(chart, loop)
     return picture
@@ -51,8 +53,10 @@ def draw_nyquist(
 ) -> None:
     """Ellipses of a loop as far as they fit, or near -1; the disc to keep out of and the nearest point where
     a modulus margin is asked for."""
-    centre, ellipse = loop.centre, loop.ellipse()
-    edges, size = centre[:, None] + ellipse.boundary(40), np.abs(centre)
+    centre = loop.centre
+    ellipse = loop.ellipse()
+    edges = centre[:, None] + ellipse.boundary(40)
+    size = np.abs(centre)
     distance = nearest_distance(
         (-1.0 - centre) * np.conj(ellipse.direction), ellipse.semi_major, ellipse.semi_minor
     )
@@ -63,14 +67,15 @@ def draw_nyquist(
     real = imag = (-reach, reach)
     if near:
         side = float(np.clip(1.35 * max(distance[nearest], modulus_margin, 0.35), 0.5, 1.3))
-        real, imag = (-1 - side, -1 + 1.25 * side), (-1.12 * side, 1.12 * side)
+        real = (-1 - side, -1 + 1.25 * side)
+        imag = (-1.12 * side, 1.12 * side)
     low, high = np.array([real, imag]).T
-    both = np.stack([edges.real, edges.imag], axis=-1)
-    inside = np.all((both.max(axis=1) > low) & (both.min(axis=1) < high), axis=1)
+    corners = np.stack([edges.real, edges.imag], axis=-1)
+    inside = np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1)
     panel.set(xlim=real, ylim=imag, equal=True)
     panel.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
     # The last one is always drawn.
-    _fill(panel, both[np.append(np.flatnonzero(inside), nearest)], loop.level)
+    _fill(panel, corners[np.append(np.flatnonzero(inside), nearest)], loop.level)
     panel.plot(centre.real, centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
     _arrow(panel, centre, real, imag)
     panel.axhline(0, color="#999999", lw=0.7)
@@ -83,14 +88,16 @@ def draw_nyquist(
         label = f"nearest: {at_least(distance[nearest])} at {loop.omega_rad_s[nearest]:.4g} rad/s"
         panel.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
         panel.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
-    beyond = " K G" if size.max() < reach else " K G (partly beyond the frame)"
-    panel.set_title(f"Loop{' around -1' if near else beyond}")
+    reach_in_words = " K G" if size.max() < reach else " K G (partly beyond the frame)"
+    panel.set_title(f"Loop{' around -1' if near else reach_in_words}")
 
 
 def draw_nichols(panel: Panel, loop: FrequencyUncertainty) -> None:
     """Gain over phase of a loop with its ellipses, on the Nichols chart of python-control."""
-    phase, level = unwrapped_degrees(loop.centre), style.decibels(np.abs(loop.centre))
-    edges, shown = loop.centre[:, None] + loop.ellipse().boundary(40), level > _LOWEST_DB
+    phase = unwrapped_degrees(loop.centre)
+    level = style.decibels(np.abs(loop.centre))
+    edges = loop.centre[:, None] + loop.ellipse().boundary(40)
+    shown = level > _LOWEST_DB
     turned = phase[:, None] + np.degrees(
         np.angle(edges / np.where(loop.centre == 0, 1.0, loop.centre)[:, None])
     )
@@ -149,7 +156,8 @@ def _fill(panel: Panel, polygons: Real, level: float) -> None:
 
 def _arrow(panel: Panel, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
     """Direction of rising frequency, half-way along the longest visible run."""
-    x, y = centre.real, centre.imag
+    x = centre.real
+    y = centre.imag
     seen = (x > real[0]) & (x < real[1]) & (y > imag[0]) & (y < imag[1])
     length = np.cumsum(np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0))
     if length.size and length[-1] > 0:

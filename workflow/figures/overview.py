@@ -18,7 +18,8 @@ def draw_overview(run: RunView) -> Picture:
     """Left: identified gain with its ellipses; middle: the loop around -1; right: the reference step, without
     the disturbance that follows it."""
     picture, (gain, around, step) = new_picture(4.1, 1, 3, width_in=12.0)
-    spread, loop = run.control.spread, run.results.closed_loop.check
+    spread = run.control.spread
+    loop = run.results.closed_loop.check
     assert loop is not None
     band = draw_enlarged(gain, spread.frequency)
     nominal = np.abs(spread.nominal.frequency_response(band.omega_rad_s))

@@ -52,7 +52,8 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
 
     searched: points (E, 2) that a search tried.
     """
-    first, second = surface.first, surface.second
+    first = surface.first
+    second = surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
     picture, (left, bar, right) = new_picture(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
     top = max(float(np.percentile(ratio, 99)), 1.0001)
@@ -62,20 +63,22 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
     fill_levels(left, first, second, np.log(shades), np.log(levels))
     bar.set(yscale="log")
     colour_bar(bar, levels)
-    low, high = [first[0], second[0]], [first[-1], second[-1]]
+    low = [first[0], second[0]]
+    high = [first[-1], second[-1]]
     if searched is not None:
-        seen = searched[np.all((searched >= low) & (searched <= high), axis=1)]
+        is_inside = np.all((searched >= low) & (searched <= high), axis=1)
+        seen = searched[is_inside]
         if seen.size:
             left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
     # Inside the picture, and not the pair's own (which is no grid point).
-    others = [
+    further_minima = [
         (i, j)
         for i, j in surface.local_minima()
         if 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
         if abs(np.log(surface.first[i] / surface.pole[0])) > 0.2
     ]
-    if others:
-        i, j = np.array(others[:8]).T
+    if further_minima:
+        i, j = np.array(further_minima[:8]).T
         left.plot(first[i], second[j], **_HOLLOW, label="other local minima")
     polar = surface.names == ("omega_rad_s", "zeta")
     words = ("{:.4g} rad/s, damping {:.3g}" if polar else "beta {:.6g}, gamma {:.6g}").format(*surface.pole)
@@ -126,20 +129,23 @@ def _shade(share: float) -> str:
 
 
 def _surface(channel: ChannelView, pair: int) -> ErrorSurface:
-    found = channel.found.identification
-    poles, dt_s = found.model.poles, found.model.dt_s
-    omega, zeta = float(poles.omega_rad_s(dt_s)[pair]), float(poles.zeta()[pair])
+    identification = channel.found.identification
+    poles = identification.model.poles
+    dt_s = identification.model.dt_s
+    omega = float(poles.omega_rad_s(dt_s)[pair])
+    zeta = float(poles.zeta()[pair])
     low = min(max(omega / 8, 2 * np.pi / channel.found.longest_s), 0.8 * omega)
     high = max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega)
     wide = np.geomspace(low, high, 30)
     # The valley of a lightly damped pair is as narrow as its damping: even steps would jump over it.
     near = omega * np.exp(zeta * np.sinh(np.linspace(-3.0, 3.0, 21)))
+    is_between = (near > low) & (near < high)
     return error_surface(
         channel.found.used,
-        found.model,
-        found.structure,
+        identification.model,
+        identification.structure,
         pair=pair,
-        first=np.unique(np.concatenate([wide, near[(near > low) & (near < high)]])),
+        first=np.unique(np.concatenate([wide, near[is_between]])),
         second=np.geomspace(min(1e-3, zeta / 3), max(0.7, min(0.97, 1.1 * zeta)), 24),
     )
 
@@ -171,7 +177,8 @@ def draw_order(channel: ChannelView) -> Picture | None:
     The response straight from the records stands faintly behind the right panel: modes belong on its peaks.
     Nothing where no other structure was tried.
     """
-    plot, steps = channel.found.stabilisation, channel.found.identification.order_table
+    plot = channel.found.stabilisation
+    steps = channel.found.identification.order_table
     if plot is None or not steps:
         return None
     picture, (left, right) = new_picture(4.6, 1, 2, width_ratios=[1.0, 1.7])
@@ -189,7 +196,8 @@ def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]
         order, above, ls="none", marker="o", ms=5, mfc="white", mec=style.MODEL, label="structure tried"
     )
     lowest = np.unique(order)
-    panel.plot(lowest, [above[order == n].min() for n in lowest], color=style.MODEL, lw=1.0)
+    least_above = [np.min(above, where=order == n, initial=np.inf) for n in lowest]
+    panel.plot(lowest, least_above, color=style.MODEL, lw=1.0)
     mine = [k for k, step in enumerate(steps) if (step.n_real, step.n_pairs) == chosen]
     if mine:
         label = f"the model: {chosen[0]} real, {chosen[1]} pairs"
@@ -202,14 +210,19 @@ def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]
 
 
 def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncertainty | None) -> None:
-    omega, count = plot.omega_rad_s, plot.n_pairs
-    stable, same = plot.stable, plot.previous >= 0
+    omega = plot.omega_rad_s
+    count = plot.n_pairs
+    stable = plot.stable
+    same = plot.previous >= 0
     panel.set(xscale="log")
     if response is not None:
         # The gain behind the marks, on a log scale of its own that nobody has to read.
         gain = np.abs(response.centre)
-        seen, log = response.omega_rad_s[gain > 0], np.log(gain[gain > 0])
-        low, high = np.percentile(log, 1), log.max()
+        is_positive = gain > 0
+        seen = response.omega_rad_s[is_positive]
+        log = np.log(gain[is_positive])
+        low = np.percentile(log, 1)
+        high = log.max()
         panel.plot(
             seen,
             0.03 + 0.94 * np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0),

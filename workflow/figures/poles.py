@@ -37,14 +37,15 @@ def draw_poles(
     closed_loop (n,): poles of a loop around it. intervals: of the poles; the area that frequency and damping
     of a mode leave is filled.
     """
-    poles, zeros = np.concatenate([model.stable_poles.values, model.unstable_poles]), model.zeros()
-    picture, both = new_picture(5.6, 1, 2)
-    whole, near = both
+    poles = np.concatenate([model.stable_poles.values, model.unstable_poles])
+    zeros = model.zeros()
+    picture, panels = new_picture(5.6, 1, 2)
+    whole, near = panels
     corner = _near_corner(poles)
     whole.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
     near.set(xlim=(1 - corner, 1 + 0.12 * corner), ylim=(-0.12 * corner, corner))
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
-    for panel in both:
+    for panel in panels:
         panel.set(equal=True, xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
         panel.grid_lines = [False, False]
         panel.plot(turn.real, turn.imag, color="#333333", lw=1.0)
@@ -71,27 +72,35 @@ def draw_poles(
 
 def _areas(intervals: Intervals, dt_s: float) -> list[Complex]:
     """Outlines in z of what the intervals of modes and real poles leave, those that the records tell."""
-    along, ones = np.linspace(0, 1, 25), np.ones(25)
-    found = []
+    along = np.linspace(0, 1, 25)
+    ones = np.ones(25)
+    outlines = []
     for mode in intervals.modes:
         if mode.told:
-            (w0, w1), (d0, d1) = mode.omega_rad_s, mode.damping
+            (w0, w1) = mode.omega_rad_s
+            (d0, d1) = mode.damping
             omega = np.concatenate([w0 + along * (w1 - w0), w1 * ones, w1 - along * (w1 - w0), w0 * ones])
             zeta = np.concatenate([d0 * ones, d0 + along * (d1 - d0), d1 * ones, d1 - along * (d1 - d0)])
             upper = np.exp((-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0.0))) * omega * dt_s)
-            found += [upper, upper.conj()]
+            outlines += [upper, upper.conj()]
     real = [np.exp(-np.array(ends) * dt_s) for ends in intervals.real_poles_per_s]
-    return found + [ends.astype(np.complex128) for ends in real if np.all(np.isfinite(ends))]
+    return outlines + [ends.astype(np.complex128) for ends in real if np.all(np.isfinite(ends))]
 
 
 def _near_corner(poles: Complex) -> float:
     """Side of the close-up: room around the slowest lightly damped pair, else around the slowest poles."""
-    upper = poles[(poles.imag > 1e-9) & (np.abs(poles) > 0.05)]
+    is_upper = (poles.imag > 1e-9) & (np.abs(poles) > 0.05)
+    upper = poles[is_upper]
     log = np.log(upper)
-    light = np.abs(upper[-log.real < 0.4 * np.abs(log)] - 1.0)
-    away = np.abs(poles - 1.0)
-    away = light if light.size else away[away > 1e-9]
-    return float(np.clip(1.7 * away.min(), 0.02, 0.9)) if away.size else 0.5
+    is_light = -log.real < 0.4 * np.abs(log)
+    distances = np.abs(upper[is_light] - 1.0)
+    if not distances.size:
+        distances = np.abs(poles - 1.0)
+        is_no_integrator = distances > 1e-9
+        distances = distances[is_no_integrator]
+    if not distances.size:
+        return 0.5
+    return float(np.clip(1.7 * distances.min(), 0.02, 0.9))
 
 
 def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
@@ -101,7 +110,8 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
     """
     fastest = float(np.pi / dt_s)
     along = np.linspace(0.0, 1.0, 120)
-    (left, right), (low, high) = panel.x.limits(), panel.y.limits()
+    left, right = panel.x.limits()
+    low, high = panel.y.limits()
     # The largest frequency in view decides which frequencies are round ones here.
     corner = np.array([complex(x, y) for x in (left, (left + right) / 2) for y in (low, high) if x or y])
     inside = np.where(np.abs(corner) < 1, corner, corner / np.maximum(np.abs(corner), 1e-12))
@@ -111,13 +121,16 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
     lines = []
     for damping in _DAMPINGS:
         turned = np.sqrt(1 - damping**2)
-        omega = fastest / turned * along  # up to the negative real axis
+        # Up to the negative real axis.
+        omega = fastest / turned * along
         lines.append((np.exp((-damping + 1j * turned) * omega * dt_s), "--", f"{damping:g}"))
     for omega in rounds:
-        damping = along[along * omega * dt_s <= _DECAYED]
+        not_decayed = along * omega * dt_s <= _DECAYED
+        damping = along[not_decayed]
         pole = omega * dt_s * (-damping + 1j * np.sqrt(1 - damping**2))
         # Beyond the Nyquist frequency a line would come back from below the real axis.
-        lines.append((np.exp(pole[pole.imag <= np.pi]), ":", f"{omega:.4g} rad/s"))
+        below_nyquist = pole.imag <= np.pi
+        lines.append((np.exp(pole[below_nyquist]), ":", f"{omega:.4g} rad/s"))
     for line, dashes, words in lines:
         for half in (line, line.conj()):
             panel.plot(half.real, half.imag, ls=dashes, **look)

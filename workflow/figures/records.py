@@ -37,7 +37,11 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
     )
     starts = np.concatenate([[0.0], np.cumsum([item.duration_s * 1.02 for item in shown])])
     first = shown[0].record
-    lively, _ = _signal(first, *rows[len(inputs) if outputs else 0])
+    # The first output where there is one, else the first input.
+    liveliest_row = rows[0]
+    if outputs:
+        liveliest_row = rows[len(inputs)]
+    lively, _ = _signal(first, *liveliest_row)
     zoom = liveliest(lively, min(_ZOOM_SAMPLES, first.n_samples))
     for (kind, name), (left, right) in zip(rows, grid, strict=True):
         for item, start in zip(shown, starts, strict=False):
@@ -74,7 +78,8 @@ def _signal(record: Record, kind: str, name: str) -> tuple[Real, str]:
     names: Sequence[str] = getattr(record, f"{kind}_names")
     if name not in names:
         raise ValueError(f"{record.label}: no {kind} column {name!r}; there is {list(names)}")
-    column, units = names.index(name), getattr(record, f"{kind}_units")
+    column = names.index(name)
+    units = getattr(record, f"{kind}_units")
     return np.asarray(getattr(record, kind)[:, column]), units[column] if units else ""
 
 

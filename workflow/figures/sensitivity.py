@@ -72,12 +72,15 @@ def sensitivity_curves(
     effort_unit = style.ratio_unit(input_unit, output_unit)
     disturbance_unit = style.ratio_unit(performance_unit or output_unit, input_unit)
     if performance is None:
-        symbol, where = "|G S|", "output"
+        symbol = "|G S|"
+        where = "output"
         disturbance = np.abs(ellipses.centre) * nominal, worst_gs
     else:
-        symbol, where = "|Gp S|", "performance output"
+        symbol = "|Gp S|"
+        where = "performance output"
         disturbance = np.abs(performance.centre) * nominal, performance.farthest() * worst
-    to_error, to_command = "reference or disturbance to error", "measurement noise to command"
+    to_error = "reference or disturbance to error"
+    to_command = "measurement noise to command"
     through = np.abs(gain * ellipses.centre) * nominal, size * worst_gs
     return (
         curve(LoopFunction.SENSITIVITY, "|S|", to_error, "1", nominal, worst),
@@ -141,7 +144,8 @@ def draw_curve(panel: Panel, curve: SensitivityCurve, level: float) -> None:
 def _range(curve: SensitivityCurve) -> tuple[float, float]:
     """At most six decades below the top, so that an integrator does not flatten everything else."""
     values = np.concatenate([curve.nominal, curve.worst, curve.limit])
-    values = values[np.isfinite(values) & (values > 0) & (values < 1e200)]
+    can_be_drawn = np.isfinite(values) & (values > 0) & (values < 1e200)
+    values = values[can_be_drawn]
     if not values.size:
         return 0.1, 10.0
     top = 2.0 * min(values.max(), 300 * float(curve.nominal.max()))

@@ -81,10 +81,10 @@ class ChannelView:
     def distortion(self) -> tuple[tuple[Distortion, ...], list[Finding], str]:
         """Levels of noise and distortion, what they say, and why there are none where the records refuse."""
         try:
-            found = distortion_of(self.measured)
+            levels = distortion_of(self.measured)
         except ValueError as error:
             return (), [], str(error)
-        return found, distortion_findings(self.measured, found, repeats_of(self.measured)), ""
+        return levels, distortion_findings(self.measured, levels, repeats_of(self.measured)), ""
 
     @property
     def light(self) -> list[tuple[int, ModelMode]]:
@@ -105,7 +105,8 @@ class ChannelView:
     @property
     def shown_pair(self) -> int | None:
         """The pole pair whose error surface is shown: the slowest lightly damped one, else the slowest."""
-        omega, zeta = self._omega_rad_s, self.found.model.poles.zeta()
+        omega = self._omega_rad_s
+        zeta = self.found.model.poles.zeta()
         light = (zeta < LIGHT) & (zeta > 5e-4)
         slowest = np.argsort(np.where(light | ~light.any(), omega, np.inf))
         return int(slowest[0]) if slowest.size else None
@@ -125,8 +126,13 @@ class ChannelView:
         if plot is None:
             return []
         modes = [mode.omega_rad_s for mode in plot.columns()]
-        mine = plot.omega_rad_s[plot.n_pairs == plot.chosen]
-        return [float(w) for w in mine if not any(abs(w / mode - 1) < 0.02 for mode in modes)]
+        is_chosen = plot.n_pairs == plot.chosen
+        # A column within 2 % has the pole pair already.
+        return [
+            float(omega)
+            for omega in plot.omega_rad_s[is_chosen]
+            if not any(abs(omega / mode - 1) < 0.02 for mode in modes)
+        ]
 
     @cached_property
     def zeros(self) -> Complex:
@@ -140,7 +146,9 @@ class ChannelView:
     def zero_pairs(self) -> list[tuple[float, float]]:
         """Antiresonances: frequency [rad/s] and damping ratio of lightly damped zero pairs."""
         zeros = self.zeros
-        log = np.log(zeros[(zeros.imag > 1e-9) & (np.abs(zeros) > 0.05)]) / self.found.model.dt_s
+        # One of each pair; a zero near the origin is no frequency.
+        is_upper = (zeros.imag > 1e-9) & (np.abs(zeros) > 0.05)
+        log = np.log(zeros[is_upper]) / self.found.model.dt_s
         return sorted((abs(s), -s.real / abs(s)) for s in log if abs(s.real) < LIGHT * abs(s))
 
     @property
@@ -194,9 +202,12 @@ class AnyRunView:
     manifest: Mapping[str, Any]
 
     def largest_recorded(self, signal: str) -> float:
-        """Of an input, in the records of the fit."""
-        fitted = [item.record for item in self.results.records.of_role("estimation")]
-        return max(float(np.max(np.abs(one.input[:, one.input_names.index(signal)]))) for one in fitted)
+        """Largest size of an input in the records of the fit, in its unit."""
+        largest = []
+        for item in self.results.records.of_role("estimation"):
+            column = item.record.input_names.index(signal)
+            largest.append(float(np.max(np.abs(item.record.input[:, column]))))
+        return max(largest)
 
     @property
     def signals(self) -> str:
@@ -225,7 +236,8 @@ class RunView(AnyRunView):
         return tuple(self._channel(index) for index in range(len(self.config.channels)))
 
     def _channel(self, index: int) -> ChannelView:
-        channel, found = self.config.channels[index], self.results.identify.channels[index]
+        channel = self.config.channels[index]
+        found = self.results.identify.channels[index]
         by_name = {item.name: item.record for item in self.results.records.records}
         friction = self.results.identify.friction if channel.uncertainty.friction_identified else None
         slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
@@ -270,7 +282,7 @@ class RunView(AnyRunView):
 
     @property
     def logged_controller(self) -> Controller:
-        """As the run's files have it."""
+        """The controller for the columns of the logs, as it stands in the run's files."""
         return Logged.of(self.config, self.results.records).law(self.controller)
 
     @property
@@ -322,28 +334,34 @@ class RunView(AnyRunView):
 
         margins = {}
         for name, with_delay in (("K_with_delay", True), ("K_without_delay", False)):
-            found = nominal_margins(partial(loop_gain, with_delay=with_delay), omega, at_zero=at_zero)
-            gain = found.gain_up
-            if found.gain_down > 0 and -np.log(found.gain_down) < np.log(found.gain_up):
-                gain = found.gain_down
+            of_loop = nominal_margins(partial(loop_gain, with_delay=with_delay), omega, at_zero=at_zero)
+            gain = of_loop.gain_up
+            if of_loop.gain_down > 0 and -np.log(of_loop.gain_down) < np.log(of_loop.gain_up):
+                gain = of_loop.gain_down
             ends = loop_gain(omega[-1:], with_delay).real
             if at_zero is not None:
                 ends = np.append(ends, at_zero)
             at_end = bool(np.any(np.isclose(gain * ends, -1.0, rtol=1e-6)))
-            margins[name] = (gain, float(np.degrees(found.phase_rad)), found.modulus), at_end
+            margins[name] = (gain, float(np.degrees(of_loop.phase_rad)), of_loop.modulus), at_end
         return margins
 
     @staticmethod
     def forms(law: Law) -> dict[str, Any]:
         """Zeros, poles and gain in z of a law with one input and output, its numerator and denominator with
         the highest power first, and its second-order sections, as lists of scipy.signal."""
-        system, here = law.to_control(), np.exp(1j)
-        found = [system.zeros(), system.poles()]
-        # Rounding leaves pairs that are not quite conjugate, and zeros at infinity that are not quite there.
-        found = [each[(each.imag >= 0) & (np.abs(each) < 1e9)] for each in found]
-        zeros, poles = (
-            np.concatenate([part, part[part.imag > 1e-9].conj()]) for part in (np.round(f, 13) for f in found)
-        )
+        system = law.to_control()
+        here = np.exp(1j)
+
+        # Rounding leaves pairs that are not quite conjugate, and zeros at infinity that are not quite there:
+        # those of the upper half-plane are kept, and mirrored.
+        def in_pairs(roots: Any) -> Any:
+            is_kept = (roots.imag >= 0) & (np.abs(roots) < 1e9)
+            upper = np.round(roots[is_kept], 13)
+            is_complex = upper.imag > 1e-9
+            return np.concatenate([upper, upper[is_complex].conj()])
+
+        zeros = in_pairs(system.zeros())
+        poles = in_pairs(system.poles())
         gain = float(np.real(system(here) * np.prod(here - poles) / np.prod(here - zeros)))
         above, below = signal.zpk2tf(zeros, poles, gain)
         # scipy's sections hold powers of 1/z: each zero fewer than there are poles is a delay of one sample.
@@ -380,17 +398,17 @@ class RunView(AnyRunView):
         if check is None or check.sensitivity is None or certificate is None:
             return []
         bandwidth = min(plant.bandwidth_rad_s for plant in certificate.plants)
-        as_identified, small, *others = check.sensitivity.measured
-        causes = [(as_identified, "model"), (small, "size"), *((row, "effects") for row in others)]
+        as_identified, small, *with_effects = check.sensitivity.measured
+        causes = [(as_identified, "model"), (small, "size"), *((row, "effects") for row in with_effects)]
         contradictions = []
         for row, cause in causes:
             weight = self.specification.magnitude(self.plant, row.omega_rad_s, LoopFunction.SENSITIVITY)
             limit = np.divide(1.0, weight, out=np.full_like(weight, np.inf), where=weight > 0)
-            found = MeasuredBeyond(
+            contradiction = MeasuredBeyond(
                 row, cause, limit, row.beyond(limit), row.beyond_bandwidth(bandwidth), bandwidth
             )
-            if found.line is not None or found.bandwidth_line is not None:
-                contradictions.append(found)
+            if contradiction.line is not None or contradiction.bandwidth_line is not None:
+                contradictions.append(contradiction)
         return contradictions
 
     @cached_property
@@ -402,7 +420,8 @@ class RunView(AnyRunView):
         not show them.
         """
         omega = self.control.spread.frequency.omega_rad_s
-        omega = omega[omega > 0]
+        above_zero = omega > 0
+        omega = omega[above_zero]
         if self.plant.own_grid is not None:
             return omega
         poles = [closed_loop_poles(self.controller, self.plant)]
@@ -418,16 +437,18 @@ class RunView(AnyRunView):
         dense = frequency_grid(
             float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)
         )
-        every = np.unique(np.concatenate([omega, dense, worst]))
-        every = every[(every > 0) & (every <= omega[-1])]
-        return smooth_grid(every, lambda w: self.controller.response(w) * self.plant.at(w).centre)
+        together = np.unique(np.concatenate([omega, dense, worst]))
+        is_inside = (together > 0) & (together <= omega[-1])
+        return smooth_grid(
+            together[is_inside], lambda w: self.controller.response(w) * self.plant.at(w).centre
+        )
 
 
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
 
 
 def unit_of(key: str, input_unit: str, output_unit: str) -> str:
-    """Of a key of the specification, for a plant whose signals have these units."""
+    """Unit of a key of the specification, for a plant whose signals have these units; "" without one."""
     units = {
         "effort_limit": ratio_unit(input_unit, output_unit),
         "input_limit": input_unit,

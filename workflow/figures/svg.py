@@ -201,8 +201,10 @@ class _Frame:
     def place(self, which: int, values: Any) -> Real:
         """Where values of an axis lie [pt]."""
         shares = self.panel.axis(which).shares(values)
-        found = self.box[0] + shares * self.width if which == X else self.box[3] - shares * self.height
-        return np.asarray(np.clip(found, -_FAR, _FAR))
+        places = self.box[0] + shares * self.width
+        if which != X:
+            places = self.box[3] - shares * self.height
+        return np.asarray(np.clip(places, -_FAR, _FAR))
 
     def written(self, points: Real) -> Real:
         """A line (N, 2) as it is written: without points that are not seen; in y to a tenth where the axis is
@@ -289,9 +291,9 @@ def _wrapped(text: str, size: float, room: float, *, bold: bool = False) -> str:
     """A text in lines that are no longer than `room` [pt], parted between words; a longer word stays
     whole."""
     lines: list[str] = []
-    for given in text.split("\n"):
+    for paragraph in text.split("\n"):
         line = ""
-        for word in given.split(" "):
+        for word in paragraph.split(" "):
             longer = f"{line} {word}" if line else word
             if line and text_width(longer, size, bold=bold) > room:
                 lines.append(line)
@@ -311,8 +313,10 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
     pad = np.zeros((2, max(rows, columns)))  # a column that holds no panel takes no width
     for panel in picture.panels:
         row, column = panel.place
-        before[X, column], before[Y, row] = 55.0, 25.0
-        after[X, column], after[Y, row] = 12.0, 25.0
+        before[X, column] = 55.0
+        before[Y, row] = 25.0
+        after[X, column] = 12.0
+        after[Y, row] = 25.0
         pad[X, column] = _PAD
         pad[Y, row] = _PAD
     frames: list[_Frame] = []
@@ -360,7 +364,8 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
         half = scale * spans / 2
         middle = np.array([x.mean(), y.mean()])
         box = np.concatenate([middle - half, middle + half])
-    along, up = box[2] - box[0], box[3] - box[1]
+    along = box[2] - box[0]
+    up = box[3] - box[1]
     size = panel.tick_size
     y_ticks = ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, 9)))
     if panel.y.named is not None:
@@ -392,16 +397,16 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
 
 
 def _fitting(axis: Axis, length: float, size: float) -> Ticks:
-    """As many numbers as fit along a length [pt]."""
-    most = int(np.clip(length / (3 * size), 1, 9))
+    """The ticks of an axis with as many numbers as fit along a length [pt] in letters of a size [pt]."""
+    count = int(np.clip(length / (3 * size), 1, 9))
     while True:
-        ticks = ticks_of(axis, most)
+        ticks = ticks_of(axis, count)
         widest = max((text_width(word, size) for word in ticks.words), default=0.0)
         places = np.sort(axis.shares(ticks.places)) * length
         nearest = float(np.min(np.diff(places), initial=np.inf))
-        if most <= 2 or axis.named is not None or widest + 4 < nearest:
+        if count <= 2 or axis.named is not None or widest + 4 < nearest:
             return ticks
-        most -= 1
+        count -= 1
 
 
 # -- paths
@@ -424,18 +429,22 @@ def _hundredths(points: Real) -> Any:
 
 @lru_cache(maxsize=20_000)
 def _short(hundredths: int) -> str:
-    whole, rest = divmod(abs(hundredths), 100)
-    text = (str(whole) if whole else "") + (f".{rest:02d}".rstrip("0") if rest else "")
-    return ("-" if hundredths < 0 else "") + (text or "0")
+    """A number of hundredths as SVG writes it shortest: ".5", "-3", "0"."""
+    whole, decimals = divmod(abs(hundredths), 100)
+    text = str(whole) if whole else ""
+    if decimals:
+        text += f".{decimals:02d}".rstrip("0")
+    sign = "-" if hundredths < 0 else ""
+    return sign + (text or "0")
 
 
 def _lines_of(points: Real, box: Real) -> Iterator[Real]:
     """Parts of a line (N, 2) that are seen in a box (left, top, right, bottom), between points that are no
     numbers."""
     with np.errstate(invalid="ignore"):
-        beyond: Any = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
+        past_side: Any = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
     # A step whose ends lie beyond the same side is not in the box.
-    outside: Any = np.any(beyond[1:] & beyond[:-1], axis=1)
+    outside: Any = np.any(past_side[1:] & past_side[:-1], axis=1)
     drawn_steps = ~outside
     finite: Any = np.isfinite(points).all(axis=1)
     drawn_steps &= finite[1:] & finite[:-1]
@@ -455,7 +464,8 @@ def thinned(points: Real, unseen: float = _UNSEEN) -> Real:
         middle = np.arange(1 + turn % 2, points.shape[0] - 1, 2)
         if not middle.size:
             continue
-        before, after = points[middle - 1], points[middle + 1]
+        before = points[middle - 1]
+        after = points[middle + 1]
         way = after - before
         length = np.hypot(*way.T)
         off = points[middle] - before
@@ -472,8 +482,11 @@ def thinned(points: Real, unseen: float = _UNSEEN) -> Real:
 
 
 def _four_a_pixel(points: Real) -> Real:
-    """Of a line (N, 2) that only goes to the right, the first, the smallest, the largest and the last point
-    of each pixel: they cover the same pixels as all of it (M4: Jugel et al., Proc. VLDB 7(10), 2014)."""
+    """A line (N, 2) with four points of each pixel at most: the first, the smallest, the largest, the last.
+
+    They cover the same pixels as all of it (M4: Jugel et al., Proc. VLDB 7(10), 2014). A line that does not
+    only go to the right, or has few points, comes back as it is.
+    """
     x, y = points.T
     if x.size < 5 or np.any(np.diff(x) < 0) or x[-1] - x[0] > x.size / 4 * _PIXEL:
         return points
@@ -481,8 +494,8 @@ def _four_a_pixel(points: Real) -> Real:
     firsts = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
     lasts = np.append(firsts[1:], x.size) - 1
     order = np.lexsort((y, pixel))  # sorted by pixel, then by value
-    kept = np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))
-    return np.asarray(points[kept])
+    chosen = np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))
+    return np.asarray(points[chosen])
 
 
 def _many(parts: list[Real], *, closed: bool = False) -> str:
@@ -593,16 +606,19 @@ class _Writer:
         lines: list[str] = []
         if looks.is_line(mark.look):
             seen = _held(points) if mark.look.get("drawstyle") == "steps-post" else points
-            if path := _many([frame.written(part) for part in _lines_of(seen, frame.box)]):
+            path = _many([frame.written(part) for part in _lines_of(seen, frame.box)])
+            if path:
                 lines = [f'<path class="{self.named(looks.stroke(mark.look))}" d="{path}"/>']
         dots = []
         if mark.look.get("marker"):
-            there = points[np.isfinite(points).all(axis=1)]
-            inside = (there >= frame.box[:2] - 1) & (there <= frame.box[2:] + 1)
-            there = there[inside.all(axis=1)]
-            if len(there):
+            places = points[np.isfinite(points).all(axis=1)]
+            after_left_top = places >= frame.box[:2] - 1
+            before_right_bottom = places <= frame.box[2:] + 1
+            inside = (after_left_top & before_right_bottom).all(axis=1)
+            places = places[inside]
+            if len(places):
                 known = self.marker(mark.look)
-                dots = [f'<path class="p" style="marker:url(#{known})" d="{path_of(there)}"/>']
+                dots = [f'<path class="p" style="marker:url(#{known})" d="{path_of(places)}"/>']
         return lines, dots
 
     def marker(self, look: Mapping[str, Any]) -> str:
@@ -612,12 +628,12 @@ class _Writer:
 
     def definitions(self) -> str:
         """Markers of the picture."""
-        found = "".join(
+        markers = "".join(
             f'<marker id="{name}" markerUnits="userSpaceOnUse" overflow="visible"><path class="{style}" '
             f'd="{outline}"/></marker>'
             for (style, outline), name in self.markers.items()
         )
-        return f"<defs>{found}</defs>" if found else ""
+        return f"<defs>{markers}</defs>" if markers else ""
 
     def across(self, mark: Rule | Span, frame: _Frame) -> str:
         """A line or a strip from edge to edge."""
@@ -642,7 +658,13 @@ class _Writer:
             # Where there is no room to the right of a line, to its left.
             x -= 2 * mark.offset[0]
             side = "right"
-        name = "w" if mark.across_x else "u" if mark.across_y else "t"
+        # Classes that the page's script knows: words at a vertical rule, at a horizontal one, at a point.
+        if mark.across_x:
+            name = "w"
+        elif mark.across_y:
+            name = "u"
+        else:
+            name = "t"
         look = self.named(f"font-size:{mark.size:g}px;fill:{mark.color}")
         return f'<g class="{name}">{_text(mark.text, x, y, look, side)}</g>'
 
@@ -664,7 +686,8 @@ class _Writer:
 
     def axis(self, frame: _Frame, which: int) -> str:
         """Lines of the grid, marks, numbers and label of an axis."""
-        panel, ticks = frame.panel, frame.y if which else frame.x
+        panel = frame.panel
+        ticks = frame.y if which else frame.x
         left, top, right, bottom = frame.box
         places = frame.place(which, ticks.places)
         minor = frame.place(which, ticks.minor)
@@ -676,7 +699,9 @@ class _Writer:
         outwards = -1 if which else 1
         side = "en" if which else "mi"
         if panel.colour_bar and which == Y:
-            edge, outwards, side = right, 1, "st"
+            edge = right
+            outwards = 1
+            side = "st"
         beside = edge + outwards * _TO_NUMBERS
         for values, long, name in ((places, _MARK, "tk"), (minor, _SMALL_MARK, "tn")):
             if values.size:
@@ -707,8 +732,8 @@ class _Writer:
             foot = bottom + frame.number_room(X) + _TO_LABEL + _ASCENT * letters
             # Below the middle of its panel, but inside of the picture.
             half = text_width(frame.x_label, letters) / 2
-            most = self.picture.width_in * POINT - _PAD - half
-            middle = max(min((left + right) / 2, most), _PAD + half)
+            rightmost = self.picture.width_in * POINT - _PAD - half
+            middle = max(min((left + right) / 2, rightmost), _PAD + half)
             return group + _text(frame.x_label, middle, foot, look, "center", letters)
         # Labels of a column stand under each other: beside the widest numbers of all its panels.
         outer = left - self.number_rooms[panel.place[1]] - _TO_LABEL
@@ -813,7 +838,8 @@ def _read(picture: Picture, frame: _Frame, shared: list[int]) -> dict[str, Any]:
 
 def _read_second(frame: _Frame, which: int, shared: list[int]) -> dict[str, Any]:
     """What the script reads of a second axis: the same box in other units."""
-    x, y = _scale(frame.panel.x), _scale(frame.panel.y)
+    x = _scale(frame.panel.x)
+    y = _scale(frame.panel.y)
     names = ["", ""]
     if which == X:
         x = [float(f"{end / (2 * np.pi):.7g}") for end in x[:2]] + x[2:]
@@ -850,11 +876,11 @@ def _text(words: str, x: float, y: float, look: str, side: str = "left", size: f
     end = {"center": " mi", "right": " en"}.get(side, "")
     name = f' class="{(look + end).strip()}"' if look or end else ""
     place = f'x="{_tenth(x)}" y="{_tenth(y)}"'
-    first, *others = words.split("\n")
-    if not others:
+    first, *further_lines = words.split("\n")
+    if not further_lines:
         return f"<text{name} {place}>{escape(first)}</text>"
     spans = "".join(
-        f'<tspan x="{_tenth(x)}" dy="{size * _LINE:.1f}">{escape(line)}</tspan>' for line in others
+        f'<tspan x="{_tenth(x)}" dy="{size * _LINE:.1f}">{escape(line)}</tspan>' for line in further_lines
     )
     return f"<text{name} {place}>{escape(first)}{spans}</text>"
 
@@ -881,13 +907,13 @@ def _cuts(frames: list[_Frame]) -> list[float]:
     columns = sorted(
         (0.0 if frame.panel.colour_bar else frame.reach()[0], frame.reach()[1]) for frame in frames
     )
-    found = []
+    cuts = []
     reach = columns[0][1] if columns else 0.0
     for low, high in columns[1:]:
         if low > reach:
-            found.append(round((low + reach) / 2, 1))
+            cuts.append(round((low + reach) / 2, 1))
         reach = max(reach, high)
-    return found
+    return cuts
 
 
 def _legend_rows(picture: Picture) -> list[list[str]]:
@@ -973,7 +999,8 @@ def svg_file(made: Drawn, classes: Mapping[str, str]) -> bytes:
     rows = _legend_rows(picture)
     legend = []
     for row, labels in enumerate(rows):
-        left, middle = _PAD, height - _PAD - _ROW * (len(rows) - row - 0.5)
+        left = _PAD
+        middle = height - _PAD - _ROW * (len(rows) - row - 0.5)
         for label in labels:
             words = _text(label, _SAMPLE + _AFTER_SAMPLE, 0.36 * _LEGEND_SIZE, "")
             legend.append(f'<g transform="translate({left:.1f} {middle:.1f})">{samples[label]}{words}</g>')

@@ -129,7 +129,8 @@ def _multiples(low: float, high: float, step: float) -> Real:
 
 
 def _inside(places: Real, low: float, high: float) -> Real:
-    return places[(places >= low * (1 - 1e-9)) & (places <= high * (1 + 1e-9))]
+    is_inside = (places >= low * (1 - 1e-9)) & (places <= high * (1 + 1e-9))
+    return places[is_inside]
 
 
 def _as_decimals(values: Real, step: float) -> list[str]:
@@ -143,5 +144,6 @@ def _linear_and_log(low: float, high: float, linear: float) -> Ticks:
     reach = max(abs(low), abs(high), linear)
     powers = linear * 10.0 ** np.arange(0, int(np.ceil(np.log10(reach / linear))) + 1)
     places = np.concatenate([-powers[::-1], [0.0], powers])
-    places = places[(places >= low) & (places <= high)]
+    is_inside = (places >= low) & (places <= high)
+    places = places[is_inside]
     return Ticks(places, [number(value) for value in places], np.zeros(0))

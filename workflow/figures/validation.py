@@ -29,14 +29,18 @@ def draw_validation(channel: ChannelView) -> Picture:
 
     Above: both outputs, whole and close up. Below: the residual, with +-2 standard deviations of the noise.
     """
-    found, shown = channel.found, channel.shown_fresh
+    found = channel.found
+    shown = channel.shown_fresh
     if shown is None:
-        record, role = found.used[0], "estimation"
+        record = found.used[0]
+        role = "estimation"
         residual = found.identification.residuals[0]
         simulated = record.output[record.n_samples - residual.size :, 0] - residual
         fit = FreshFit(record.name, float(found.identification.fit_percent[0]), simulated, residual)
     else:
-        record, role, fit = channel.fresh_records[shown], found.fresh_roles[shown], found.fresh[shown]
+        record = channel.fresh_records[shown]
+        role = found.fresh_roles[shown]
+        fit = found.fresh[shown]
     time_s = record.time_s[record.n_samples - fit.residual.size :]  # a delayed answer begins later
     noise = 2 * found.identification.noise_std
     picture, grid = new_picture(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
@@ -56,7 +60,9 @@ def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: 
     """Into two panels, at the times of the fit (T,) or a part of them: measured and simulated; the residual,
     with +-noise."""
     upper, lower = panels
-    time, simulated, residual = time_s[part], fit.simulated[part], fit.residual[part]
+    time = time_s[part]
+    simulated = fit.simulated[part]
+    residual = fit.residual[part]
     upper.plot(*outline(time, simulated + residual), **_THICK, label="measured")
     upper.plot(*outline(time, simulated), **_THIN, label="model, simulated")
     lower.plot(*outline(time, residual), **style.MEASURED_LINE | {"lw": 0.7}, label="residual")
@@ -74,12 +80,14 @@ def draw_residual_tests(channel: ChannelView) -> Picture | None:
     tests = {test.name: test for test in channel.spread.tests}
     if not {"whiteness", "independence"} <= tests.keys():
         return None
-    whiteness, independence = tests["whiteness"], tests["independence"]
-    picture, both = new_picture(3.5, 1, 2, width_ratios=[1.0, 1.35])
-    left, right = both
+    whiteness = tests["whiteness"]
+    independence = tests["independence"]
+    picture, panels = new_picture(3.5, 1, 2, width_ratios=[1.0, 1.35])
+    left, right = panels
     dots = {"ls": "none", "ms": 4}
-    for panel, test in zip(both, (whiteness, independence), strict=True):
-        lags, size = test.lags, test.correlation
+    for panel, test in zip(panels, (whiteness, independence), strict=True):
+        lags = test.lags
+        size = test.correlation
         panel.fill_between(
             lags, -test.band, test.band, **style.BAND, label=f"{share(test.level)} band of each lag"
         )
