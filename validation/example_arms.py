@@ -32,10 +32,10 @@ def paper_example() -> control.TransferFunction:
     so the asymmetry of the zeros is the structural damping kappa, and gives the pair a damping ratio of 0.02.
     """
     right, left = _EXAMPLE_ZEROS_RAD_S
-    square, kappa, one = np.polymul([-1 / right, 1.0], [-1 / left, 1.0])
+    square, kappa, constant = np.polymul([-1 / right, 1.0], [-1 / left, 1.0])
     return control.tf(
-        _EXAMPLE_GAIN * np.array([square, kappa, one]),
-        [1 / _EXAMPLE_POLE_RAD_S**2, kappa, one, 0.0, 0.0],
+        _EXAMPLE_GAIN * np.array([square, kappa, constant]),
+        [1 / _EXAMPLE_POLE_RAD_S**2, kappa, constant, 0.0, 0.0],
         inputs=["hub_torque_Nm"],
         outputs=["tip_m"],
         name="paper_example",
@@ -75,9 +75,13 @@ def two_link_matrices(
         )
     far_mass = links[1].mass_per_length_kg_m * links[1].length_m + payload_kg
     unit = np.eye(3 + 2 * n_modes)
-    theta_1, theta_2, q_1, q_2 = unit[0], unit[1], unit[2 : 3 + n_modes], unit[3 + n_modes :]
+    theta_1 = unit[0]
+    theta_2 = unit[1]
+    q_1 = unit[2 : 3 + n_modes]
+    q_2 = unit[3 + n_modes :]
     across_1, bent, weights_1, spring_1 = _bending(links[0], n_modes, elbow_mass_kg + far_mass, theta_1, q_1)
-    elbow, psi = across_1[-1], theta_1 + bent + theta_2
+    elbow = across_1[-1]
+    psi = theta_1 + bent + theta_2
     across_2, _, weights_2, spring_2 = _bending(links[1], n_modes, payload_kg, psi, q_2)
     weights_2[-1] = payload_kg
     mass = across_1.T @ (weights_1[:, None] * across_1) + across_2.T @ (weights_2[:, None] * across_2)
@@ -100,16 +104,19 @@ def _bending(
 
     Points are the nodes of a quadrature and, without mass, the tip. q (n_modes, N), or one more: (x/L)^2.
     """
-    length, ei = link.length_m, link.bending_stiffness_Nm2
+    length = link.length_m
+    ei = link.bending_stiffness_Nm2
     modes = clamped_free_modes(ei, link.mass_per_length_kg_m, length, n_modes, tip_mass_kg)
     # The highest mode has about n_modes / 2 waves along the link; 8 nodes a mode integrate its square to
     # rounding.
     nodes, weights = np.polynomial.legendre.leggauss(8 * n_modes + 16)
-    x, area = np.append(0.5 * length * (nodes + 1), length), np.append(0.5 * length * weights, 0.0)
+    x = np.append(0.5 * length * (nodes + 1), length)
+    area = np.append(0.5 * length * weights, 0.0)
     bent: list[Real] = [modes.shape(x), modes.slope(x), modes.curvature(x)]
     if q.shape[0] > n_modes:
-        more = (x / length) ** 2, 2 * x / length**2, np.full(x.size, 2 / length**2)
-        bent = [np.column_stack(pair) for pair in zip(bent, more, strict=True)]
+        # A parabola beside the modes, with its slope and its curvature.
+        parabola = (x / length) ** 2, 2 * x / length**2, np.full(x.size, 2 / length**2)
+        bent = [np.column_stack(pair) for pair in zip(bent, parabola, strict=True)]
     shape, slope, curvature = (each @ q for each in bent)
     spring = ei * curvature.T @ (area[:, None] * curvature)
     return np.outer(x, turn) + shape, slope[-1], link.mass_per_length_kg_m * area, spring
@@ -127,7 +134,8 @@ def two_link_operating_point(elbow_angle_rad: float = np.pi / 3, n_modes: int = 
         arm.links, arm.hubs, arm.elbow_mass_kg, arm.payload_kg, elbow_angle_rad, n_modes
     )
     n = mass.shape[0]
-    joints, zero = np.eye(n)[:2], np.zeros((n, n))
+    joints = np.eye(n)[:2]
+    zero = np.zeros((n, n))
     damping[:2, :2] += np.diag([motor.back_emf_damping_Nms for motor in motors])
     drive = joints.T * [motor.torque_per_volt_Nm_V for motor in motors]
     return control.ss(

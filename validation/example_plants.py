@@ -99,9 +99,10 @@ class LinkUncertainty:
                     if change != 0:
                         slope = slope + inverse[complex(root)].scaled(complex(signed * change))
             columns.append(centre.times(slope))
-        omega, h = intervals.centre, intervals.half_width
-        one = np.ones(omega.size, dtype=np.complex128)
-        growth = FirstOrder(one + 1j * (omega / 20) ** 2, one * (2j * omega / 400), (h / 20) ** 2, h)
+        omega = intervals.centre
+        h = intervals.half_width
+        ones = np.ones(omega.size, dtype=np.complex128)
+        growth = FirstOrder(ones + 1j * (omega / 20) ** 2, ones * (2j * omega / 400), (h / 20) ** 2, h)
         disc = centre.times(growth).scaled(_ISOTROPIC[self.scenario])
         return centre, stacked([*columns, disc, disc.scaled(1j)])
 
@@ -116,9 +117,10 @@ class LinkUncertainty:
             {key: _positive(rng, _NOMINAL[key], spread) for key, spread in _SPREAD[self.scenario].items()}
             for _ in range(draws)
         ]
-        found = [_roots_and_gain(p) for p in parameters]
-        poles, zeros = np.array([f[0] for f in found]), np.array([f[1] for f in found])
-        gain = np.array([f[2] for f in found])
+        systems = [_roots_and_gain(drawn) for drawn in parameters]
+        poles = np.array([system[0] for system in systems])
+        zeros = np.array([system[1] for system in systems])
+        gain = np.array([system[2] for system in systems])
         knots = np.arange(-15, 10) / 3.0
         noise = rng.standard_normal((draws, knots.size)) + 1j * rng.standard_normal((draws, knots.size))
 

@@ -38,12 +38,12 @@ def baselines(case: Case) -> dict[str, dict[str, Any]]:
         return {"parameters only": refit, "residual correlation": _document(case, "none", {}, after)}
     shares = _shares(case, model, base)
     name = max(shares, key=lambda effect: shares[effect])
-    beyond = max(1.0 - base.residual_coefficients.size / energy, 1e-12)
-    found = shares[name] >= _EXPLAINED * beyond
+    share_beyond_noise = max(1.0 - base.residual_coefficients.size / energy, 1e-12)
+    is_explained = shares[name] >= _EXPLAINED * share_beyond_noise
     ranked = dict(sorted(shares.items(), key=lambda item: -item[1]))
     return {
         "parameters only": refit,
-        "residual correlation": _document(case, "effect" if found else "unknown", ranked, after),
+        "residual correlation": _document(case, "effect" if is_explained else "unknown", ranked, after),
     }
 
 
@@ -52,7 +52,7 @@ def _shares(case: Case, model: ResidualModel, base: Fit) -> dict[str, float]:
     P = base.deviations.size
     Q = np.linalg.qr(base.jacobian[:, :P])[0] if P else np.zeros((base.residual_coefficients.size, 0))
     left = base.residual_coefficients - Q @ (Q.T @ base.residual_coefficients)
-    found: dict[str, float] = {}
+    shares: dict[str, float] = {}
     for candidate in case.machine.candidates(case.experiments):
         for start in candidate.starts:
             change = (
@@ -63,8 +63,8 @@ def _shares(case: Case, model: ResidualModel, base: Fit) -> dict[str, float]:
             size = float(np.linalg.norm(change) * np.linalg.norm(base.residual_coefficients))
             # An effect that is there lowers the residuals: only changes that point against them count.
             cosine = -float(change @ left) / size if size > 0 and np.isfinite(size) else 0.0
-            found[candidate.effect] = max(found.get(candidate.effect, 0.0), max(cosine, 0.0) ** 2)
-    return found
+            shares[candidate.effect] = max(shares.get(candidate.effect, 0.0), max(cosine, 0.0) ** 2)
+    return shares
 
 
 def _document(case: Case, verdict: str, shares: dict[str, float], gap_after: float) -> dict[str, Any]:

@@ -74,7 +74,8 @@ def link_basis(
     if not 1 <= n_modes <= _POLYNOMIALS - 3:
         raise ValueError(f"n_modes must be 1..{_POLYNOMIALS - 3}; got {n_modes}")
     unit_integral, weights, unit_angles, to_tip = _polynomials()
-    integral, angles = 0.5 * length_m * unit_integral, 0.5 * length_m * unit_angles
+    integral = 0.5 * length_m * unit_integral
+    angles = 0.5 * length_m * unit_angles
     stiffness = np.diag(bending_stiffness_Nm2 * length_m / (2 * np.arange(_POLYNOMIALS) + 1))
     deflection = integral @ angles
     lumps = mass_per_length_kg_m * 0.5 * length_m * np.append(weights, 0.0)

@@ -27,14 +27,30 @@ RANGES: dict[Sort, tuple[float, float]] = {
 }
 # A parametric effect among uncertain nominals is this many tolerances large.
 _TOLERANCES = (4.0, 8.0)
-_CLOSE_ENOUGH = 0.12  # of the wanted gap, in its logarithm
+# Distance from the wanted gap, in its logarithm, that is close enough. Chosen: the size is drawn anyway.
+_CLOSE_ENOUGH = 0.12
+# Largest gap in records of the fit over that in held-out ones, at least.
 _SHARE_IN_ESTIMATION = 0.25
+# Draws of a rig and partners until a case is given up.
 _TRIES = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """A planned experiment as it ran: commanded voltage (T,), measured (T, 2), and sizes of the gap."""
+    """A planned experiment as it ran.
+
+    Attributes
+    ----------
+    plan : Planned
+    voltage_V : (T,) array
+        As commanded.
+    measured : (T, 2) array
+        Hub angle and tip, with noise, in the digits of the file.
+    ratio, rms : (2,) arrays
+        Rms of the gap of each output, over its noise and in its unit.
+    before, after : (T, 2) arrays
+        Residuals over the noise, of the true rig without the effects and with them.
+    """
 
     plan: Planned
     voltage_V: Real
@@ -56,7 +72,7 @@ class BlindCase:
 
 
 def sorts_of(shares: Mapping[S, float], n_cases: int, only: S | None, slack: float = 0.0) -> list[S]:
-    """As many of each sort as its share, by largest remainders, so that it holds for few cases too.
+    """Sorts of the cases: each as often as its share, by largest remainders, so that it holds for few too.
 
     slack: what a number may lack of a whole one by rounding.
     """
@@ -130,25 +146,27 @@ def _effects(
     tolerances: dict[str, float],
     rng: np.random.Generator,
 ) -> list[Table] | None:
+    """Effects that a case hides, sized to the wanted gap; None where one of them cannot have its size."""
     if sort == "none":
         return []
     names = [name]
     if sort == "pair":
-        others = [n for n in pool if n != name and {n, name} not in NOT_TOGETHER]
-        names.append(str(rng.choice(others)))
+        partners = [n for n in pool if n != name and {n, name} not in NOT_TOGETHER]
+        names.append(str(rng.choice(partners)))
     low, high = RANGES[sort]
-    found = []
-    for one in names:
+    effects = []
+    for effect_name in names:
         wanted = log_uniform(rng, low, high)
-        open_size = sizable(one, rig, plans, rng)
-        if tolerances and one in PARAMETRIC:
-            entry = _many_tolerances(one, open_size, rig, plans, tolerances, (low, high), rng)
+        open_size = sizable(effect_name, rig, plans, rng)
+        if tolerances and effect_name in PARAMETRIC:
+            entry = _many_tolerances(effect_name, open_size, rig, plans, tolerances, (low, high), rng)
         else:
+            # At its largest size an effect may stay below the wanted gap, but for a faint one.
             entry = _sized(open_size, rig, plans, wanted, low if sort != "faint" else wanted)
         if entry is None:
             return None
-        found.append(entry)
-    return found
+        effects.append(entry)
+    return effects
 
 
 def _sized(
@@ -156,22 +174,22 @@ def _sized(
 ) -> Table | None:
     """The effect at which the largest gap ratio is as wanted (secant in logarithms), or at least enough."""
     nominal = _Nominal(rig, plans)
-    tried: list[tuple[float, float]] = []
+    measured: list[tuple[float, float]] = []
     size = open_size.first
     for _ in range(9):
         ratio = nominal.largest_ratio([open_size.at(size)])
-        tried.append((float(np.log(size)), float(np.log(max(ratio, 1e-6)))))
-        miss = float(np.log(wanted)) - tried[-1][1]
+        measured.append((float(np.log(size)), float(np.log(max(ratio, 1e-6)))))
+        miss = float(np.log(wanted)) - measured[-1][1]
         if abs(miss) < _CLOSE_ENOUGH or (size >= open_size.largest and ratio >= enough):
             return open_size.at(size)
         if size >= open_size.largest and miss > 0:
             return None
         slope = 1.0
-        if len(tried) > 1:
-            (x0, y0), (x1, y1) = tried[-2:]
+        if len(measured) > 1:
+            (x0, y0), (x1, y1) = measured[-2:]
             slope = (y1 - y0) / (x1 - x0) if x1 != x0 else 1.0
         step = np.clip(miss / np.clip(slope, 0.3, 4.0), -3.0, 2.0)
-        size = float(min(np.exp(tried[-1][0] + step), open_size.largest))
+        size = float(min(np.exp(measured[-1][0] + step), open_size.largest))
     return None
 
 
@@ -195,7 +213,8 @@ class _Nominal:
     """Records of the rig without effects, kept while sizes are tried."""
 
     def __init__(self, rig: Rig, plans: Sequence[Planned]) -> None:
-        self.rig, self.plans = rig, plans
+        self.rig = rig
+        self.plans = plans
         self.truth = Truth(rig)
         self._records: dict[str, Clean] = {}
 
@@ -220,7 +239,8 @@ class _Nominal:
 def _run(
     rig: Rig, effects: list[Table], plans: tuple[Planned, ...], rng: np.random.Generator
 ) -> tuple[Record, ...]:
-    machine, nominal = Truth(rig, effects), Truth(rig)
+    machine = Truth(rig, effects)
+    nominal = Truth(rig)
     records = []
     for plan in plans:
         noise = rng.standard_normal((plan.voltage_V.size, 2)) * machine.noise
@@ -249,12 +269,17 @@ def _run(
 def _answer(
     sort: Sort, rig: Rig, tolerances: dict[str, float], effects: list[Table], records: tuple[Record, ...]
 ) -> dict[str, Any]:
-    """As the answer files of the labelled cases, and besides what only a sealed label needs."""
+    """The label of a case: as the answer files of labelled cases, and what only a sealed label needs."""
     largest = max(float(np.max(record.ratio)) for record in records)
     unlisted = sort == "unlisted"
+    verdict = "none"
+    severity = "none"
+    if effects:
+        verdict = "unknown" if unlisted else "effect"
+        severity = "clear" if largest >= 3 else "subtle"
     answer: dict[str, Any] = {
-        "verdict": "none" if not effects else "unknown" if unlisted else "effect",
-        "severity": "none" if not effects else "clear" if largest >= 3 else "subtle",
+        "verdict": verdict,
+        "severity": severity,
         "max_ratio": round(largest, 3),
         "sort": sort,
         "nominal": "uncertain" if tolerances else "exact",

@@ -92,7 +92,8 @@ class _Case:
 
     def run(self, report: Report) -> Answer:
         """Its answer; its folder is written."""
-        plan, folder = self.plan, self.out / case_name(self.index)
+        plan = self.plan
+        folder = self.out / case_name(self.index)
         rng = np.random.default_rng([self.seed, 1, self.index])
         case: BlindCase | WorkshopCase
         if isinstance(plan, WorkshopPlan):

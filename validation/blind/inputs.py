@@ -9,6 +9,7 @@ import numpy as np
 from validation.blind.rigs import magnitudes
 from validation.blind.truth import Feedback, Real, Truth
 
+# Samples of a period of the multisine.
 _PERIOD = 700
 
 
@@ -39,7 +40,8 @@ def plan_experiments(truth: Truth, rng: np.random.Generator) -> tuple[Planned, .
         bend = float(np.max(np.abs(unit.tip_m - arm * unit.hub_angle_rad))) / length
         return np.asarray(np.round(1e-2 * shape * min(angle_rad / angle, share / bend), 4))
 
-    T, dt = 1400, truth.dt_s
+    T = 1400
+    dt = truth.dt_s
     angles = rng.uniform(0.09, 0.15), rng.uniform(0.17, 0.35), rng.uniform(0.15, 0.23)
     low, high, fresh = (scaled(_binary(T, rng), angle, 0.065) for angle in angles)
     multisine = scaled(_multisine(dt, rng), rng.uniform(0.12, 0.25), rng.uniform(0.04, 0.07))
@@ -60,7 +62,7 @@ def plan_experiments(truth: Truth, rng: np.random.Generator) -> tuple[Planned, .
 
 
 def _binary(T: int, rng: np.random.Generator) -> Real:
-    """+-1, each value held for a drawn number of samples; zero in the first row."""
+    """A random binary signal (T,): +-1, each held for a drawn number of samples; zero in the first row."""
     hold = int(rng.integers(2, 5))
     bits = rng.integers(0, 2, -(-T // hold))
     voltage = np.where(np.repeat(bits, hold)[:T] == 1, 1.0, -1.0)
@@ -69,7 +71,10 @@ def _binary(T: int, rng: np.random.Generator) -> Real:
 
 
 def _multisine(dt_s: float, rng: np.random.Generator) -> Real:
-    """All lines up to 35 Hz with random phases; weaker at the first lines, which turn the hub most."""
+    """Two periods of a random-phase multisine with all lines up to 35 Hz, largest value 1.
+
+    It is weaker at the first lines, which turn the hub most.
+    """
     lines = np.arange(1, int(35.0 * _PERIOD * dt_s) + 1)
     size = np.minimum(lines / 3.5, 1.0) / np.sqrt(1 + (lines / 46.0) ** 2)
     spectrum = np.zeros(_PERIOD // 2 + 1, dtype=np.complex128)
@@ -97,8 +102,10 @@ def _slew(truth: Truth, T: int, rng: np.random.Generator) -> Feedback:
     target = rng.choice([-1.0, 1.0]) * rng.uniform(0.3, 0.42)
     back = target * rng.uniform(-0.5, 0.5)
     reference = np.zeros(T)
-    begin, first = int(rng.integers(80, 150)), int(rng.integers(150, 300))
-    again, second = int(rng.integers(560, 680)), int(rng.integers(150, 300))
+    begin = int(rng.integers(80, 150))
+    first = int(rng.integers(150, 300))
+    again = int(rng.integers(560, 680))
+    second = int(rng.integers(150, 300))
     rows = np.arange(T)
     reference += target * _smooth((rows - begin) / first)
     reference += (back - target) * _smooth((rows - again) / second)

@@ -15,7 +15,17 @@ import numpy.typing as npt
 
 Real = npt.NDArray[np.float64]
 
-BASE, MOTOR, HUB, ROOT, ATTACHED = 0, 1, 2, 3, 4
+# Places of the rotary bodies in a row of the coupling.
+BASE = 0
+# Motor side of a backlash.
+MOTOR = 1
+# Hub side of it.
+HUB = 2
+# Root of the link, behind a joint's compliance.
+ROOT = 3
+# What is attached to the hub by a spring.
+ATTACHED = 4
+# Number of the bodies.
 BODIES = 5
 
 
@@ -96,9 +106,13 @@ def _accelerations(
         for k in range(R):
             body[i] += couple[i, k] * q[k]
             speed[i] += couple[i, k] * v[k]
-    alpha, alpha_dot = body[ROOT], speed[ROOT]
+    alpha = body[ROOT]
+    alpha_dot = speed[ROOT]
     # Directions in the frame of the link root.
-    cosine, sine, bend_x, bend_y = work[0], work[1], work[2], work[3]
+    cosine = work[0]
+    sine = work[1]
+    bend_x = work[2]
+    bend_y = work[3]
     for h in range(G):
         turn = 0.0
         rate = alpha_dot
@@ -116,28 +130,36 @@ def _accelerations(
     # In-plane gravity in this frame.
     ux = p.gravity * np.cos(alpha) + p.gravity_across * np.sin(alpha)
     uy = p.gravity_across * np.cos(alpha) - p.gravity * np.sin(alpha)
-    dx, dy = work[4], work[5]
+    dx = work[4]
+    dy = work[5]
     for g in range(G + 1):
-        x, y = p.radius_m, 0.0
-        bx, by = -p.radius_m * alpha_dot * alpha_dot, 0.0
+        x = p.radius_m
+        y = 0.0
+        bx = -p.radius_m * alpha_dot * alpha_dot
+        by = 0.0
         for h in range(G):
             w = integral[g, h]
             x += w * cosine[h]
             y += w * sine[h]
             bx += w * bend_x[h]
             by += w * bend_y[h]
-        dx[0], dy[0] = -y, x
+        dx[0] = -y
+        dy[0] = x
         for i in range(n):
-            sx, sy = 0.0, 0.0
+            sx = 0.0
+            sy = 0.0
             for h in range(G):
                 w = arms[i, g, h]
                 sx -= w * sine[h]
                 sy += w * cosine[h]
-            dx[1 + i], dy[1 + i] = sx, sy
+            dx[1 + i] = sx
+            dy[1 + i] = sy
         lump = lumps[g]
-        fx, fy = lump * (ux - bx), lump * (uy - by)
+        fx = lump * (ux - bx)
+        fy = lump * (uy - by)
         if p.drag > 0.0 and g < G:
-            vx, vy = dx[0] * alpha_dot, dy[0] * alpha_dot
+            vx = dx[0] * alpha_dot
+            vy = dy[0] * alpha_dot
             for i in range(n):
                 vx += dx[1 + i] * v[R + i]
                 vy += dy[1 + i] * v[R + i]
@@ -251,12 +273,15 @@ def _outputs(p: Any, link: Link, q: Real) -> tuple[float, float]:
     couple, angle, integral, _, _, _, _ = link
     G, n = angle.shape
     R = couple.shape[1]
-    base, hub, root = 0.0, 0.0, 0.0
+    base = 0.0
+    hub = 0.0
+    root = 0.0
     for k in range(R):
         base += couple[BASE, k] * q[k]
         hub += couple[HUB, k] * q[k]
         root += couple[ROOT, k] * q[k]
-    x, y = p.radius_m, 0.0
+    x = p.radius_m
+    y = 0.0
     for h in range(G):
         turn = 0.0
         for i in range(n):
@@ -274,13 +299,17 @@ def _tip_acceleration(p: Any, link: Link, q: Real, v: Real, a: Real) -> float:
     couple, angle, integral, _, _, _, tip_angle = link
     G, n = angle.shape
     R = couple.shape[1]
-    alpha_dot, alpha_ddot = 0.0, 0.0
+    alpha_dot = 0.0
+    alpha_ddot = 0.0
     for k in range(R):
         alpha_dot += couple[ROOT, k] * v[k]
         alpha_ddot += couple[ROOT, k] * a[k]
-    x, y = -p.radius_m * alpha_dot * alpha_dot, p.radius_m * alpha_ddot
+    x = -p.radius_m * alpha_dot * alpha_dot
+    y = p.radius_m * alpha_ddot
     for h in range(G):
-        turn, rate, gain = 0.0, alpha_dot, alpha_ddot
+        turn = 0.0
+        rate = alpha_dot
+        gain = alpha_ddot
         for i in range(n):
             turn += angle[h, i] * q[R + i]
             rate += angle[h, i] * v[R + i]
@@ -331,15 +360,22 @@ def run(
         for g in range(G + 1):
             for h in range(G):
                 arms[i, g, h] = integral[g, h] * angle[h, i]
-    q, v = np.zeros(size), np.zeros(size)
-    q_stage, v_stage = np.zeros(size), np.zeros(size)
+    q = np.zeros(size)
+    v = np.zeros(size)
+    q_stage = np.zeros(size)
+    v_stage = np.zeros(size)
     kv = np.zeros((4, size))
     kq = np.zeros((4, size))
     ki = np.zeros(4)
     M = np.zeros((size, size))
     work = np.zeros((6, max(G, n + 1) + 1))
     dry = np.zeros(3)
-    current, filtered, ready, slewed, voltage, rate = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    current = 0.0
+    filtered = 0.0
+    ready = 0.0
+    slewed = 0.0
+    voltage = 0.0
+    rate = 0.0
     for k in range(R):
         if couple[BASE, k] == 0.0:
             q[k] = start[0]
@@ -400,7 +436,8 @@ def run(
                     amps = current
                     if stage == 0:
                         for i in range(size):
-                            q_stage[i], v_stage[i] = q[i], v[i]
+                            q_stage[i] = q[i]
+                            v_stage[i] = v[i]
                     else:
                         for i in range(size):
                             q_stage[i] = q[i] + f * kq[stage - 1, i]
@@ -433,7 +470,8 @@ def run(
                 ready = voltage
                 if p.lag > 0.0:
                     filtered = asked + (filtered - asked) * np.exp(-step / p.lag)
-                turned, slip = -shaft, 0.0
+                turned = -shaft
+                slip = 0.0
                 for m in range(R):
                     turned += (couple[MOTOR, m] - couple[BASE, m]) * q[m]
                     slip += (couple[MOTOR, m] - couple[BASE, m]) * v[m]

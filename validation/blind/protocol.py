@@ -43,8 +43,10 @@ from workflow.engine.store import Store
 from workflow.text.templates import RunSummary
 
 _FORMAT = "flexlink-blind-1"
-# Expected seconds per case: they shape the progress bar only.
-_CASE_S, _DIAGNOSIS_S = 8.0, 40.0
+# Expected seconds to make a case: they shape the progress bar only.
+_CASE_S = 8.0
+# Expected seconds to diagnose it.
+_DIAGNOSIS_S = 40.0
 
 Diagnose = Callable[[Path], dict[str, Any]]
 
@@ -69,11 +71,30 @@ def run_blind(
     progress: Progress | None = None,
     diagnose: Diagnose = diagnose_folder,
 ) -> RunSummary:
-    """Generate, seal, diagnose, open, score. Raises InputError, one line, for whatever was given wrongly.
+    """Generate, seal, diagnose, open, score.
 
-    only: cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
-    workshop: imperfectly known machines and awkward logs; their sorts are none, single, pair and unlisted.
-    diagnose: case folder -> document; runs in processes that are kept out of the run's directory.
+    Parameters
+    ----------
+    n_cases, seed : int
+        Number of cases, and what they are drawn from.
+    out : Path
+        Directory of the run.
+    jobs : int, optional
+        Processes; default: one per processor.
+    only : str, optional
+        Cases of this sort alone (none, faint, clear, pair, unlisted) in place of the mix.
+    workshop : bool
+        Imperfectly known machines and awkward logs; their sorts are none, single, pair and unlisted.
+    resume : bool
+        Go on with the run that is there.
+    progress : Progress, optional
+    diagnose : callable
+        From a case folder to its document; runs in processes that are kept out of the run's directory.
+
+    Raises
+    ------
+    InputError
+        One line: something wrong with what the user gave.
     """
     progress = progress or Progress()
     sorts = [*(SHARES if workshop else SORTS)]
@@ -85,11 +106,15 @@ def run_blind(
         raise InputError(f"--cases must be at least 1 and --seed at least 0; got {n_cases} and {seed}")
     width = jobs or os.cpu_count() or 1
     settings: dict[str, Any] = {"format": _FORMAT, "cases": n_cases, "seed": seed}
-    settings |= ({"only": only} if only else {}) | ({"workshop": True} if workshop else {})
+    if only:
+        settings["only"] = only
+    if workshop:
+        settings["workshop"] = True
     _begin(BlindDirectory(out), settings, resume)
     progress.plan([("cases", _CASE_S * n_cases / width), ("diagnosis", _DIAGNOSIS_S * n_cases / width)])
     _sealed_cases(out, settings, width, progress)
     names = sorted(path.name for path in (out / "cases").iterdir() if path.is_dir())
+    # While cases are diagnosed the labels are in no file.
     with off_disk(out):
         _predict(out, names, width, diagnose, progress)
     predictions = [read_json(out / "predictions" / f"{name}.json") for name in names]
@@ -97,6 +122,8 @@ def run_blind(
         out / "predictions.json",
         {name: sha256_of_file(out / "predictions" / f"{name}.json") for name in names},
     )
+
+    # The answers stand: now the labels may be read.
     labels = open_seal(out)
     _check_cases(out, labels)
     document = _scored(predictions, labels, FAMILIES if workshop else GROUPS)
@@ -158,8 +185,8 @@ def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, pro
         workers(jobs, preload=["validation.blind.worker"]) as processes,
         progress.stage("diagnosis", taken_up=not todo) as update,
     ):
-        for index, found in processes.run(work):
-            document = failed(todo[index], found.reason) if isinstance(found, Failure) else found
+        for index, result in processes.run(work):
+            document = failed(todo[index], result.reason) if isinstance(result, Failure) else result
             write_json(folder / f"{todo[index]}.json", document)
             done += 1
             update(done / len(names), f"{done} of {len(names)}")

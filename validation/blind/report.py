@@ -61,17 +61,17 @@ def _table(scored: Mapping[str, Any]) -> str:
 
 def summary(document: Mapping[str, Any], out: Path) -> RunSummary:
     """For the terminal."""
-    found = document["diagnosis"]
+    scored = document["diagnosis"]
     sections = []
     for part in _SLICES:
         rows = tuple(
             Row(name, cell(numbers))
-            for name, numbers in found["table"][part].items()
+            for name, numbers in scored["table"][part].items()
             if numbers["count"] and (part == "all" or name != _CPU)
         )
         if rows:
             sections.append(TableSection(part if part == "all" else f"{part} nominal", rows))
-    right = found["table"]["all"]["verdict and set right, every case"]
+    right = scored["table"]["all"]["verdict and set right, every case"]
     return RunSummary(
         title="Blind protocol",
         sections=tuple(sections),

@@ -53,7 +53,8 @@ def draw_rig(rng: np.random.Generator) -> Rig:
     """An arm of 0.4 to 1.2 m whose first flexible mode lies between 2 and 20 Hz."""
     log = partial(log_uniform, rng)
     density, modulus = _MATERIALS[int(rng.choice(len(_MATERIALS), p=_SHARES))]
-    density, modulus = density * rng.uniform(0.93, 1.07), modulus * rng.uniform(0.93, 1.07)
+    density = density * rng.uniform(0.93, 1.07)
+    modulus = modulus * rng.uniform(0.93, 1.07)
     while True:
         length = rng.uniform(0.4, 1.2)
         clamped = log(1.5, 7.0)
@@ -103,8 +104,11 @@ def draw_rig(rng: np.random.Generator) -> Rig:
 
 def magnitudes(rig: RigTable) -> SimpleNamespace:
     """Mass of the link, inertia at the hub when all is stiff, torque per volt and braking of the motor."""
-    link, hub, motor = rig["link"], rig["hub"], rig["motor"]
-    L, r = link["length_m"], hub["radius_m"]
+    link = rig["link"]
+    hub = rig["hub"]
+    motor = rig["motor"]
+    L = link["length_m"]
+    r = hub["radius_m"]
     mass = link["density_kg_m3"] * link["width_m"] * link["thickness_m"] * L
     inertia = hub["inertia_kg_m2"] + mass * (L**2 / 3 + r * L + r**2)
     per_volt = motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]

@@ -25,15 +25,20 @@ Document = Mapping[str, Any]
 
 GROUPS: Mapping[str, str] = MappingProxyType({name: effect.group for name, effect in EFFECTS.items()})
 
-CLEAR, FAINT = 3.0, (0.3, 1.5)
+# Gap over noise from which on a case counts as clear.
+CLEAR = 3.0
+# Gaps over noise of faint cases.
+FAINT = (0.3, 1.5)
+# Probability above which a first answer counts as confident.
 CONFIDENT = 0.8
+# Bins of probability of the calibration.
 _BINS = 10
 # Closure is a ratio of gaps: with less gap than this (in noise deviations) it says nothing.
 _LEAST_GAP = 0.02
 
 
-def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str, Any]:
-    """One row: what was said and what is true.
+def _case(document: Document, true: Document, groups: Mapping[str, str]) -> dict[str, Any]:
+    """One row: the answer to a case beside its label.
 
     kind: none, single, several or unknown. first: the answer in one word, none, unknown or the first effect.
     accepted: the effects that were; answer: these, or the verdict. probability: of the first answer; a
@@ -41,29 +46,48 @@ def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str
     any of them. all_right: verdict and exact set. top_1, top_2: the true effect is among the first answers.
     errors, covered, standard_errors: of every parameter of an effect that was rightly accepted, see `_off`.
     """
+    # The label.
     names = [str(effect["name"]) for effect in true.get("effects", ())]
     kind = str(true["verdict"])
     if kind == "effect":
         kind = "single" if len(names) == 1 else "several"
-    verdict = str(said["verdict"])
-    effects = {str(e["name"]): e for e in said.get("effects", ())}
+
+    # The answer: its first word, what was accepted, and how sure it is.
+    verdict = str(document["verdict"])
+    effects = {str(e["name"]): e for e in document.get("effects", ())}
     first = verdict
     if verdict == "effect":
         first = next((name for name in effects if name not in ("none", "unknown")), "effect")
-    accepted = frozenset(said.get("combination") or (first,)) if verdict == "effect" else frozenset()
+    accepted = frozenset[str]()
+    if verdict == "effect":
+        accepted = frozenset(document.get("combination") or (first,))
     probability = effects.get(first, {}).get("probability")
     if probability is None and verdict == "none" and effects:
         probability = 1.0 - sum(float(e.get("probability") or 0.0) for e in effects.values())
     ranking = list(dict.fromkeys([first, *effects]))
     family, *families = (groups.get(name, name) for name in (first, *names))
     hidden = ", ".join(str(e["name"]) for e in true.get("unlisted") or ())
-    matches = [
-        (key, float(value), effects[effect["name"]], float(estimate))
-        for effect in true.get("effects", ())
-        if effect["name"] in accepted and effect["name"] in effects
-        for key, value in effect["parameters"].items()
-        if (estimate := (effects[effect["name"]].get("parameters") or {}).get(key)) is not None
-    ]
+
+    # Parameters of effects that were rightly accepted.
+    errors = []
+    covered = []
+    standard_errors = []
+    for effect in true.get("effects", ()):
+        answered = effects.get(effect["name"])
+        if effect["name"] not in accepted or answered is None:
+            continue
+        for key, number in effect["parameters"].items():
+            value = float(number)
+            estimate = (answered.get("parameters") or {}).get(key)
+            if estimate is None:
+                continue
+            estimate = float(estimate)
+            if key == "phase_rad" or value:
+                errors.append(_error(key, value, estimate))
+            interval = (answered.get("intervals") or {}).get(key)
+            if interval is not None and None not in interval:
+                covered.append(_inside(key, value, estimate, interval))
+                standard_errors.append(_standard_error(key, value, estimate, interval))
     return {
         "case": true["case"],
         "nominal": str(true.get("nominal", "exact")),
@@ -80,21 +104,11 @@ def _case(said: Document, true: Document, groups: Mapping[str, str]) -> dict[str
         "top_2": bool(set(ranking[:2]) & set(names)),
         "family": family in families,
         "common": len(accepted & set(names)) / max(len(names), 1),
-        "errors": [
-            _error(key, value, estimate) for key, value, _, estimate in matches if key == "phase_rad" or value
-        ],
-        "covered": [
-            _inside(key, value, estimate, interval)
-            for key, value, effect, estimate in matches
-            if (interval := (effect.get("intervals") or {}).get(key)) is not None and None not in interval
-        ],
-        "standard_errors": [
-            _standard_error(key, value, estimate, interval)
-            for key, value, effect, estimate in matches
-            if (interval := (effect.get("intervals") or {}).get(key)) is not None and None not in interval
-        ],
-        "closed": _closed(said, true),
-        "cpu_s": said.get("cpu_s"),
+        "errors": errors,
+        "covered": covered,
+        "standard_errors": standard_errors,
+        "closed": _closed(document, true),
+        "cpu_s": document.get("cpu_s"),
     }
 
 
@@ -102,32 +116,44 @@ def wilson(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share, after Wilson (1927); (0, 1) without cases."""
     if count == 0:
         return 0.0, 1.0
-    found = binomtest(hits, count).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
+    interval = binomtest(hits, count).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def scores(
     predictions: Sequence[Document], answers: Sequence[Document], groups: Mapping[str, str] = GROUPS
 ) -> dict[str, Any]:
-    """Everything that can be said about these predictions; groups: effect -> family.
+    """Everything that can be said about these predictions.
+
+    Parameters
+    ----------
+    predictions, answers : sequences of mappings
+        Documents of diagnoses, and labels, of the same cases.
+    groups : mapping of str to str
+        Family of each effect.
 
     Returns
     -------
-    dict with "table" (slice -> row -> numbers; slices all, exact, uncertain), "confusion" (rows true, columns
-    said), "unlisted" (cause -> answers), "several" (cases with more than one effect), "calibration" (bins),
-    "wrong" (every case whose first answer is wrong).
+    dict
+        With "table" (slice -> row -> numbers; slices all, exact, uncertain), "confusion" (rows true, columns
+        said), "unlisted" (cause -> answers), "several" (cases with more than one effect), "calibration"
+        (bins), "wrong" (every case whose first answer is wrong).
 
-    Raises ValueError if the two lists do not name the same cases.
+    Raises
+    ------
+    ValueError
+        The two lists do not name the same cases, each once.
     """
-    said = {str(p["case"]): p for p in predictions}
+    predicted = {str(p["case"]): p for p in predictions}
     true = {str(a["case"]): a for a in answers}
-    if said.keys() != true.keys() or len(said) != len(predictions) or len(true) != len(answers):
-        odd = sorted(said.keys() ^ true.keys())
+    if predicted.keys() != true.keys() or len(predicted) != len(predictions) or len(true) != len(answers):
+        odd = sorted(predicted.keys() ^ true.keys())
         raise ValueError(
             f"predictions and answers must name the same cases, each once; differing: {', '.join(odd) or '-'}"
         )
-    cases = pd.DataFrame([_case(said[name], true[name], groups) for name in sorted(true)])
-    several, unknown = cases[cases.kind == "several"], cases[cases.kind == "unknown"]
+    cases = pd.DataFrame([_case(predicted[name], true[name], groups) for name in sorted(true)])
+    several = cases[cases.kind == "several"]
+    unknown = cases[cases.kind == "unknown"]
     named = cases[cases.kind != "several"]
     columns = ["case", "true", "answer", "probability", "ratio", "nominal"]
     wrong = cases.loc[~cases.all_right, columns]
@@ -147,10 +173,13 @@ def scores(
 
 
 def _rows(cases: pd.DataFrame) -> dict[str, Any]:
-    single, several = cases[cases.kind == "single"], cases[cases.kind == "several"]
-    clear, faint = single[single.ratio >= CLEAR], single[single.ratio.between(*FAINT)]
+    single = cases[cases.kind == "single"]
+    several = cases[cases.kind == "several"]
+    clear = single[single.ratio >= CLEAR]
+    faint = single[single.ratio.between(*FAINT)]
     listed = pd.concat([single, several])
-    unlisted, nothing = cases[cases.kind == "unknown"], cases[cases.kind == "none"]
+    unlisted = cases[cases.kind == "unknown"]
+    nothing = cases[cases.kind == "none"]
     return {
         "top-1, ratio >= 3": _share(clear.top_1),
         "top-2, ratio >= 3": _share(clear.top_2),
@@ -179,8 +208,9 @@ def _rows(cases: pd.DataFrame) -> dict[str, Any]:
 
 
 def _share(hits: Iterable[bool]) -> dict[str, Any]:
-    found = list(hits)
-    count, right = len(found), sum(map(int, found))
+    outcomes = list(hits)
+    count = len(outcomes)
+    right = sum(map(int, outcomes))
     share = right / count if count else math.nan
     return {"share": share, "hits": right, "count": count, "interval": list(wilson(right, count))}
 
@@ -217,7 +247,9 @@ def _inside(key: str, value: float, estimate: float, interval: Sequence[float]) 
 def _standard_error(key: str, value: float, estimate: float, interval: Sequence[float]) -> float:
     """Error in standard deviations as a 95 % interval states them; infinite for an interval without width."""
     half_width = abs(_off(key, float(interval[0]), float(interval[1]))) / 2
-    return abs(_off(key, value, estimate)) / half_width * norm.ppf(0.975) if half_width else math.inf
+    if not half_width:
+        return math.inf
+    return float(abs(_off(key, value, estimate)) / half_width * norm.ppf(0.975))
 
 
 def _width_over_spread(standard_errors: Iterable[float]) -> dict[str, Any]:
@@ -230,11 +262,12 @@ def _width_over_spread(standard_errors: Iterable[float]) -> dict[str, Any]:
     return {"value": norm.ppf(0.75) / typical if typical else math.inf, "count": len(sizes)}
 
 
-def _closed(said: Document, true: Document) -> float | None:
+def _closed(document: Document, true: Document) -> float | None:
     """(before - after) / (before - oracle), held-out; before is the true rig without the effect."""
     sizes = true.get("pooled_gap", {})
-    before, oracle = sizes.get("held_out_gap_before"), sizes.get("held_out_gap_after_oracle")
-    after = said.get("gap_after")
+    before = sizes.get("held_out_gap_before")
+    oracle = sizes.get("held_out_gap_after_oracle")
+    after = document.get("gap_after")
     if before is None or oracle is None or after is None or before - oracle < _LEAST_GAP:
         return None
     return float((before - after) / (before - oracle))
@@ -246,9 +279,9 @@ def _calibration(cases: pd.DataFrame) -> list[dict[str, Any]]:
     place = (cases.probability * _BINS).astype(int).clip(upper=_BINS - 1)
     for k in range(_BINS):
         inside = cases[place == k]
-        said = _mean(inside.probability)["value"]
+        probability = _mean(inside.probability)["value"]
         right = _share(inside.first_is_right)
-        bins.append({"low": k / _BINS, "high": (k + 1) / _BINS, "probability": said, **right})
+        bins.append({"low": k / _BINS, "high": (k + 1) / _BINS, "probability": probability, **right})
     return bins
 
 

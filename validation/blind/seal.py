@@ -95,7 +95,8 @@ def open_seal(directory: Path) -> list[dict[str, Any]]:
     """
     published = read_json(directory / COMMITMENT)
     sealed = read_json(directory / SEAL_DIRECTORY / LABELS)
-    labels, salt = sealed.get("labels"), sealed.get("salt")
+    labels = sealed.get("labels")
+    salt = sealed.get("salt")
     if not isinstance(labels, list) or not isinstance(salt, str):
         raise InputError(f"{directory / SEAL_DIRECTORY / LABELS}: expected labels and salt")
     if not hmac.compare_digest(commitment(salt, labels), str(published.get("sha256"))):

@@ -97,7 +97,8 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     if name in ratios:
         return Sizable(name, *ratios[name], ratio)
     if name == "stribeck_friction":
-        share, speed = rng.uniform(0.35, 0.75), log(0.02, 0.3)
+        share = rng.uniform(0.35, 0.75)
+        speed = log(0.02, 0.3)
         levels = {"static_torque_Nm": s.torque, "coulomb_torque_Nm": share * s.torque}
         return growing(0.05, 0.8, {"stribeck_velocity_rad_s": speed}, **levels)
     if name == "actuator_saturation":
@@ -120,7 +121,8 @@ def sizable(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
         tone = {"frequency_Hz": log(0.5, 12.0), "phase_rad": phase}
         return growing(0.05, 1.0, tone, amplitude_Nm=s.torque)
     if name == "base_compliance":
-        base, damping = s.inertia * log(0.3, 3.0), rng.uniform(0.03, 0.15)
+        base = s.inertia * log(0.3, 3.0)
+        damping = rng.uniform(0.03, 0.15)
         # Size 1: the base swings at 6 Hz.
         stiffness = (s.inertia + base) * (2 * pi * 6.0) ** 2
 

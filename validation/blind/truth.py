@@ -57,7 +57,7 @@ UNLISTED = (
     "winding_heat",  # resistance grows linearly in time during a record
     "encoder_eccentricity",  # a (sin(theta + p) - sin p) added to the hub angle
 )
-# The same, in workshop cases only (the other cases stay what they were).
+# Causes that no list names, in workshop cases only (the other cases stay what they were).
 WORKSHOP_UNLISTED = (
     "gear_drag",  # -c |omega| omega on the motor side
     "asymmetric_dead_zone",  # dead zone of another width for each sign of the voltage
@@ -65,13 +65,22 @@ WORKSHOP_UNLISTED = (
     "attachment",  # a body on the hub behind a torsion spring and damper
 )
 
+# Deflection before dry friction slips: as good as rigid.
 PRE_SLIDING_RAD = 1e-5
+# Frequency of both sides of a backlash against each other on its contact. Chosen: stiff beside the modes.
 _CONTACT_HZ = 180.0
+# Modes of the link above it are left out.
 _FASTEST_MODE_HZ = 300.0
-# Substeps: enough for stability and a local error far below the noise; contacts want more.
-_FEWEST, _FEWEST_CONTACT, _MOST = 16, 128, 2000
-# A workshop's imperfections are far larger than what the fifth mode and finer steps add.
-_MODES_WORKSHOP, _FEWEST_WORKSHOP = 4, 4
+# Substeps of a sample at least: a local error far below the noise.
+_FEWEST = 16
+# With a backlash: contacts want more.
+_FEWEST_CONTACT = 128
+# At most; a stiffer machine is stepped too coarsely, and drawn again where it leaves every bound.
+_MOST = 2000
+# Modes of a workshop machine: its imperfections are far larger than what a fifth one adds.
+_MODES_WORKSHOP = 4
+# Its substeps at least, for the same reason.
+_FEWEST_WORKSHOP = 4
 
 
 class OutOfBoundsError(ValueError):
@@ -130,7 +139,8 @@ class Clean:
 
     def measured(self, noise: Real) -> Real:
         """(T, 2) with noise (T, 2) added and the tip quantised or clipped where its sensor does so."""
-        hub, tip = self.hub_angle_rad + noise[:, 0], self.tip_m + noise[:, 1]
+        hub = self.hub_angle_rad + noise[:, 0]
+        tip = self.tip_m + noise[:, 1]
         return np.column_stack([hub, self.sensed_tip(tip)])
 
     def sensed_tip(self, tip_m: Real) -> Real:
@@ -161,7 +171,8 @@ class Truth:
             return float(by_name[name][parameter]) if name in by_name else absent
 
         self.get = get
-        link, hub = rig["link"], rig["hub"]
+        link = rig["link"]
+        hub = rig["hub"]
         stiffness_ratio = get("link_stiffness", "ratio", 1.0)
         section = link["width_m"] * link["thickness_m"]
         bending = link["youngs_modulus_Pa"] * section * link["thickness_m"] ** 2 / 12 * stiffness_ratio
@@ -264,13 +275,15 @@ class Truth:
 
         Raises OutOfBoundsError where the motion leaves every bound (an unstable loop).
         """
-        get, p = self.get, self._physics
+        get = self.get
+        p = self._physics
         commanded = np.array(voltage_V, dtype=np.float64)
         static = self.amplifier
         acting = amplified(commanded, static)
         whole, late = _delay(get("input_delay", "delay_s", 0.0) + self.transport_delay_s, self.dt_s)
         if feedback is None:
-            gains, reference = np.zeros(0), np.zeros(0)
+            gains = np.zeros(0)
+            reference = np.zeros(0)
             noise = np.zeros(0)
         else:
             gains = np.array(
@@ -283,9 +296,11 @@ class Truth:
             )
             reference = np.array(feedback.reference_rad)
             noise = np.zeros(commanded.size) if hub_noise_rad is None else np.array(hub_noise_rad)
-            commanded[:], acting[:] = 0.0, 0.0
+            commanded[:] = 0.0
+            acting[:] = 0.0
         outputs = np.zeros((commanded.size, 3))
-        around, begin = self.background, before or Before()
+        around = self.background
+        begin = before or Before()
         start = np.array([begin.start_angle_rad, -begin.rows_before * self.dt_s])
         encoder = np.array([around.hub_offset_rad, around.encoder_step_rad, *self._eccentricity])
         fine = run(
@@ -342,10 +357,15 @@ class Truth:
 
     def linear(self) -> tuple[Real, Real, Real]:
         """Mass, stiffness and damping at rest, contacts closed: free angles, then modes of the link."""
-        p, link, couple = self._physics, self._link, self._link.couple
-        R, n = couple.shape[1], link.stiffness.size
+        p = self._physics
+        link = self._link
+        couple = self._link.couple
+        R = couple.shape[1]
+        n = link.stiffness.size
         size = R + n
-        M, K, C = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size))
+        M = np.zeros((size, size))
+        K = np.zeros((size, size))
+        C = np.zeros((size, size))
         shapes = self.shapes
         to_link = np.zeros((1 + n, size))
         to_link[0, :R] = couple[ROOT]
@@ -397,7 +417,7 @@ class Truth:
 
 
 def state_matrix(M: Real, K: Real, C: Real) -> Real:
-    """Of positions, then speeds."""
+    """State matrix (2 N, 2 N) of mass, stiffness and damping (N, N); positions, then speeds."""
     size = M.shape[0]
     below = [-np.linalg.solve(M, K), -np.linalg.solve(M, C)]
     return np.block([[np.zeros((size, size)), np.eye(size)], below])

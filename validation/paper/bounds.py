@@ -26,7 +26,9 @@ from validation.paper.methods import JUDGED_BAND_RAD_S, gobf_options
 from validation.paper.settings import PaperSettings
 from workflow.engine.randomness import stage_rng
 
+# Probability of an ellipse of two standard deviations in the plane: 1 - exp(-2).
 TWO_SIGMA_LEVEL = float(-np.expm1(-2.0))
+# Ways to bounds, by the names of the table.
 RECIPES = ("classical", "tangent", "tangent (poles from the data)")
 
 
@@ -70,15 +72,15 @@ def posteriors_of(record: Record) -> dict[str, ResponsePosterior]:
     ordered = identify([record], gobf_options())
     chosen = identify([record], IdentOptions())
     classical_recipe, tangent_recipe, chosen_recipe = RECIPES
-    found = {
+    posteriors = {
         classical_recipe: classical([record], ordered.model, _embedding_options(ordered)),
         tangent_recipe: tangent([record], ordered.model, _embedding_options(ordered)),
     }
     if np.array_equal(chosen.model.poles.values, ordered.model.poles.values):
-        found[chosen_recipe] = found[tangent_recipe]  # the data chose order 4 too
+        posteriors[chosen_recipe] = posteriors[tangent_recipe]  # the data chose order 4 too
     else:
-        found[chosen_recipe] = tangent([record], chosen.model, _embedding_options(chosen))
-    return found
+        posteriors[chosen_recipe] = tangent([record], chosen.model, _embedding_options(chosen))
+    return posteriors
 
 
 def _embedding_options(found: Identification) -> EmbeddingOptions:
@@ -134,14 +136,14 @@ def coverage_of(
     """Every recipe on `repeats` records of one machine, omega (F,)."""
     truth = machine.response(omega_rad_s)
     size = np.abs(truth)
-    found: dict[str, list[FrequencyUncertainty]] = {name: [] for name in RECIPES}
+    ellipses: dict[str, list[FrequencyUncertainty]] = {name: [] for name in RECIPES}
     for k in range(settings.repeats):
         report(k / settings.repeats, f"{machine.name}, record {k + 1}")
         record = machine.trial(stage_rng(settings.seed, "paper", "bounds", machine.name, str(k))).fitted
         for name, posterior in posteriors_of(record).items():
-            found[name].append(posterior.at(omega_rad_s, TWO_SIGMA_LEVEL))
+            ellipses[name].append(posterior.at(omega_rad_s, TWO_SIGMA_LEVEL))
     rows = []
-    for name, bounds in found.items():
+    for name, bounds in ellipses.items():
         mean = np.mean([bound.centre for bound in bounds], axis=0)
         rows.append(
             Coverage(

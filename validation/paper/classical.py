@@ -62,7 +62,8 @@ def prior_posterior(grid: KernelGrid) -> KernelPosterior:
     """alpha, lam of largest restricted likelihood, eta left at its prior."""
     best = np.unravel_index(int(np.argmax(grid.log_likelihood)), grid.log_likelihood.shape)
     spectrum = grid.spectra[best[0]]
-    s2, alpha = float(grid.noise_variance[best]), float(grid.alpha[best])
+    s2 = float(grid.noise_variance[best])
+    alpha = float(grid.alpha[best])
     factor = np.zeros((spectrum.length, spectrum.singular.size))
     factor[: spectrum.singular.size] = np.sqrt(s2 * alpha) * spectrum.axes  # B V (B V)^T = B B^T
     return KernelPosterior(

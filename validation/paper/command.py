@@ -36,8 +36,12 @@ from workflow.figures.svg import COMMON_STYLE, alone, drawn, style_of
 from workflow.report.rendering import embedded
 from workflow.text.templates import Row, RunSummary, TableSection, environment
 
+# The page.
 PAGE = "paper.html"
-TABLE_CSV, TABLE_JSON = "table.csv", "table.json"
+# The table of all rows for a spreadsheet.
+TABLE_CSV = "table.csv"
+# The table of all rows for a program.
+TABLE_JSON = "table.json"
 
 
 class PaperDirectory(Store):
@@ -76,7 +80,9 @@ def redraw_paper(
     no page ever stands over other figures. With `replace` the files of an earlier call are exchanged, and
     nothing else is touched. Raises InputError when `out` cannot be written or holds something.
     """
-    settings, progress, store = settings or PaperSettings(), progress or Progress(), PaperDirectory(Path(out))
+    settings = settings or PaperSettings()
+    progress = progress or Progress()
+    store = PaperDirectory(Path(out))
     if store.refuse_unless_free(replace=True) and not replace:
         raise InputError(f"{out}: not empty, a redrawn paper is there; choose another --out or --replace it")
     progress.plan(STAGES)
@@ -86,7 +92,8 @@ def redraw_paper(
         for number, draw in DRAWERS.items():
             update((number - 1) / len(DRAWERS), f"figure {number}")
             pictures[number] = draw(results)
-        findings, rows = findings_of(results), table.rows_of(results)
+        findings = findings_of(results)
+        rows = table.rows_of(results)
         headlines = headlines_of(results, findings)
         document = {
             "seed": settings.seed,

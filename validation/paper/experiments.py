@@ -56,7 +56,7 @@ class Comparison:
 
 @dataclass(frozen=True, eq=False)
 class PaperResults:
-    """All results of one run; `recipe` is GOBF by the paper's own search on the simulation record."""
+    """Results of one run; `recipe` is GOBF by the paper's own search on the simulation record."""
 
     settings: PaperSettings
     surface: SurfaceStudy
@@ -73,7 +73,7 @@ def frequencies() -> RealArray:
 
 
 def run_experiments(settings: PaperSettings, progress: Progress) -> PaperResults:
-    """All of it; deterministic for given settings."""
+    """Results of every experiment of the paper; the same settings give the same numbers."""
     with progress.stage("surface") as report:
         surface = study_surface(settings, report)
     with progress.stage("simulation") as report:
@@ -97,7 +97,7 @@ def run_experiments(settings: PaperSettings, progress: Progress) -> PaperResults
 def compare(
     machine: PaperMachine, settings: PaperSettings, report: Callable[[float, str], None]
 ) -> Comparison:
-    """All methods on the drawn record (trial 0), and their scores over all `repeats` trials."""
+    """Models of every method on the drawn record (trial 0), and their scores over `repeats` trials."""
     omega = frequencies()
     collected: dict[str, list[Score]] = {name: [] for name in (*METHODS, *BETTER_STARTS)}
     ceilings: list[float] = []
@@ -118,7 +118,7 @@ def compare(
         omega_rad_s=omega,
         truth=machine.response(omega),
         models=models,
-        scores={name: found[0] for name, found in collected.items()},
+        scores={name: of_trials[0] for name, of_trials in collected.items()},
         simulated={name: free_run(model, trial.fresh) for name, model in models.items()},
         ceiling_percent=ceilings[0],
         median_ceiling_percent=float(np.median(ceilings)),

@@ -75,7 +75,8 @@ def _methods(shown: Comparison, names: tuple[str, ...]) -> Curves:
 
 
 def _bode(shown: Comparison, curves: Curves, title: str) -> Picture:
-    omega, (reference, _) = shown.omega_rad_s, next(iter(curves.values()))
+    omega = shown.omega_rad_s
+    reference, _ = next(iter(curves.values()))
     picture, (gain, phase) = new_picture(6.0, 2, 1, sharex=True, height_ratios=[1.25, 1.0])
     for label, (response, line) in curves.items():
         gain.plot(omega, decibels(np.abs(response)), **line, label=label)
@@ -90,7 +91,8 @@ def _bode(shown: Comparison, curves: Curves, title: str) -> Picture:
 def draw_gobf_run(shown: Comparison) -> Picture:
     """Fig. 5: measured tip and GOBF's free run, and what is left."""
     record = shown.trial.fresh
-    time, measured = record.time_s, record.output[:, 0]
+    time = record.time_s
+    measured = record.output[:, 0]
     picture, (upper, lower) = new_picture(4.9, 2, 1, sharex=True, height_ratios=[1.7, 1.0])
     _overlay(upper, shown, "GOBF")
     residual = {**style.MEASURED_LINE, "lw": 0.7}
@@ -150,7 +152,8 @@ def draw_bounds(study: BoundsStudy, gain_unit: str) -> Picture:
         low, high = JUDGED_BAND_RAD_S
         gain.set_title(f"{name}: truth inside at {share:.0f} % of {low:.0f} to {high:.0f} rad/s")
     gain, phase, distance = grid[:, 0]
-    highest, span = decibels(np.abs(study.truth).max()), unwrapped_degrees(study.truth)
+    highest = decibels(np.abs(study.truth).max())
+    span = unwrapped_degrees(study.truth)
     gain.set(ylabel=f"gain [dB re 1 {gain_unit}]", ylim=(floor, highest + 10))
     phase.set(ylabel="phase [deg]", ylim=(span.min() - 200, span.max() + 100))
     phase.y.every = 180.0
@@ -188,7 +191,8 @@ def _frequency_axes(top: Panel, bottom: Panel, omega: RealArray) -> None:
 
 
 def _phase(omega: RealArray, response: ComplexArray, reference: ComplexArray) -> RealArray:
-    phase, target = unwrapped_degrees(response), unwrapped_degrees(reference)
+    phase = unwrapped_degrees(response)
+    target = unwrapped_degrees(reference)
     return phase + _turn(omega, phase, target)
 
 

@@ -42,7 +42,8 @@ class Findings:
 
 def findings_of(results: PaperResults) -> Findings:
     """One draw is luck: figures are judged by medians and majorities over the records."""
-    simulation, experiment = results.simulation, results.experiment
+    simulation = results.simulation
+    experiment = results.experiment
     ((gamma, along),) = slices(results.surface.surface, [float(results.surface.surface.second[0])])
     fresh = experiment.trial.fresh
     residual = fresh.output[:, 0] - experiment.simulated["GOBF"]
@@ -52,8 +53,10 @@ def findings_of(results: PaperResults) -> Findings:
     adequate = tuple(name for name in PEERS if fits[name] >= fits["GOBF"] - CLOSE_TO_BEST)
     bounds = results.bounds
     radius = bounds.bounds["classical"].ellipse().semi_major / np.abs(bounds.truth)
-    low = float(np.median(radius[(bounds.omega_rad_s >= 1) & (bounds.omega_rad_s <= 10)]))
-    high = float(np.median(radius[bounds.omega_rad_s >= 100]))
+    in_low_decade = (bounds.omega_rad_s >= 1) & (bounds.omega_rad_s <= 10)
+    is_high = bounds.omega_rad_s >= 100
+    low = float(np.median(radius[in_low_decade]))
+    high = float(np.median(radius[is_high]))
     usually = {"simulation": _usually(simulation), "experiment": _usually(experiment)}
     return Findings(
         agrees={

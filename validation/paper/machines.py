@@ -135,7 +135,8 @@ class LinkExperiment:
     def mode(self) -> tuple[float, float]:
         """(omega [rad/s], damping ratio) of the first mode."""
         poles = linear_arm(self.rig).poles()
-        pairs = poles[poles.imag > 0]
+        is_upper = poles.imag > 0
+        pairs = poles[is_upper]
         pole = complex(pairs[np.argmin(np.abs(pairs))])
         return abs(pole), -pole.real / abs(pole)
 
@@ -145,7 +146,8 @@ class LinkExperiment:
 
     def trial(self, rng: np.random.Generator) -> Trial:
         """Two runs of the nonlinear arm from rest, each with its own PRBS and sensor noise."""
-        records, clean = [], np.zeros(0)
+        records = []
+        clean = np.zeros(0)
         for name in ("fitted", "fresh"):
             u = prbs(_REGISTER, 1, EXPERIMENT_AMPLITUDE_V, EXPERIMENT_SAMPLES, rng)
             run = simulate(self.rig, u, self.effects, rng=rng)

@@ -63,7 +63,8 @@ def poles_of(model: LinearModel) -> ComplexArray:
 def pairs_of(model: LinearModel, dt_s: float) -> RealArray:
     """(P, 2): omega [rad/s] and damping ratio of every complex pair; negative damping is unstable."""
     poles = poles_of(model)
-    log = np.log(poles[poles.imag > 1e-9])
+    is_upper = poles.imag > 1e-9
+    log = np.log(poles[is_upper])
     return np.column_stack([np.abs(log) / dt_s, -log.real / np.abs(log)])
 
 
@@ -87,7 +88,8 @@ class Score:
 def score(machine: PaperMachine, trial: Trial, model: LinearModel, omega_rad_s: RealArray) -> Score:
     """The measures for one model; omega (F,) covers the judged band."""
     low, high = JUDGED_BAND_RAD_S
-    inside = omega_rad_s[(omega_rad_s >= low) & (omega_rad_s <= high)]
+    is_judged = (omega_rad_s >= low) & (omega_rad_s <= high)
+    inside = omega_rad_s[is_judged]
     truth = machine.response(inside)
     error = np.abs(model.frequency_response(inside) - truth) / np.abs(truth)
     pairs = pairs_of(model, trial.fitted.dt_s)

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-# Order of all models of the paper, section 4: two real poles, one pair.
+# Order of all models of the paper, section 4.
 ORDER = 4
-N_REAL, N_PAIRS = 2, 1
-DT_S = 0.005  # 200 Hz, p. 104
+# Its real poles.
+N_REAL = 2
+# Its pole pairs.
+N_PAIRS = 1
+# Sampling period: 200 Hz, p. 104.
+DT_S = 0.005
 
 
 @dataclass(frozen=True)

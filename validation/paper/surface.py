@@ -39,8 +39,11 @@ COORDINATES: tuple[typing.Literal["raw", "log"], ...] = ("raw", "log")
 # The window of the paper's Fig. 1. Its axis says gamma_1 from -1 to -0.9988: that is Wahlberg's -gamma.
 BETA_WINDOW = (0.98, 1.0)
 GAMMA_WINDOW = (0.9988, 1.0)
-# A resonance in the middle of that window, and the top of its J axis as the output's variance.
-RESONANCE_RAD_S, RESONANCE_ZETA = 28.0, 0.002
+# A resonance in the middle of that window.
+RESONANCE_RAD_S = 28.0
+# Its damping ratio.
+RESONANCE_ZETA = 0.002
+# The output's variance: the top of the figure's J axis.
 OUTPUT_VARIANCE = 0.04
 # Two ends of descents are one minimum, and a search succeeded, when their cost agrees to this fraction.
 SAME_COST = 2e-3
@@ -74,8 +77,11 @@ class SearchShares:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceStudy:
-    """All of Fig. 1. `descended` of the window's border minima, followed downhill, reach the global minimum
-    in `reached` cases; mean_square_minimum is its J."""
+    """What Fig. 1 shows.
+
+    `descended` of the window's border minima, followed downhill, reach the global minimum in `reached` cases;
+    mean_square_minimum is its J.
+    """
 
     surface: ErrorSurface
     counts: tuple[MinimaCount, ...]
@@ -175,20 +181,22 @@ def count_hits(settings: PaperSettings, report: Callable[[float, str], None]) ->
             best = min(*costs.values(), identify([record], options).rss)
             for (coordinates, variant), cost in costs.items():
                 key = problem, coordinates, variant
-                hits[key] = hits.get(key, 0) + int(cost <= best * (1 + SAME_COST))
+                hits.setdefault(key, 0)
+                if cost <= best * (1 + SAME_COST):
+                    hits[key] += 1
     return SearchShares(settings.searches, settings.evaluations, hits)
 
 
 def _costs(record: Record, options: IdentOptions, evaluations: int) -> dict[tuple[str, str], float]:
     """Cost at the end of the descent from DIRECT's best point, by coordinates and variant."""
     data = prepare([record], options.structure())
-    found: dict[tuple[str, str], float] = {}
+    costs: dict[tuple[str, str], float] = {}
     for coordinates in COORDINATES:
         for variant in VARIANTS:
             poles = direct_alone(PoleSearch(data, _searched(options, coordinates, variant)), evaluations)
             # Downhill with the same bounds for both: what differs is where the search was made.
-            found[coordinates, variant] = refine(data, poles, PoleSearch(data, options).bounds).rss
-    return found
+            costs[coordinates, variant] = refine(data, poles, PoleSearch(data, options).bounds).rss
+    return costs
 
 
 def direct_alone(search: PoleSearch[PoleProblem], evaluations: int) -> Poles:
@@ -217,17 +225,17 @@ def paper_recipe(record: Record, evaluations: int) -> GobfModel:
 def _searched(
     options: IdentOptions, coordinates: typing.Literal["raw", "log"], variant: Algorithm
 ) -> IdentOptions:
-    """The same options with another search."""
+    """Options with other coordinates and another algorithm of the search."""
     return options.model_copy(update={"coordinates": coordinates, "algorithm": variant})
 
 
 def slices(surface: ErrorSurface, gammas: Sequence[float]) -> list[tuple[float, RealArray]]:
     """(gamma, J over beta) on the grid lines nearest to the given gammas."""
-    found = []
+    slices_at = []
     for gamma in gammas:
         j = int(np.argmin(np.abs(surface.second - gamma)))
-        found.append((float(surface.second[j]), surface.mean_square[:, j]))
-    return found
+        slices_at.append((float(surface.second[j]), surface.mean_square[:, j]))
+    return slices_at
 
 
 def minima_along(values: RealArray) -> int:

@@ -39,12 +39,12 @@ class Row:
 
 
 def rows_of(results: PaperResults) -> tuple[Row, ...]:
-    """All rows, figure by figure."""
+    """Rows of the table, figure by figure."""
     rows: list[Row] = []
 
     def row(figure: int, quantity: str, value: float, unit: str = "", paper: str = "not printed") -> str:
-        said = Markup(quantity).unescape()
-        rows.append(Row(figure, said, paper, REPORTED[figure - 1].place, float(value), unit))
+        plain_text = Markup(quantity).unescape()
+        rows.append(Row(figure, plain_text, paper, REPORTED[figure - 1].place, float(value), unit))
         return ""
 
     environment(package="validation").get_template("paper_rows.j2").render(

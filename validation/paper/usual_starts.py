@@ -24,7 +24,8 @@ _ONE = np.ones(1)
 
 def usual_oe(record: Record, nb: int, nf: int) -> PolynomialModel:
     """y = (B / F) u + e by prediction-error minimisation, best of the two usual starts; delay one sample."""
-    u, y = filter_input(record.input[:, 0], 0, 1), record.output[:, 0]
+    u = filter_input(record.input[:, 0], 0, 1)
+    y = record.output[:, 0]
     starts = [arx_polynomials(u, y, nf, nb), instrumental_variables(u, y, nf, nb)]
     stable = [PolynomialModel(_ONE, b, _ONE, stabilised(a)) for a, b in starts]
     return best_end(stable, u, y).of(record, 1)

@@ -28,7 +28,8 @@ def answer_of(
 ) -> dict[str, Any]:
     """As the answer files of the labelled cases."""
     hidden = sort == "unlisted"
-    noise, background = machine.noise, asdict(machine.background)
+    noise = machine.noise
+    background = asdict(machine.background)
     hub_offset_rad = background.pop("hub_offset_rad")
     del background["encoder_step_rad"]  # which is stated as counts
     entries = []
@@ -41,8 +42,11 @@ def answer_of(
         entries.append(entry if away is None else {**entry, "tolerances_away": away})
     true_over_stated = _relative(machine.true, machine.stated, machine.tolerances)
     worst = max(abs(d) / machine.tolerances[key] for key, d in true_over_stated.items())
+    verdict = "none"
+    if sort != "none":
+        verdict = "unknown" if hidden else "effect"
     answer: dict[str, Any] = {
-        "verdict": "none" if sort == "none" else "unknown" if hidden else "effect",
+        "verdict": verdict,
         "severity": "none" if sort == "none" else "clear",
         "effects": entries,
         "unlisted": effects if hidden else [],
@@ -83,8 +87,9 @@ def answer_of(
 
 
 def _relative(true: Rig, stated: Rig, keys: dict[str, float]) -> dict[str, float]:
-    found = {}
+    """True over stated value, less one, of each key "section.name"."""
+    relative = {}
     for key in keys:
         section, name = key.split(".")
-        found[key] = rounded(true[section][name] / stated[section][name] - 1)
-    return found
+        relative[key] = rounded(true[section][name] / stated[section][name] - 1)
+    return relative

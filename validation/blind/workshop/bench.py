@@ -24,7 +24,9 @@ class Bench:
     """Runs of the true machine and what the nominal one, refitted, leaves of them."""
 
     def __init__(self, machine: Workshop, runs: tuple[Run, ...], quiet: Background) -> None:
-        self.machine, self.runs, self.quiet = machine, runs, quiet
+        self.machine = machine
+        self.runs = runs
+        self.quiet = quiet
 
     def voltages(self) -> tuple[Planned, ...]:
         """The plans with the voltages they lead to, for the scales of effects."""
@@ -57,12 +59,12 @@ class Bench:
     def logs(self, truth: Truth) -> list[Log]:
         if truth.substeps > _MOST_SUBSTEPS:
             raise OutOfBoundsError("a machine this stiff is beyond every bound")
-        found = []
+        logs = []
         for run in self.runs:
             clean = self.record(truth, run)
             output = self.output(clean, run.before.rows_before)
-            found.append(Log(clean.voltage_V, output, run.plan.role == "held_out"))
-        return found
+            logs.append(Log(clean.voltage_V, output, run.plan.role == "held_out"))
+        return logs
 
     def nominal(self, logs: list[Log]) -> Nominal:
         sensors = self.machine.stated["sensors"]

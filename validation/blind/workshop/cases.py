@@ -98,7 +98,9 @@ def make_case(plan: WorkshopPlan, rng: np.random.Generator) -> WorkshopCase:
 
     Raises ValueError if forty draws do not suffice.
     """
-    sort, sensor, first = plan.sort, plan.sensor, plan.first_effect
+    sort = plan.sort
+    sensor = plan.sensor
+    first = plan.first_effect
     for attempt in range(_TRIES):
         pool = unlisted(sensor) if sort == "unlisted" else listed(sensor)
         names = [] if sort == "none" else [first if attempt < 3 and first in pool else str(rng.choice(pool))]
@@ -175,8 +177,10 @@ def _sized(
     measure: Callable[[float], float], first: float, wanted: float, largest: float, smallest: float
 ) -> float | None:
     """Size at which a growing measure is as wanted: secant in logarithms, kept between what is known."""
-    low, high = np.log(smallest), np.log(largest)
-    at, tried = float(np.log(min(first, largest))), list[tuple[float, float]]()
+    low = np.log(smallest)
+    high = np.log(largest)
+    at = float(np.log(min(first, largest)))
+    measured = list[tuple[float, float]]()
     for _ in range(9):
         try:
             value = measure(float(np.exp(at)))
@@ -190,13 +194,13 @@ def _sized(
             return None
         slope = 1.0
         if np.isfinite(miss):
-            tried.append((at, miss))
-        if len(tried) > 1 and tried[-1][0] != tried[-2][0]:
-            slope = -(tried[-1][1] - tried[-2][1]) / (tried[-1][0] - tried[-2][0])
+            measured.append((at, miss))
+        if len(measured) > 1 and measured[-1][0] != measured[-2][0]:
+            slope = -(measured[-1][1] - measured[-2][1]) / (measured[-1][0] - measured[-2][0])
         step = np.clip(miss / np.clip(slope, 0.3, 3.0), -1.5, 2.0)
         at = at + float(step)
         if not low < at < high:
-            # An end that was not tried yet is worth a look; between two that were, the middle is.
+            # An end that was not measured yet is worth a look; between two that were, the middle is.
             end = np.log(largest) if miss > 0 else np.log(smallest)
             at = float(end if end in (low, high) else 0.5 * (low + high))
     return None
@@ -216,8 +220,12 @@ def _recorded(
 ) -> WorkshopCase | None:
     truth = Truth(machine.true, effects, machine.background)
     oracle = Truth(machine.true, effects, bench.quiet)
-    samples, clean_logs, noisy_logs, oracle_logs = [], [], [], []
-    around, dt = machine.background, truth.dt_s
+    samples = []
+    clean_logs = []
+    noisy_logs = []
+    oracle_logs = []
+    around = machine.background
+    dt = truth.dt_s
     for run in runs:
         before = run.before.rows_before
         rows = run.plan.voltage_V.size
@@ -276,6 +284,7 @@ def _lost_rows(voltage_V: Real, rng: np.random.Generator) -> list[int]:
         return []
     steps = np.abs(np.diff(voltage_V)) < 0.1 * np.std(voltage_V)
     calm = 1 + np.flatnonzero(steps[:-1] & steps[1:])
-    calm = calm[(calm >= 20) & (calm < voltage_V.size - 20)]
+    is_inside = (calm >= 20) & (calm < voltage_V.size - 20)
+    calm = calm[is_inside]
     count = min(int(rng.integers(1, 4)), calm.size)
     return sorted(rng.choice(calm, count, replace=False).tolist())

@@ -26,8 +26,14 @@ _TOLERANCES = {
     "motor.resistance_ohm": (0.03, 0.05),
     "payload.mass_kg": (0.025, 0.05),
 }
-_DELAY, _DELAY_TOLERANCE = 0.75, 0.2  # of the sampling period; relative
-_FAR, _FARTHEST = 0.1, 3.0  # how often a value may be this many tolerances off; else two
+# Transport delay over the sampling period, as stated.
+_DELAY = 0.75
+# Its relative tolerance.
+_DELAY_TOLERANCE = 0.2
+# How often a value may be `_FARTHEST` tolerances off; else two.
+_FAR = 0.1
+# Tolerances by which a value is off at most, then.
+_FARTHEST = 3.0
 # Sampling period, and rows of a record.
 _ROWS = {0.002: (2100, 3000), 0.004: (1050, 1600), 0.005: (850, 1300), 0.01: (800, 900)}
 
@@ -108,8 +114,8 @@ def draw_workshop(sensor: Sensor, rng: np.random.Generator) -> Workshop:
     tolerances["sampling.transport_delay_s"] = _DELAY_TOLERANCE
     true: Rig = {section: dict(values) for section, values in nominal.items()}
     for key, tolerance in tolerances.items():
-        most = _FARTHEST if rng.random() < _FAR else 2.0
-        off(true, key, tolerance, most, 6, rng)
+        largest_draw = _FARTHEST if rng.random() < _FAR else 2.0
+        off(true, key, tolerance, largest_draw, 6, rng)
     counts = round(log(2200, 18500))
     drag = nominal["hub"]["viscous_friction_Nms"]
     # Of a scale that the caller sets: torques of some tenths of the viscous one at a radian per second.

@@ -16,11 +16,18 @@ from scipy.signal import lfilter
 from validation.blind.rigs import Rig
 from validation.blind.truth import Background, Real, Truth, state_matrix
 
-# Weight of a sample: its noise and this share of the motion. What a model misses is no noise, and 25 samples
-# of it tell no more than one, so that tolerances still count; beyond four of them no value is believed.
-_SHARE, _PER_ONE, _FARTHEST = 0.05, 25.0, 4.0
+# Share of the motion that a sample is weighted by, beside its noise: what a model misses is no noise.
+_SHARE = 0.05
+# Samples of what a model misses that tell no more than one, so that tolerances still count.
+_PER_ONE = 25.0
+# Tolerances beyond which no value is believed.
+_FARTHEST = 4.0
+# Step of the differences by which the fit finds its slopes, in deviations of the parameters.
 _STEP = 1e-4
-_ENOUGH, _MOST = 1e-3, 15
+# Relative change of the cost at which the fit ends.
+_ENOUGH = 1e-3
+# Evaluations of the fit at most.
+_MOST = 15
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +52,10 @@ class Linear:
         b[size:] = np.linalg.solve(M, np.eye(size)[0]) * (
             motor["gear_ratio"] * motor["torque_constant_Nm_A"] / motor["resistance_ohm"]
         )
-        hub, tip = np.eye(2 * size)[0], np.append(truth.shapes[-1], np.zeros(size))
-        rows, self.direct = [hub, tip], np.zeros(2)
+        hub = np.eye(2 * size)[0]
+        tip = np.append(truth.shapes[-1], np.zeros(size))
+        rows = [hub, tip]
+        self.direct = np.zeros(2)
         if acceleration:
             # Twice differentiated: the tip's row sees positions only.
             rows[1] = (tip @ A) @ A
@@ -69,17 +78,21 @@ class Linear:
         T, n = log.output.shape
         B = log.voltage_V.size - T
         padded = np.concatenate([np.full(self.whole + 1, log.voltage_V[0]), log.voltage_V])
-        newer, older = padded[B + 1 : B + 1 + T], padded[B : B + T]
+        newer = padded[B + 1 : B + 1 + T]
+        older = padded[B : B + T]
         seen = self.seen[:n]
         forced = older[:, None] * self.direct[None, :n]
         poles = np.exp(self.values * self.dt_s)
         # Of a conjugate pair one pole is enough.
         for i in np.flatnonzero(poles.imag >= 0).tolist():
-            pole, sides = poles[i], 2 if poles[i].imag > 0 else 1
+            pole = poles[i]
+            sides = 2 if poles[i].imag > 0 else 1
             drive = self.older[i] * older + self.newer[i] * newer
             state = np.asarray(lfilter([0.0, 1.0], [1.0, -pole], drive.astype(np.complex128)))
             forced += sides * np.real(state[:, None] * seen[None, :, i])
-        powers = np.exp(np.outer(np.arange(T) * self.dt_s, self.values[half := poles.imag >= 0]))
+        # One of each pair of poles, counted twice.
+        half = poles.imag >= 0
+        powers = np.exp(np.outer(np.arange(T) * self.dt_s, self.values[half]))
         weights = np.where(self.values[half].imag > 0, 2.0, 1.0)
         free = [np.real((powers * (weights * row[half])) @ self.inverse[half]) for row in seen]
         zero = np.zeros((T, n, 1))
@@ -91,7 +104,8 @@ def _held(A: Real, b: Real, over_s: float) -> Real:
     """State after a unit input held over this time."""
     size = b.size
     block = np.zeros((size + 1, size + 1))
-    block[:size, :size], block[:size, size] = A, b
+    block[:size, :size] = A
+    block[:size, size] = b
     return np.asarray(expm(block * over_s)[:size, size])
 
 
@@ -102,7 +116,8 @@ class Nominal:
         self.keys = list(tolerances)
         self.spread = np.array([tolerances[key] for key in self.keys])
         self.prior = self.spread / np.sqrt(_PER_ONE)
-        self.logs, self.acceleration = logs, acceleration
+        self.logs = logs
+        self.acceleration = acceleration
         motion = np.array([np.std(log.output, axis=0) for log in logs])
         self.weights = 1 / np.hypot(noise, _SHARE * np.sqrt(np.mean(motion**2, axis=0)))
 
@@ -117,12 +132,12 @@ class Nominal:
     def residuals(self, rig: Rig, deviations: Real, only_fitted: bool = False) -> list[Real]:
         """(T, n) per record with its initial state and encoder offset fitted."""
         linear = Linear(self.at(rig, deviations), self.acceleration)
-        found = []
+        residuals = []
         for log in self.logs:
             if not (only_fitted and log.held_out):
                 forced, free = linear.responses(log)
-                found.append(self.without_start(log.output - forced, free))
-        return found
+                residuals.append(self.without_start(log.output - forced, free))
+        return residuals
 
     def without_start(self, gap: Real, free: Real) -> Real:
         """gap (T, n) with what initial states and offset explain taken out, in the weighted sense."""
@@ -130,8 +145,8 @@ class Nominal:
         columns = (free * w[:, :, None]).reshape(gap.size, -1)
         target = (gap * w).ravel()
         scale = np.linalg.norm(columns, axis=0) + 1e-300
-        found = np.linalg.lstsq(columns / scale, target, rcond=1e-9)[0]
-        return np.asarray((target - (columns / scale) @ found).reshape(gap.shape) / w)
+        solution = np.linalg.lstsq(columns / scale, target, rcond=1e-9)[0]
+        return np.asarray((target - (columns / scale) @ solution).reshape(gap.shape) / w)
 
     def refit(self, rig: Rig) -> list[Real]:
         """Residuals (T, n) per record with the stated values fitted to the estimation records, within what
@@ -146,9 +161,9 @@ class Nominal:
             now = stacked(at)
             return np.column_stack([(stacked(at + _STEP * e) - now) / _STEP for e in np.eye(at.size)])
 
-        most = _FARTHEST * self.spread
+        bound = _FARTHEST * self.spread
         p = least_squares(
-            stacked, zero, slopes, bounds=(-most, most), x_scale=self.spread, ftol=_ENOUGH, max_nfev=_MOST
+            stacked, zero, slopes, bounds=(-bound, bound), x_scale=self.spread, ftol=_ENOUGH, max_nfev=_MOST
         ).x
         return self.residuals(rig, p)
 
@@ -175,8 +190,8 @@ class Nominal:
             + [np.diag(1 / self.prior)]
         )
         target = np.concatenate([*((left[k] * self.weights).ravel() for k in fitted), zero])
-        found = np.linalg.lstsq(J, target, rcond=None)[0]
+        deviations = np.linalg.lstsq(J, target, rcond=None)[0]
         return [
-            gap - sum((d * s for d, s in zip(found, slope, strict=True)), np.zeros_like(gap))
+            gap - sum((d * s for d, s in zip(deviations, slope, strict=True)), np.zeros_like(gap))
             for gap, slope in zip(left, slopes, strict=True)
         ]

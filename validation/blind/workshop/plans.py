@@ -37,7 +37,9 @@ def plan_workshop(
     loop = makers.loop(controller)
     u = rng.uniform
     if closed:
-        small, large, fresh = u(0.25, 0.5), u(0.5, 1.2), u(0.4, 1.2)
+        small = u(0.25, 0.5)
+        large = u(0.5, 1.2)
+        fresh = u(0.4, 1.2)
         runs = [
             ("steps_low", "random steps of the reference, small", makers.steps(small)),
             ("steps_high", "random steps of the reference, large", makers.steps(large)),
@@ -47,7 +49,9 @@ def plan_workshop(
             ("mixed", "multisine on slews of the reference", makers.mixed()),
         ]
     else:
-        low, high, fresh = u(0.1, 0.2), u(0.3, 0.6), u(0.2, 0.4)
+        low = u(0.1, 0.2)
+        high = u(0.3, 0.6)
+        fresh = u(0.2, 0.4)
         runs = [
             ("prbs_low", "random binary voltage, low amplitude", makers.binary(low)),
             ("prbs_high", "random binary voltage, high amplitude", makers.binary(high)),
@@ -64,7 +68,10 @@ def plan_workshop(
     for k, (kind, words, shape) in enumerate(runs):
         role = "estimation" if k < 4 else "held_out"
         in_loop = closed or words.startswith("multisine on")
-        farthest = (1.2 if in_loop else 0.25) if pulled else 3.1
+        # Gravity pulls a machine in open loop away: it begins near its rest.
+        farthest = 3.1
+        if pulled:
+            farthest = 1.2 if in_loop else 0.25
         start = rounded(u(-farthest, farthest))
         plan = Planned(f"{k + 1:02d}_{kind}", kind, role, words, shape)
         if in_loop:
@@ -78,7 +85,7 @@ def plan_workshop(
 
 
 def _limited(truth: Truth, runs: list[Run], rng: np.random.Generator) -> list[Run]:
-    """With the controller's own limit, which the largest of its motions may reach."""
+    """The runs with a limit of the controller, which the largest of its motions may reach."""
     peaks = [
         np.max(np.abs(truth.record(r.plan.voltage_V, r.plan.feedback, None, r.before).voltage_V))
         for r in runs
@@ -97,7 +104,9 @@ class _Makers:
     """Shapes of voltages and references (rows before the first, and the record's)."""
 
     def __init__(self, truth: Truth, samples: tuple[int, int], rng: np.random.Generator) -> None:
-        self.truth, self.samples, self.rng = truth, samples, rng
+        self.truth = truth
+        self.samples = samples
+        self.rng = rng
         self.dt = truth.dt_s
         self.rows_before = int(_BEFORE_S / self.dt)
         M, K, _ = truth.linear()
@@ -105,7 +114,8 @@ class _Makers:
         self.first_rad_s = float(np.sqrt(np.sort(squares)[1]))
         self.inertia = float(M[0, 0])
         known = magnitudes(truth.rig)
-        self.per_volt, self.braking = known.per_volt, known.braking + known.viscous
+        self.per_volt = known.per_volt
+        self.braking = known.braking + known.viscous
 
     def length(self) -> int:
         return int(self.rng.integers(self.samples[0], self.samples[1] + 1)) + self.rows_before
@@ -120,28 +130,29 @@ class _Makers:
             derivative = 0.0
             if controller == "PD":
                 derivative = max(1.6 * bandwidth * self.inertia - self.braking, 0.05 * self.braking)
-            found = Feedback(
+            loop = Feedback(
                 step,
                 rounded(proportional),
                 rounded(derivative / self.per_volt),
                 float(np.exp(-1 / rng.uniform(2.0, 5.0))),
             )
             try:
-                angle = self.truth.record(np.zeros(step.size), found, None, Before(0.0, 0)).hub_angle_rad
+                angle = self.truth.record(np.zeros(step.size), loop, None, Before(0.0, 0)).hub_angle_rad
             except ValueError:
                 angle = np.array([0.0, 1.0])
             late = angle[-angle.size // 4 :]
             if np.std(late) < 0.015 and np.max(angle) < 0.3 * 1.7:
-                return found
+                return loop
             bandwidth *= 0.8
-        raise OutOfBoundsError("no loop found: at every bound")
+        raise OutOfBoundsError("no loop loop: at every bound")
 
     # ---- references
 
     def steps(self, span_rad: float) -> Real:
         """Levels held between 0.5 and 1.8 s, over this span."""
         T = self.length()
-        reference, k = np.zeros(T), self._first_move()
+        reference = np.zeros(T)
+        k = self._first_move()
         while k < T:
             reference[k:] = self.rng.uniform(-0.5, 0.5) * span_rad
             k += int(self.rng.uniform(0.5, 1.8) / self.dt)
@@ -155,7 +166,9 @@ class _Makers:
 
     def slews(self, span_rad: float) -> Real:
         T = self.length()
-        reference, level, k = np.zeros(T), 0.0, self._first_move()
+        reference = np.zeros(T)
+        level = 0.0
+        k = self._first_move()
         rows = np.arange(T)
         while k < T:
             target = self.rng.uniform(-0.5, 0.5) * span_rad
@@ -197,11 +210,13 @@ class _Makers:
 
     def doublets(self, span_rad: float) -> Real:
         T = self.length()
-        wave, k = np.zeros(T), self.rows_before + int(0.1 / self.dt)
+        wave = np.zeros(T)
+        k = self.rows_before + int(0.1 / self.dt)
         while k < T:
             pulse = int(self.rng.uniform(0.1, 0.25) / self.dt)
             sign = self.rng.choice([-1.0, 1.0])
-            wave[k : k + pulse], wave[k + pulse : k + 2 * pulse] = sign, -sign * self.rng.uniform(0.7, 1.0)
+            wave[k : k + pulse] = sign
+            wave[k + pulse : k + 2 * pulse] = -sign * self.rng.uniform(0.7, 1.0)
             k += 2 * pulse + int(self.rng.uniform(0.8, 1.6) / self.dt)
         return self._scaled(wave, span_rad)
 
@@ -209,7 +224,8 @@ class _Makers:
         """White noise behind a first-order low pass."""
         T = self.length()
         pole = float(np.exp(-self.dt * 2 * pi * self.rng.uniform(1.5, 4.0)))
-        wave, now = np.zeros(T), 0.0
+        wave = np.zeros(T)
+        now = 0.0
         for k, white in enumerate(self.rng.standard_normal(T).tolist()):
             now = pole * now + (1 - pole) * white
             wave[k] = now
@@ -220,7 +236,8 @@ class _Makers:
         period = T // 2
         lines = np.arange(1, period // 2)
         frequency = lines / (period * self.dt)
-        lines = lines[(frequency >= low_Hz) & (frequency <= high_Hz)]
+        is_excited = (frequency >= low_Hz) & (frequency <= high_Hz)
+        lines = lines[is_excited]
         spectrum = np.zeros(period // 2 + 1, dtype=np.complex128)
         spectrum[lines] = np.exp(2j * pi * self.rng.random(lines.size))
         wave = np.fft.irfft(spectrum, period)
@@ -236,7 +253,8 @@ class _Makers:
             size = self.rng.uniform(-0.4, 0.4) * np.max(np.abs(wave))
             wave[at : at + int(0.08 / self.dt)] = size
         unit = 1e-2 * wave / np.max(np.abs(wave))
-        link, hub = self.truth.rig["link"], self.truth.rig["hub"]
+        link = self.truth.rig["link"]
+        hub = self.truth.rig["hub"]
         clean = self.truth.record(unit)
         arm = hub["radius_m"] + link["length_m"]
         bend = float(np.max(np.abs(clean.tip_m - arm * clean.hub_angle_rad))) / link["length_m"]

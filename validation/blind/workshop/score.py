@@ -45,10 +45,25 @@ FAMILIES: Mapping[str, str] = MappingProxyType(
 def score_folders(
     labelled: Path, found: Path, groups: Mapping[str, str] = FAMILIES, *, partial: bool = False
 ) -> dict[str, Any]:
-    """As `validation.blind.scores.scores`; a case without a diagnosis is wrong, or left out if partial.
+    """Scores (`validation.blind.scores.scores`) of the diagnoses in a folder.
 
-    A nominal is exact if the rig file that was read has no tolerances. Raises InputError if there is no
-    labelled case, or a diagnosis that belongs to none.
+    A case without a diagnosis is wrong, or left out if partial. A nominal is exact if the rig file that was
+    read has no tolerances.
+
+    Parameters
+    ----------
+    labelled : Path
+        Folder of labelled cases.
+    found : Path
+        Folder of diagnoses, as `flexlink diagnose --out` leaves them.
+    groups : mapping of str to str
+        Family of each effect.
+    partial : bool
+
+    Raises
+    ------
+    InputError
+        There is no labelled case, or a diagnosis that belongs to none.
     """
     answers = {
         path.parent.name: {**tomllib.loads(path.read_text("utf-8")), "case": path.parent.name}
@@ -56,7 +71,8 @@ def score_folders(
     }
     if not answers:
         raise InputError(f"{labelled}: no labelled case is there; expected <case>/answer.toml")
-    documents, timings = {}, dict[str, Any]()
+    documents = {}
+    timings = dict[str, Any]()
     for path in sorted(found.rglob("*.json")):
         document = json.loads(path.read_text("utf-8"))
         if path.name == "timings.json":  # of the same directory
@@ -69,13 +85,16 @@ def score_folders(
     if not documents:
         raise InputError(f"{found}: no diagnosis is there; expected the --out of flexlink diagnose")
     names = [name for name in answers if name in documents or not partial]
-    said = [(documents.get(name) or failed(name, "no diagnosis")) | timings.get(name, {}) for name in names]
-    for name, document in zip(names, said, strict=True):
+    predictions = []
+    for name in names:
+        document = documents.get(name) or failed(name, "no diagnosis")
+        predictions.append(document | timings.get(name, {}))
+    for name, document in zip(names, predictions, strict=True):
         rig = labelled / name / document.get("rig_file", "rig.toml")
         if rig.is_file():
             stated = tomllib.loads(rig.read_text("utf-8"))
             answers[name]["nominal"] = "uncertain" if stated.get("tolerances") else "exact"
-    return scores(said, [answers[name] for name in names], groups)
+    return scores(predictions, [answers[name] for name in names], groups)
 
 
 def main(

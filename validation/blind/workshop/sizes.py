@@ -50,13 +50,18 @@ def partners(name: str, sensor: Sensor) -> list[str]:
 
 
 def of_size(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random.Generator) -> Sizable:
-    """As `validation.blind.sizes.sizable`, with more room, and the causes only workshops have."""
+    """An effect with everything but its size drawn, see `validation.blind.sizes.sizable`.
+
+    Sizes may be larger than there, and the causes that only workshops have are known, too.
+    """
     # Scales of the noise-sized cases refer to a tip sensor.
     sensed: Rig = {section: dict(values) for section, values in rig.items()}
     sensed["sensors"].setdefault("tip_noise_m", 0.001)
     if name not in WORKSHOP_UNLISTED:
-        found = sizable(name, sensed, plans, rng)
-        return found if name in _BOUNDED else replace(found, largest=_LARGER * found.largest)
+        effect = sizable(name, sensed, plans, rng)
+        if name in _BOUNDED:
+            return effect
+        return replace(effect, largest=_LARGER * effect.largest)
     rms = float(np.median([np.sqrt(np.mean(p.voltage_V**2)) for p in plans]))
     sign = float(rng.choice([-1.0, 1.0]))
     hub = rig["hub"]
@@ -70,7 +75,8 @@ def of_size(name: str, rig: RigTable, plans: tuple[Planned, ...], rng: np.random
     if name == "slew_limit":
         # Size 1: from zero to the usual voltage in 50 ms.
         return Sizable(name, 0.3, 20.0, lambda size: {"rate_V_s": rms / (0.05 * size)})
-    frequency, damping = rng.uniform(2.0, 6.0), rng.uniform(0.02, 0.08)
+    frequency = rng.uniform(2.0, 6.0)
+    damping = rng.uniform(0.02, 0.08)
 
     def attached(size: float) -> Table:
         inertia = size * hub["inertia_kg_m2"]
