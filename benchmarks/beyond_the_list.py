@@ -360,13 +360,13 @@ def joint_case(
 
     # A cause on no list.
     unlisted = [str(rng.choice(JOINT_UNLISTED))] if has_unlisted else []
-    beyond = [np.zeros(samples) for _ in motions]
+    unlisted_force = [np.zeros(samples) for _ in motions]
     for cause in unlisted:
         law = unlisted_torque(cause, rng)
         parts = [law(motion, log) for log, motion in enumerate(motions)]
         shares[cause] = _log_uniform(rng, *JOINT_SHARES)
         size = shares[cause] * scale / _rms(np.concatenate(parts))
-        beyond = [size * part for part in parts]
+        unlisted_force = [size * part for part in parts]
 
     background = float(rng.uniform(0, MOST_BACKGROUND)) * scale
     noise = scale * _log_uniform(rng, *JOINT_NOISE)
@@ -382,7 +382,7 @@ def joint_case(
     )
     outputs = []
     for log, motion in enumerate(motions):
-        measured = joint_torque(true, effects, motion)[:, 0] + beyond[log]
+        measured = joint_torque(true, effects, motion)[:, 0] + unlisted_force[log]
         measured = measured + background * np.sin(5 * motion[:, 0] + 0.3 * log)
         outputs.append(measured + noise * rng.standard_normal(samples))
     return _labelled("joint", name, plant, motions, outputs, listed, unlisted, shares)
@@ -657,8 +657,8 @@ def arm_case(
 
     shares = {cause: share_without(known, effects) for cause in unlisted}
     for effect in listed:
-        others = {other: effects[other] for other in listed if other != effect}
-        shares[effect] = share_without(machine, others)
+        other_effects = {other: effects[other] for other in listed if other != effect}
+        shares[effect] = share_without(machine, other_effects)
 
     noise = motion * [_log_uniform(rng, *ARM_NOISE) for _ in range(2)]
     plant = Plant(

@@ -45,7 +45,10 @@ BAND_RAD_S = (0.5, 120.0)
 PERIOD_SAMPLES = 4000
 BOUNDS = {"omega_min_rad_s": 30.0, "decay_min_per_s": 1.0}
 DRAWS = 4
-LARGE, SMALL = 0.2, 0.02  # rad rms; the records of the fit have 0.5
+# Large excitation, rad rms; the records of the fit have 0.5.
+LARGE = 0.2
+# Small excitation, rad rms.
+SMALL = 0.02
 PAYLOADS_KG = (0.0, 0.02, 0.04)
 BETWEEN_KG = (0.0, 0.01, 0.02, 0.03, 0.04)
 
@@ -58,8 +61,11 @@ def altered(config: RunConfig, *, seed: int | None = None, **effects: dict[str, 
     if seed is not None:
         document["run"] = {**document.get("run", {}), "seed": seed}
     stated = document["source"].get("effects", [])
-    kept = [effect for effect in stated if effect["name"] not in effects]
-    document["source"]["effects"] = [*kept, *({"name": name, **values} for name, values in effects.items())]
+    unchanged = [effect for effect in stated if effect["name"] not in effects]
+    document["source"]["effects"] = [
+        *unchanged,
+        *({"name": name, **values} for name, values in effects.items()),
+    ]
     return RunConfig.from_document(document, source="default arm")
 
 
@@ -76,10 +82,10 @@ def identified(config: RunConfig, folder: Path) -> UncertainPlant:
 
 def designed(plants: list[UncertainPlant], config: RunConfig) -> tuple[Controller, Certificate]:
     """Controller for all plants with the specification of the default arm."""
-    found = synthesise(
+    design = synthesise(
         plants, config.specification, config.synthesis, rng=np.random.default_rng(config.run.seed)
     )
-    return found.controller, certify(found.controller, plants, config.specification)
+    return design.controller, certify(design.controller, plants, config.specification)
 
 
 def nominal_peak(controller: Controller, plant: UncertainPlant) -> float:
@@ -117,9 +123,10 @@ def same_plant(out: Print, config: RunConfig, seeds: int, folder: Path) -> None:
         now = altered(config, seed=seed)
         plant = identified(now, folder / str(seed))
         controller, certificate = designed([plant], now)
-        nominal, bound = nominal_peak(controller, plant), certificate.plants[0].worst_peak_sensitivity
+        nominal = nominal_peak(controller, plant)
+        bound = certificate.plants[0].worst_peak_sensitivity
         large, small = (measured(controller, now, rms=rms, seed=seed) for rms in (LARGE, SMALL))
-        off = [100 * (found.peak[0] / nominal - 1) for found in (large, small)]
+        off = [100 * (measurement.peak[0] / nominal - 1) for measurement in (large, small)]
         deviations.append(off[0])
         out(
             f"   {seed}  {'yes' if certificate.certified else 'NO':>4}  {nominal:7.4f}  {bound:9.4f}  "
@@ -157,12 +164,12 @@ def several_payloads(out: Print, config: RunConfig, folder: Path) -> None:
     worst = 0.0
     for mass in BETWEEN_KG:
         name = f"{1000 * mass:g} g"
-        found = measured(controller, config, rms=LARGE, seed=7, tip_payload={"mass_kg": mass})
-        worst = max(worst, found.peak[0])
+        measurement = measured(controller, config, rms=LARGE, seed=7, tip_payload={"mass_kg": mass})
+        worst = max(worst, measurement.peak[0])
         bound = bounds.get(name)
         beside = "        -" if bound is None else f"{bound:9.4f}"
-        off = "" if bound is None else f"{100 * (found.peak[0] / bound - 1):+8.2f}"
-        out(f"   {name:>7}  {beside}  {words(found)}  {off}")
+        off = "" if bound is None else f"{100 * (measurement.peak[0] / bound - 1):+8.2f}"
+        out(f"   {name:>7}  {beside}  {words(measurement)}  {off}")
     largest = max(bounds.values())
     off = 100 * (worst / largest - 1)
     out(f"   worst case: certified {largest:.4f}, achieved {worst:.4f}: {off:+.2f} % (reach: within 5 %)")

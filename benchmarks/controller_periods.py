@@ -82,7 +82,7 @@ class Case:
 
 def cases(series: int, kinds: Sequence[str], ways: Sequence[str]) -> list[Case]:
     """One machine for each kind and way: the first seed that is logged often enough to show its mode."""
-    found = []
+    chosen = []
     for kind in kinds:
         for way in ways:
             number = WAYS.index(way)
@@ -94,15 +94,16 @@ def cases(series: int, kinds: Sequence[str], ways: Sequence[str]) -> list[Case]:
                 if drawn.kept and drawn.plant.dt_s * rows * drawn.draft.mode_hz * _ROWS_A_PERIOD < 1:
                     break
                 seed += 1
-            found.append(Case(drawn, way, rows))
-    return found
+            chosen.append(Case(drawn, way, rows))
+    return chosen
 
 
 def write(case: Case, folder: Path) -> list[Path]:
     """Logs of the case as its drive writes them, the last one for validation."""
     folder.mkdir(parents=True, exist_ok=True)
     time, reference, command, output = case.machine.draft.columns
-    limit, rows = case.machine.plant.limit, case.rows
+    limit = case.machine.plant.limit
+    rows = case.rows
     paths = []
     for log in range(len(case.machine.classes)):
         got, begin = case.machine.record(log, case.machine.rng(log))

@@ -30,10 +30,12 @@ def run(out: Print, *, controllers: int = 1000, seed: int = 47) -> None:
     stable = certified = numbers = loose = 0
     for number in range(controllers):
         case = drawn_case(rng)
-        found, told, checked, cautious = checked_case(case, rng)
-        stable, certified = stable + told[0], certified + told[1]
-        numbers, loose = numbers + checked, loose + cautious
-        false += [f"controller {number} ({case['kind']} on {case['plant']}): {line}" for line in found]
+        false_claims, stable_and_certified, checked, cautious = checked_case(case, rng)
+        stable = stable + stable_and_certified[0]
+        certified = certified + stable_and_certified[1]
+        numbers = numbers + checked
+        loose = loose + cautious
+        false += [f"controller {number} ({case['kind']} on {case['plant']}): {line}" for line in false_claims]
     for line in false:
         out(line)
     out(f"{controllers} controllers, {stable} stable, {certified} certified; {numbers} numbers checked")
@@ -77,7 +79,8 @@ def checked_case(
     from control_design.plants.weights import RationalWeight
 
     nominal = control.ss(*case["G"][:3], [[case["G"][3]]], _DT_S)
-    relative, loop = case["relative"], _loop(case["K"], case["G"], case["delay"])
+    relative = case["relative"]
+    loop = _loop(case["K"], case["G"], case["delay"])
     discs = RationalWeight(numerator=(relative or 1.0,), denominator=(1.0,))
     plant = UncertainPlant("plant", nominal, StatedDiscs(nominal, discs) if relative else None)
     a, b, c, d = case["K"]
@@ -100,27 +103,30 @@ def checked_case(
         members.append(_series(loop, _system(member)))
     claims = [(verdict.nominal_margins, members[0]), *((verdict.worst_margins, m) for m in members)]
     numbers = 1
-    for at, (margins, one) in enumerate(claims):
+    for at, (margins, claimed_loop) in enumerate(claims):
         word = "nominal" if at == 0 else "worst"
         numbers += 5
-        if not _radius(one, 1.0) < 1 + _RADIUS:
+        if not _radius(claimed_loop, 1.0) < 1 + _RADIUS:
             false.append(f"{word}: a member is unstable, modulus {margins.modulus:.6g}")
             continue
-        high, low = min(margins.gain_up, 1e6), max(margins.gain_down, 1e-6)
+        high = min(margins.gain_up, 1e6)
+        low = max(margins.gain_down, 1e-6)
         for word_2, end in (("gain_up", high * (1 - _SLACK)), ("gain_down", low * (1 + _SLACK))):
             gains = np.append(np.geomspace(1.0, end, 30), end)
-            bad = [float(g) for g in gains if not _radius(one, float(g)) < 1 + _RADIUS]
+            bad = [float(g) for g in gains if not _radius(claimed_loop, float(g)) < 1 + _RADIUS]
             if bad:
                 false.append(f"{word} {word_2} {getattr(margins, word_2):.8g}: unstable at {bad[0]:.8g}")
         turn = min(margins.phase_rad, np.pi) * (1 - _SLACK)
-        bad = [t for t in np.linspace(0, turn, 25) if not _radius(one, np.exp(-1j * t)) < 1 + _RADIUS]
+        bad = [
+            t for t in np.linspace(0, turn, 25) if not _radius(claimed_loop, np.exp(-1j * t)) < 1 + _RADIUS
+        ]
         if bad:
             false.append(f"{word} phase {margins.phase_rad:.8g}: unstable at {bad[0]:.8g}")
-        least = _delay_margin(one)
+        least = _delay_margin(claimed_loop)
         if margins.delay_s > least * (1 + _SLACK):
             false.append(f"{word} delay {margins.delay_s:.8g}, true {least:.8g}")
-        theta = _around(one)
-        back = np.abs(1 + _response(one, theta))
+        theta = _around(claimed_loop)
+        back = np.abs(1 + _response(claimed_loop, theta))
         nearest = float(np.min(back))
         if margins.modulus > nearest * (1 + _SLACK):
             false.append(f"{word} modulus {margins.modulus:.8g}, true {nearest:.8g}")
@@ -137,7 +143,9 @@ def checked_case(
         if np.any(within) and np.min(back[within]) < np.sqrt(2) * (1 - 1e-4):
             false.append(f"bandwidth {verdict.bandwidth_rad_s:.6g}: |1 + L| {np.min(back[within]):.6g}")
     up = verdict.nominal_margins.gain_up
-    careful = int(up < 1e6 and _radius(loop, up * 1.001) < 1 - _RADIUS)
+    careful = 0
+    if up < 1e6 and _radius(loop, up * 1.001) < 1 - _RADIUS:
+        careful = 1
     return false, (True, answer.certified), numbers, careful
 
 
@@ -148,8 +156,10 @@ def _system(given: Any) -> System:
 
 def _series(first: System, second: System) -> System:
     """second after first."""
-    (a, b, c, d), (e, f, g, h) = first, second
-    n, m = a.shape[0], e.shape[0]
+    (a, b, c, d) = first
+    (e, f, g, h) = second
+    n = a.shape[0]
+    m = e.shape[0]
     whole = np.block([[a, np.zeros((n, m))], [f @ c, e]])
     return whole, np.vstack([b, f * d]), np.hstack([h * c, g]), h * d
 
@@ -185,35 +195,41 @@ def _around(loop: System) -> Any:
     a, b, c, d = loop
     poles = np.concatenate([np.linalg.eigvals(a), np.linalg.eigvals(a - b @ c / (1 + d))])
     parts = [np.geomspace(1e-7, np.pi, 3000)]
-    for p in poles[np.abs(poles) > 0.5]:
+    is_slow = np.abs(poles) > 0.5
+    for p in poles[is_slow]:
         away = np.geomspace(max(abs(1 - abs(p)), 1e-9) / 30, 0.3, 120)
         parts += [abs(np.angle(p)) + away, abs(np.angle(p)) - away]
     theta = np.unique(np.concatenate(parts))
-    return theta[(theta > 1e-7) & (theta <= np.pi)]
+    is_inside = (theta > 1e-7) & (theta <= np.pi)
+    return theta[is_inside]
 
 
 def _delay_margin(loop: System) -> float:
     """Smallest delay at which 1 + L e^{-j omega delay} vanishes, s: unit-circle zeros of L(z) L(1/z) - 1."""
     a, b, c, d = loop
-    n, one = a.shape[0], np.eye(a.shape[0])
+    n = a.shape[0]
+    identity = np.eye(a.shape[0])
     # z w = ... : x+ = A x + B v, w = z (A w + B u), v = C w + D u, and C x + D v = u.
     left = np.block([
         [a, b @ c, d * b],
-        [np.zeros((n, n)), one, np.zeros((n, 1))],
+        [np.zeros((n, n)), identity, np.zeros((n, 1))],
         [c, d * c, np.array([[d * d - 1.0]])],
     ])  # fmt: skip
     right = np.block([
-        [one, np.zeros((n, n + 1))],
+        [identity, np.zeros((n, n + 1))],
         [np.zeros((n, n)), a, b],
         [np.zeros((1, 2 * n + 1))],
     ])  # fmt: skip
     z = scipy.linalg.eigvals(left, right)
-    z = z[np.isfinite(z) & (np.abs(np.abs(z) - 1) < 1e-7) & (z.imag > 1e-7)]
+    on_circle = np.isfinite(z) & (np.abs(np.abs(z) - 1) < 1e-7) & (z.imag > 1e-7)
+    z = z[on_circle]
     theta = np.angle(z)
     if not theta.size:
         return float("inf")
     value = _response(loop, theta)
-    theta, value = theta[np.abs(np.abs(value) - 1) < 1e-5], value[np.abs(np.abs(value) - 1) < 1e-5]
+    crosses = np.abs(np.abs(value) - 1) < 1e-5
+    theta = theta[crosses]
+    value = value[np.abs(np.abs(value) - 1) < 1e-5]
     return float(np.min(np.mod(np.angle(-value), 2 * np.pi) / theta, initial=np.inf) * _DT_S)
 
 
@@ -249,9 +265,11 @@ def _pair(radius: float, angle: float) -> list[complex]:
 
 
 def _plants(rng: np.random.Generator) -> dict[str, System]:
-    u, light = rng.uniform, float(1 - 10 ** rng.uniform(-4, -1))
+    u = rng.uniform
+    light = float(1 - 10 ** rng.uniform(-4, -1))
     angle = float(u(0.1, 2.5))
-    mode, zero = _pair(light, angle), _pair(light, angle * u(0.6, 1.4))
+    mode = _pair(light, angle)
+    zero = _pair(light, angle * u(0.6, 1.4))
     slow = 1 - 10 ** u(-5, -0.5)
     return {
         "lag": _tf([], [slow], 1 - slow),

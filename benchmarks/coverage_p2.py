@@ -44,7 +44,11 @@ class Case:
     coloured_noise: bool = False
 
 
-FIXED, FIVE = "fixed plant, N = {}, {} dB", "five modes (also 48 and 75 Hz), N = {}, {} dB"
+# Titles of the cases.
+FIXED = "fixed plant, N = {}, {} dB"
+# Of a plant with five modes.
+FIVE = "five modes (also 48 and 75 Hz), N = {}, {} dB"
+# Of plants that are drawn.
 RANDOM = "random plants, N = {}, {} dB"
 CASES = {
     "main": Case(FIXED.format(2000, 35), Setting(), (92, 98), worst=88, is_main=True),
@@ -108,15 +112,16 @@ def judge(
     ellipses = posterior.at(OMEGA, LEVEL)
     axes = ellipses.ellipse()
     distance = ellipses.normalised_distance(truth)
-    error, size = np.abs(truth - ellipses.centre), np.abs(truth)
+    error = np.abs(truth - ellipses.centre)
+    size = np.abs(truth)
     mean = np.sqrt(axes.semi_major * axes.semi_minor)
     ratios = np.stack([mean / error, 1 / distance, axes.semi_major / error])
-    found = Outcome(distance <= 1, axes.semi_major / size, mean / size, ratios, cpu_s)
+    outcome = Outcome(distance <= 1, axes.semi_major / size, mean / size, ratios, cpu_s)
     if seed is None:
-        return found
+        return outcome
     level = posterior.joint_level(OMEGA, LEVEL, np.random.default_rng(seed), n_draws=1000)
     everywhere = bool(np.all(posterior.at(OMEGA, level).contains(truth)))
-    return replace(found, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
+    return replace(outcome, joint=everywhere, joint_radius2=float(-2 * np.log1p(-level)))
 
 
 def one_run(name: str, seed: int) -> RunOutcome:
@@ -127,16 +132,16 @@ def one_run(name: str, seed: int) -> RunOutcome:
     model, cpu_identify_s = timed(lambda: identify([run.record]).model)
     options = EmbeddingOptions(coloured_noise=case.coloured_noise)
     posterior, cpu_s = timed(lambda: tangent([run.record], model, options))
-    found = {"tangent": judge(posterior, truth, cpu_s, seed)}
+    by_method = {"tangent": judge(posterior, truth, cpu_s, seed)}
     if case.coverage is not None:
-        alone = options.model_copy(update={"prior_missed_mode": 0.0})
-        other, cpu_s = timed(lambda: tangent([run.record], model, alone))
-        found["no missed mode"] = judge(other, truth, cpu_s, seed)
+        without_missed_mode = options.model_copy(update={"prior_missed_mode": 0.0})
+        other, cpu_s = timed(lambda: tangent([run.record], model, without_missed_mode))
+        by_method["no missed mode"] = judge(other, truth, cpu_s, seed)
     if case.is_main:
         low = identify([run.record], IdentOptions(n_real=2, n_pairs=1)).model
-        found["classical, n = 4"] = judge(classical([run.record], low), truth)
-        found["covariance, n = 4"] = judge(covariance_alone(run, low), truth)
-    return RunOutcome(model.poles.pairs.size, cpu_identify_s, found)
+        by_method["classical, n = 4"] = judge(classical([run.record], low), truth)
+        by_method["covariance, n = 4"] = judge(covariance_alone(run, low), truth)
+    return RunOutcome(model.poles.pairs.size, cpu_identify_s, by_method)
 
 
 def per_band(values: np.ndarray, statistic: Callable[[np.ndarray], float]) -> list[float]:
@@ -166,39 +171,47 @@ def report(out: Print, case: Case, runs: Sequence[RunOutcome]) -> None:
         "    " + " " * 22 + "".join(f"{f'{low:g}-{min(high, 300):g}':>8}" for low, high in BANDS) + "   rad/s"
     )
     for method in runs[0].by_method:
-        found = [run.by_method[method] for run in runs]
-        inside = np.array([item.inside for item in found])
+        outcomes = [run.by_method[method] for run in runs]
+        inside = np.array([item.inside for item in outcomes])
         coverage = per_band(100 * inside, np.mean)
-        own, bounds, tail = method == "tangent", case.coverage, ""
-        if own and bounds is not None:
+        is_tangent = method == "tangent"
+        bounds = case.coverage
+        tail = ""
+        if is_tangent and bounds is not None:
             ok = all(bounds[0] <= value <= bounds[1] for value in coverage)
             tail = f"reach {bounds[0]:g}-{bounds[1]:g} in every band: {verdict(ok)}"
         out(f"  {method}")
         out(row("coverage", coverage, tail))
-        radii = per_band(100 * np.array([item.major for item in found]), np.median)
-        if case.is_main and own:
+        radii = per_band(100 * np.array([item.major for item in outcomes]), np.median)
+        if case.is_main and is_tangent:
             wanted = [RADIUS_REACH.get(band) for band in BANDS]
             ok = all(limit is None or r <= limit for limit, r in zip(wanted, radii, strict=True))
             out(row("radius", radii, f"reach below: {verdict(ok)}"))
             out("    " + f"{'  at most':<22}" + "".join(f"{'' if w is None else w:>8}" for w in wanted))
         else:
             out(row("radius", radii))
-        out(row("mean radius", per_band(100 * np.array([item.mean for item in found]), np.median)))
-        overall, worst = 100 * float(inside.mean()), 100 * float(inside.mean(axis=0).min())
-        ratios = np.median(np.array([item.ratios for item in found]), axis=(0, 2))
-        asked = f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})" if case.is_main and own else ""
+        out(row("mean radius", per_band(100 * np.array([item.mean for item in outcomes]), np.median)))
+        overall = 100 * float(inside.mean())
+        worst = 100 * float(inside.mean(axis=0).min())
+        ratios = np.median(np.array([item.ratios for item in outcomes]), axis=(0, 2))
+        asked = (
+            f" (reach 1.8-2.4: {verdict(bool(1.8 <= ratios[0] <= 2.4))})"
+            if case.is_main and is_tangent
+            else ""
+        )
         out(
-            f"    overall {overall:.1f}{at_least(overall, case.overall if own else None)}"
-            f"; worst {worst:.1f}{at_least(worst, case.worst if own else None)}; ratio {ratios[0]:.2f}{asked}"
+            f"    overall {overall:.1f}{at_least(overall, case.overall if is_tangent else None)}"
+            f"; worst {worst:.1f}{at_least(worst, case.worst if is_tangent else None)}; "
+            f"ratio {ratios[0]:.2f}{asked}"
             f", along the error {ratios[1]:.2f}, semi-major {ratios[2]:.2f}"
         )
         text = f"    all inside {100 * inside.all(axis=1).mean():.0f}"
         if method in ("tangent", "no missed mode"):
             text += (
-                f"; simultaneous bands {100 * np.mean([item.joint for item in found]):.0f}"
-                f" (squared radius {np.median([item.joint_radius2 for item in found]):.1f})"
+                f"; simultaneous bands {100 * np.mean([item.joint for item in outcomes]):.0f}"
+                f" (squared radius {np.median([item.joint_radius2 for item in outcomes]):.1f})"
                 f"; cpu {1e3 * np.median([run.cpu_identify_s for run in runs]):.0f}"
-                f" + {1e3 * np.median([item.cpu_s for item in found]):.0f} ms"
+                f" + {1e3 * np.median([item.cpu_s for item in outcomes]):.0f} ms"
             )
         out(text)
 
@@ -211,7 +224,8 @@ def run(
     first_seed: int = 0,
     processes: int = 2,
 ) -> None:
-    if unknown := sorted(set(cases) - set(CASES)):
+    unknown = sorted(set(cases) - set(CASES))
+    if unknown:
         sys.exit(f"unknown cases {', '.join(unknown)}; choose from {', '.join(CASES)}")
     # Processes started afresh: forking after the numerical libraries have started their threads can hang.
     context = multiprocessing.get_context("spawn")

@@ -25,11 +25,21 @@ from diagnosis.machine.machine_protocol import Role
 
 DT_S = 1e-3
 FORCE_PER_VOLT_N = 35.15065188
-POSITION_GAIN, VELOCITY_GAIN, LIMIT_V = 160.18, 243.45, 10.0
+# Gain of the position controller, 1/s.
+POSITION_GAIN = 160.18
+# Gain of the velocity controller, V s/m.
+VELOCITY_GAIN = 243.45
+# Largest command of the drive.
+LIMIT_V = 10.0
 PUBLISHED = {"mass_kg": 95.1089, "viscous_Ns_m": 203.5034, "coulomb_N": 20.3935, "offset_N": -3.1648}
-# The reference repeats exactly after this many samples; records start where it moves at constant speed.
-PERIOD, FIRST = 6240, 200
-_RUN_IN, _SUBSTEPS = 400, 4
+# The reference repeats exactly after this many samples.
+PERIOD = 6240
+# Records start at this sample, where it moves at constant speed.
+FIRST = 200
+# Samples that the loop is run before the first one.
+_RUN_IN = 400
+# Steps of the simulation a sample.
+_SUBSTEPS = 4
 
 
 def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
@@ -40,7 +50,7 @@ def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
     """
     P = EffectParameter
     friction = SHARE, P("velocity_m_s", 1e-3, 0.1)
-    found = [
+    listed = [
         PlantEffect("coulomb_friction", (P("force_N", 1e-2, 150.0),), dependence="continuous"),
         PlantEffect("constant_offset", (P("force_N", 1e-2, 100.0),), signed=True, dependence="continuous"),
         PlantEffect("stribeck_friction", (P("static_N", 1e-2, 300.0), *friction), dependence="continuous"),
@@ -52,18 +62,18 @@ def effects(loop: bool, refined: bool) -> tuple[PlantEffect, ...]:
         PlantEffect("actuator_dead_zone", (P("width_V", 1e-3, 3.0),), dependence="continuous"),
     ]
     if loop:
-        found += [
+        listed += [
             PlantEffect(
                 "actuator_saturation", (P("limit_V", 1.0, LIMIT_V),), grows=False, dependence="continuous"
             ),
             PlantEffect("encoder_quantisation", (P("step_m", 1e-7, 1e-4),), dependence="non-smooth"),
         ]
     if refined:
-        found += [
+        listed += [
             PlantEffect("viscous_asymmetry", (P("coefficient_Ns_m", 1.0, 1000.0),), signed=True),
             PlantEffect("quadratic_friction", (P("coefficient_Ns2_m2", 1.0, 2e4),), signed=True),
         ]
-    return tuple(found)
+    return tuple(listed)
 
 
 _EVERY = effects(loop=True, refined=True)
@@ -95,16 +105,19 @@ def _run(reference: Real, p: np.record) -> Real:
     seen1 = q - v * DT_S
     seen2 = q - 2 * v * DT_S
     pull = 0.0
-    limit, encoder = p.actuator_saturation_limit_V, p.encoder_quantisation_step_m
+    limit = p.actuator_saturation_limit_V
+    encoder = p.encoder_quantisation_step_m
     dead_zone = p.actuator_dead_zone_width_V * FORCE_PER_VOLT_N
     # Dry friction adds up when two laws of it are tried together.
     coulomb = p.coulomb_friction_force_N + p.stribeck_friction_coulomb_share * p.stribeck_friction_static_N
     static = p.coulomb_friction_force_N + p.stribeck_friction_static_N
-    asymmetry, quadratic = p.viscous_asymmetry_coefficient_Ns_m, p.quadratic_friction_coefficient_Ns2_m2
+    asymmetry = p.viscous_asymmetry_coefficient_Ns_m
+    quadratic = p.quadratic_friction_coefficient_Ns2_m2
     for k in range(T):
         seen = q if encoder <= 0.0 else encoder * np.round(q / encoder)
         volts = VELOCITY_GAIN * (POSITION_GAIN * (reference[k] - seen) - (seen - seen2) / (2 * DT_S))
-        seen2, seen1 = seen1, seen
+        seen2 = seen1
+        seen1 = seen
         volts = min(max(volts, -limit), limit)
         force[k] = FORCE_PER_VOLT_N * volts
         late = (1 + p.actuator_gain_relative_error) * late_value(
@@ -199,14 +212,16 @@ def case(
     data = record(folder)
     if held_out == "passes":
         runs = passes(data)
-        fitted, judged = runs[::2], runs[1::2]
+        fitted = runs[::2]
+        judged = runs[1::2]
     else:
-        fitted, judged = _strokes(data, (2900, 4000), (5900, 7140)), _strokes(data, (900, 2900), (4000, 5900))
+        fitted = _strokes(data, (2900, 4000), (5900, 7140))
+        judged = _strokes(data, (900, 2900), (4000, 5900))
     stated = viscous_refit([data[piece] for piece in fitted])
     columns = [1, 2, 3] if simulated == "forces" else [0]
     # Measured motion brings noise of its own to the forces it is said to take.
-    rest = data[:, 4] - forces(stated, {}, data[:, 1:4])[:, 0] if simulated == "forces" else data[:, 4]
-    noise = scatter(rest)
+    unexplained = data[:, 4] - forces(stated, {}, data[:, 1:4])[:, 0] if simulated == "forces" else data[:, 4]
+    noise = scatter(unexplained)
     plant = Plant(
         forces if simulated == "forces" else simulate,
         stated,

@@ -196,18 +196,18 @@ def told_by(
     timer.start()
     assert process.stderr is not None
     line = ""
-    found = False
-    for said in process.stderr:
-        line = said.strip() or line
-        found = doubted and re.search(words, line) is not None
-        if found:
+    is_told = False
+    for printed in process.stderr:
+        line = printed.strip() or line
+        is_told = doubted and re.search(words, line) is not None
+        if is_told:
             process.kill()
             break
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     timer.cancel()
     process.stderr.close()
-    code = None if found else process.returncode
+    code = None if is_told else process.returncode
     return Told(code, usage.ru_utime + usage.ru_stime, line.removeprefix("flexlink: "))
 
 
@@ -264,9 +264,13 @@ def controllers(folder: Path) -> dict[str, tuple[list[str], str]]:
         spec = ["--spec", str(folder / "specification.toml")]
         return ["certify", str(folder / plant), *spec, "--controller", str(folder / controller)]
 
-    found = {f"controller {name}": (given("plant.json", name), said) for name, said in words.items()}
-    as_plants = {name: said for name, said in words.items() if name not in ("slow.json", "gains.txt")}
-    return found | {f"plant {name}": (given(name, "law.json"), said) for name, said in as_plants.items()}
+    of_controllers = {
+        f"controller {name}": (given("plant.json", name), expected) for name, expected in words.items()
+    }
+    as_plants = {name: expected for name, expected in words.items() if name not in ("slow.json", "gains.txt")}
+    return of_controllers | {
+        f"plant {name}": (given(name, "law.json"), expected) for name, expected in as_plants.items()
+    }
 
 
 def run(out: Print, *, seed: int = 0, most_s: float = 2.0, good: int = 3) -> None:
@@ -274,13 +278,13 @@ def run(out: Print, *, seed: int = 0, most_s: float = 2.0, good: int = 3) -> Non
     counted: list[tuple[bool, float]] = []
 
     def judge(name: str, command: str, call: Callable[[], Told], words: str, code: int | None) -> None:
-        told = call()
-        right = told.code == code and re.search(words, told.line, re.IGNORECASE) is not None
-        counted.append((right and told.cpu_s <= most_s, told.cpu_s))
-        ended = "goes on" if told.code is None else f"exit {told.code}"
+        answer = call()
+        right = answer.code == code and re.search(words, answer.line, re.IGNORECASE) is not None
+        counted.append((right and answer.cpu_s <= most_s, answer.cpu_s))
+        ended = "goes on" if answer.code is None else f"exit {answer.code}"
         mark = "  " if counted[-1][0] else "!!"
-        line = re.sub(r"\S*/(?=[\w.]+)", "", told.line)
-        out(f"{mark} {name:28} {command:9} {told.cpu_s:5.2f} s  {ended:8} {line}")
+        line = re.sub(r"\S*/(?=[\w.]+)", "", answer.line)
+        out(f"{mark} {name:28} {command:9} {answer.cpu_s:5.2f} s  {ended:8} {line}")
 
     with tempfile.TemporaryDirectory() as place:
         for number, (name, case) in enumerate(hopeless(seed).items()):
@@ -315,10 +319,10 @@ def run(out: Print, *, seed: int = 0, most_s: float = 2.0, good: int = 3) -> Non
                 folder.mkdir()
                 columns = simulated(seed + 10 + number, closed=closed)
                 for command, arguments in arguments_by_command(folder, columns).items():
-                    told = told_by(arguments, longest_cpu_s=SEARCHED_S)
-                    refused += told.code == 2
-                    if told.code == 2:
-                        out(f"!! good log {number}, closed = {closed}, {command}: {told.line}")
+                    answer = told_by(arguments, longest_cpu_s=SEARCHED_S)
+                    refused += answer.code == 2
+                    if answer.code == 2:
+                        out(f"!! good log {number}, closed = {closed}, {command}: {answer.line}")
         out(f"{refused} of {8 * good} commands refuse good logs")
 
 

@@ -58,7 +58,8 @@ def write_fleet(folder: Path, count: int, samples: int = 300) -> list[Path]:
             run = space["simulate"](space["PARAMETERS"], {"dry_friction": {"force_N": size}}, force[:, None])  # type: ignore[operator]
             measured = run[:, 0] + 1e-4 * rng.standard_normal(force.size)
             rows = np.column_stack([DT_S * np.arange(force.size), force, measured])
-            path, header = folder / f"{name}{log}.csv", "time_s,force_N,position_m"
+            path = folder / f"{name}{log}.csv"
+            header = "time_s,force_N,position_m"
             np.savetxt(path, rows, delimiter=",", header=header, comments="", fmt="%.9g")
         (folder / f"{name}.toml").write_text(
             f'python = "carriage.py"\nlog = ["{name}a.csv", "{name}b.csv"]\ncase = "{name}"\n'
@@ -91,9 +92,10 @@ def diagnose(
         "--quiet",
         *options,
     ]
-    started, peak = time.monotonic(), 0.0
-    with open(f"{out}.txt", "wb") as told:
-        process = subprocess.Popen(command, stdout=told, stderr=subprocess.STDOUT)
+    started = time.monotonic()
+    peak = 0.0
+    with open(f"{out}.txt", "wb") as printed:
+        process = subprocess.Popen(command, stdout=printed, stderr=subprocess.STDOUT)
         while process.poll() is None:
             peak = max(peak, _peak_MB(process))
             if kill is not None and len(list(out.glob("unit-*.json"))) * 3 >= len(cases):
@@ -111,10 +113,10 @@ def main() -> None:
     options.add_argument(
         "--kill", action="store_true", help="on a cluster beside local processes, one killed"
     )
-    given = options.parse_args()
-    cases = write_fleet(given.out / "cases", given.cases)
-    diagnose(cases, given.out / "near", "--jobs", "2")
-    if not given.kill:
+    parsed = options.parse_args()
+    cases = write_fleet(parsed.out / "cases", parsed.cases)
+    diagnose(cases, parsed.out / "near", "--jobs", "2")
+    if not parsed.kill:
         return
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -124,17 +126,18 @@ def main() -> None:
     scheduler = [*dask, "scheduler", "--host", address, "--no-dashboard"]
     worker = [*dask, "worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
     begun = [
-        subprocess.Popen(call, cwd=given.out, env=os.environ, **quiet) for call in (scheduler, worker, worker)
+        subprocess.Popen(call, cwd=parsed.out, env=os.environ, **quiet)
+        for call in (scheduler, worker, worker)
     ]  # type: ignore[call-overload]
     try:
-        diagnose(cases, given.out / "far", "--scheduler", address, kill=begun[-1])
+        diagnose(cases, parsed.out / "far", "--scheduler", address, kill=begun[-1])
     finally:
         for process in begun:
             process.kill()
     near, far = (
         {
             p.name: p.read_bytes()
-            for p in (given.out / where).iterdir()
+            for p in (parsed.out / where).iterdir()
             if p.name not in ("timings.json", "lock")
         }
         for where in ("near", "far")

@@ -47,13 +47,17 @@ FRICTIONS_NM = (0.005, 0.02, 0.1)
 SIZES_RAD = (0.003, 0.01, 0.03, 0.1, 0.2)
 STEPS_RAD = (0.02, 0.1, 0.3)
 DRAWS = 16
-SINE_RAD, SINE_RAD_S = 0.05, 0.1
+# Amplitude of the slow sine.
+SINE_RAD = 0.05
+# Its frequency.
+SINE_RAD_S = 0.1
 
 
 def sticking_on_arm(controller: Controller, source: SimulatedSource, samples: int) -> float:
     """By bisection, noise and encoder off."""
     arm = SampledArm(rig_of(source), parse_effects(source.effects), None)
-    low, high = 1e-5, 1.0
+    low = 1e-5
+    high = 1.0
     while high > 1.01 * low:
         middle = float(np.sqrt(low * high))
         moved = simulate(controller, arm, np.full(samples, middle)).measured
@@ -82,8 +86,8 @@ def one_arm(
     key = [seed, FRICTIONS_NM.index(torque_Nm)]
     records = estimation_records(source, seed)
     at_hub = [record.siso(channel.input, channel.output) for record in records]
-    found = fit_friction(at_hub, channel.identification)
-    loops = drawn(controller, found, np.random.default_rng([*key, 1]), DRAWS)
+    friction = fit_friction(at_hub, channel.identification)
+    loops = drawn(controller, friction, np.random.default_rng([*key, 1]), DRAWS)
     peaks = np.empty((len(SIZES_RAD), 3))
     for k, size in enumerate(SIZES_RAD):
         excitation = plan.excitation(size / plan.rms)
@@ -92,14 +96,14 @@ def one_arm(
         peaks[k, 0] = measure_sensitivity(controller, arm, phases(), **excitation).peak[0]
         peaks[k, 1:] = predicted_peak(loops, phases, np.random.default_rng([*key, 5, k]), **excitation)
     samples = settling_samples(float(np.max(np.abs(controller.poles))), 200, 6000)
-    fitted = FrictionLoop.of(controller, found)
+    fitted = FrictionLoop.of(controller, friction)
     spread = [loop.sticking_step(samples) for loop in loops]
     stuck = sticking_on_arm(controller, source, samples)
     left = []
     for size in STEPS_RAD:
         arm = encoded_arm(source, (), np.random.default_rng([seed, 6]))
         left.append(abs(size - float(np.mean(simulate(controller, arm, np.full(600, size)).measured[-60:]))))
-    law = replace(controller, feedforward=friction_feedforward(controller, found))
+    law = replace(controller, feedforward=friction_feedforward(controller, friction))
     loose = source.model_copy(update={"effects": ()})
     pairs = ((controller, source), (law, source), (controller, loose))
     errors = [sine_errors(each, arm, seed) for each, arm in pairs]
@@ -116,18 +120,22 @@ def run(out: Print, *, seeds: int = 14, first: int = 0) -> None:
     plan = plan_sensitivity(controller, plant, rms_of([record.input for record in records]), 300)
     bound = certificate.plants[0].worst_peak_sensitivity
     out(f"no integrator: linear peak of |S| {plan.nominal_peak:.4f}, certified {bound:.4f}")
-    held, counted, claims, kept = 0, 0, 0, 0
+    held = 0
+    counted = 0
+    claims = 0
+    claims_kept = 0
     for torque_Nm in FRICTIONS_NM:
         arms = [one_arm(controller, plan, torque_Nm, first + k) for k in range(seeds)]
         peaks = np.array([arm[0] for arm in arms])
         sticking = np.array([arm[1] for arm in arms])
         inside = (peaks[:, :, 1] <= peaks[:, :, 0]) & (peaks[:, :, 0] <= peaks[:, :, 2])
         moves = np.array(SIZES_RAD) >= sticking[:, :1]
-        held, counted = held + int(np.sum(inside & moves)), counted + int(np.sum(moves))
+        held = held + int(np.sum(inside & moves))
+        counted = counted + int(np.sum(moves))
         allowed = (1 + TOLERANCE_PERCENT / 100) * bound
         claimed = np.cumprod(peaks[:, ::-1, 2] <= allowed, axis=1)[:, ::-1] == 1
         claims += int(np.sum(claimed))
-        kept += int(np.sum(claimed & (peaks[:, :, 0] <= allowed)))
+        claims_kept += int(np.sum(claimed & (peaks[:, :, 0] <= allowed)))
         out(f"\nfriction {torque_Nm:g} N m, {seeds} arms")
         out("  reference, rad rms      " + " ".join(f"{size:>15g}" for size in SIZES_RAD))
         middle = np.median(peaks, axis=0)
@@ -143,8 +151,11 @@ def run(out: Print, *, seeds: int = 14, first: int = 0) -> None:
             f"  sticking step: predicted {np.median(sticking[:, 0]):.3g} rad, found {sticking[0, 3]:.3g}; "
             f"predicted over found {ratio.min():.3f} to {ratio.max():.3f}"
         )
-        rest = [arm[2] for arm in arms]
-        out(f"  error at rest over its bound: median {np.median(rest):.2f}, largest {max(rest):.2f}")
+        errors_at_rest = [arm[2] for arm in arms]
+        out(
+            f"  error at rest over its bound: median {np.median(errors_at_rest):.2f}, "
+            f"largest {max(errors_at_rest):.2f}"
+        )
         sine = 1e3 * np.array([arm[3] for arm in arms])
         for k, of in enumerate(("of the hub", "as measured")):
             without, with_it, loose = np.median(sine[:, :, k], axis=0)
@@ -155,7 +166,7 @@ def run(out: Print, *, seeds: int = 14, first: int = 0) -> None:
             )
     out(
         f"\ninside, sizes from the sticking step on: {held} of {counted} = {100 * held / counted:.1f} % "
-        f"(reach: 95 %); at most 5 % above the certified peak, where claimed: {kept} of {claims}"
+        f"(reach: 95 %); at most 5 % above the certified peak, where claimed: {claims_kept} of {claims}"
     )
 
 

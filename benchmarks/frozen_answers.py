@@ -36,8 +36,10 @@ from benchmarks.frozen_questions import QUESTIONS, Answer, Question
 from benchmarks.harness import RESULTS, Print, main
 from diagnosis.search import moves
 
-# CPU seconds of one question, after which it has no answer; seconds until a process that hangs is given up.
-LONGEST_S, HANGS_S = 180.0, 1800.0
+# CPU seconds of one question, after which it has no answer.
+LONGEST_S = 180.0
+# Seconds until a process that hangs is given up.
+HANGS_S = 1800.0
 # CPU seconds assumed of a question that was never stored.
 _GUESS_S = 8.0
 # A stored duration stays where it is until it is off by this factor, so that storing changes answers only.
@@ -76,7 +78,8 @@ class Moved(NamedTuple):
 
     def __str__(self) -> str:
         shown = (
-            json.dumps(one, ensure_ascii=False) if one is not _NOTHING else "(nothing)" for one in self[2:4]
+            json.dumps(value, ensure_ascii=False) if value is not _NOTHING else "(nothing)"
+            for value in self[2:4]
         )
         return f"{self.kind}: {self.name}: " + " -> ".join(shown)
 
@@ -86,25 +89,27 @@ _NOTHING = object()
 
 def moved(before: Answer, now: Answer) -> list[Moved]:
     """What is not as it was stored, within its tolerance or not."""
-    found = []
+    moves = []
     for kind in KINDS:
-        old, new = before.get(kind, {}), now.get(kind, {})
+        old = before.get(kind, {})
+        new = now.get(kind, {})
         for name in {**old, **new}:
             absent = 0.0 if kind == "probabilities" else _NOTHING
             pair = old.get(name, absent), new.get(name, absent)
-            if (share := _share(KINDS[kind], *pair, of_lines=kind == "lines")) > 0:
-                found.append(Moved(kind, name, *pair, share))
-    return found
+            share = _share(KINDS[kind], *pair, of_lines=kind == "lines")
+            if share > 0:
+                moves.append(Moved(kind, name, *pair, share))
+    return moves
 
 
 def _share(kind: Kind, before: Any, now: Any, *, of_lines: bool) -> float:
-    """Of the tolerance that the difference takes; infinite where none is tolerated."""
+    """Share of the tolerance that the difference takes; infinite where none is tolerated."""
     if before == now or (before != before and now != now):
         return 0.0
     if of_lines and isinstance(before, str) and isinstance(now, str):
         return _share_of_line(kind, before, now)
-    both = before, now
-    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in both):
+    values = before, now
+    if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
         return np.inf
     allowed = max(kind.absolute, kind.relative * abs(before))
     off = abs(now - before)
@@ -112,12 +117,15 @@ def _share(kind: Kind, before: Any, now: Any, *, of_lines: bool) -> float:
 
 
 def _share_of_line(kind: Kind, before: str, now: str) -> float:
-    """Of two sentences: their words are the same; numbers differ by a unit of the last digit or the share."""
+    """Share of the tolerance that the difference of two sentences takes; infinite where words differ.
+
+    Numbers may differ by a unit of the last digit, or by the relative tolerance.
+    """
     if _NUMBER.sub("#", before) != _NUMBER.sub("#", now):
         return np.inf
     worst = 0.0
     for old, new in zip(_NUMBER.findall(before), _NUMBER.findall(now), strict=True):
-        a, b = (float(one.replace("−", "-")) for one in (old, new))
+        a, b = (float(number.replace("−", "-")) for number in (old, new))
         mantissa, _, power = old.partition("e")
         digit = 10.0 ** (int(power or 0) - len(mantissa.partition(".")[2])) if "." in old else 0.0
         allowed = max(1.01 * digit, kind.relative * abs(a))
@@ -135,15 +143,17 @@ class Stored:
 
     @classmethod
     def read(cls, path: Path) -> Stored:
-        found, name = cls(path), ""
+        stored = cls(path)
+        name = ""
         for line in path.read_text("utf-8").splitlines() if path.is_file() else ():
             if line.startswith("    "):
                 kind, _, values = line.strip().partition(" ")
-                found.answers[name][kind] = json.loads(values)
+                stored.answers[name][kind] = json.loads(values)
             elif line and line[0] != "#":
                 name, _, seconds = line.rpartition(" | ")
-                found.answers[name], found.cpu_s[name] = {}, float(seconds.removesuffix(" s"))
-        return found
+                stored.answers[name] = {}
+                stored.cpu_s[name] = float(seconds.removesuffix(" s"))
+        return stored
 
     def put(self, name: str, answer: Answer, cpu_s: float) -> None:
         before = self.cpu_s.get(name, 0.0)
@@ -166,17 +176,19 @@ class Stored:
 
 
 def plain(answer: Answer) -> Answer:
-    """As it is after a file: floats with six digits, nothing of numpy."""
+    """An answer as it comes back from a file: floats with six digits, nothing of numpy."""
 
-    def value(one: Any) -> Any:
-        if isinstance(one, np.generic):
-            one = one.item()
-        if isinstance(one, float):
-            return float(f"{one:.6g}")
-        return [value(part) for part in one] if isinstance(one, list | tuple) else one
+    def value(item: Any) -> Any:
+        if isinstance(item, np.generic):
+            item = item.item()
+        if isinstance(item, float):
+            return float(f"{item:.6g}")
+        return [value(part) for part in item] if isinstance(item, list | tuple) else item
 
     return {
-        kind: {name: value(one) for name, one in values.items()} for kind, values in answer.items() if values
+        kind: {name: value(item) for name, item in values.items()}
+        for kind, values in answer.items()
+        if values
     }
 
 
@@ -211,9 +223,9 @@ def serve(connection: Connection, change: str, without: str) -> None:
 
 
 def _cpu_s() -> float:
-    """Of this process and of those it has waited for."""
+    """CPU seconds of this process and of those it has waited for."""
     used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(one.ru_utime + one.ru_stime for one in used)
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
 
 
 class Worker:
@@ -225,10 +237,12 @@ class Worker:
         self.process = context.Process(target=serve, args=(other, *changes))
         self.process.start()
         other.close()
-        self.name, self.since = "", 0.0
+        self.name = ""
+        self.since = 0.0
 
     def ask(self, name: str) -> None:
-        self.name, self.since = name, time.monotonic()
+        self.name = name
+        self.since = time.monotonic()
         self.connection.send(name)
 
     def take(self) -> tuple[Answer, str, float]:
@@ -252,19 +266,21 @@ def answers(
     names: Sequence[str], jobs: int, *changes: str
 ) -> Iterator[tuple[str, tuple[Answer, str, float]]]:
     """Name and answer with its place and CPU seconds, as they come."""
-    left, workers = deque(names), list[Worker]()
+    left = deque(names)
+    workers = list[Worker]()
     try:
         for _ in range(min(jobs, len(names))):
             workers.append(Worker(*changes))
             workers[-1].ask(left.popleft())
         while workers:
-            ready = wait([one.connection for one in workers], timeout=10.0)
+            ready = wait([of_worker.connection for of_worker in workers], timeout=10.0)
             for worker in [*workers]:
                 if time.monotonic() - worker.since > HANGS_S and worker.connection not in ready:
                     worker.process.kill()
                 if worker.connection not in ready:
                     continue
-                name, found = worker.name, worker.take()
+                name = worker.name
+                result = worker.take()
                 if not left or not worker.process.is_alive():
                     workers.remove(worker)
                     worker.end()
@@ -272,7 +288,7 @@ def answers(
                         workers.append(worker := Worker(*changes))
                 if left:
                     worker.ask(left.popleft())
-                yield name, found
+                yield name, result
     finally:
         for worker in workers:
             worker.end()
@@ -305,16 +321,24 @@ def run(
         return stored.cpu_s.get(name, _GUESS_S)
 
     ready = sorted((name for name in wanted if name not in skipped), key=expected_s, reverse=True)
-    left_s, begin, count = sum(map(expected_s, ready)), time.monotonic(), 0
-    all_s, spent_s, wrong, within = left_s, 0.0, list[str](), list[tuple[float, str]]()
+    left_s = sum(map(expected_s, ready))
+    begin = time.monotonic()
+    count = 0
+    all_s = left_s
+    spent_s = 0.0
+    wrong = list[str]()
+    within = list[tuple[float, str]]()
     for name, (answer, place, cpu_s) in answers(ready, jobs, change, without):
-        count, left_s, spent_s = count + 1, left_s - expected_s(name), spent_s + cpu_s
+        count = count + 1
+        left_s = left_s - expected_s(name)
+        spent_s = spent_s + cpu_s
         before = stored.answers.get(name)
         off = moved(before or {}, answer)
         told = [str(one) for one in off if one.share > 1] if before is not None else []
         state = "moved" if told else "same"
         if before is None:
-            state, told = "not stored", [] if store else [f"it is stored by: {_storing(name, against)}"]
+            state = "not stored"
+            told = [] if store else [f"it is stored by: {_storing(name, against)}"]
         else:
             within += [(one.share, f"{name}: {one}") for one in off if one.share <= 1]
         if place and (told or before is None):  # in place of a line for each value that vanished

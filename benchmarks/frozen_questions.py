@@ -51,7 +51,11 @@ def _shared(variable: str, name: str) -> Path:
     return Path(os.environ.get(variable) or ROOT.parent / "shared" / name)
 
 
-DATA, GAP = _shared("FLEXLINK_DATA", "data"), _shared("FLEXLINK_GAP", "gap")
+# Measured arms.
+DATA = _shared("FLEXLINK_DATA", "data")
+# Recorded gap cases.
+GAP = _shared("FLEXLINK_GAP", "gap")
+# Simulated machines with their truth.
 MACHINES = DATA.parent / "machines"
 
 
@@ -65,7 +69,7 @@ class Kept:
         self.answer.setdefault(kind, {}).update(values)
 
     def picked(self, document: Any, rules: Iterable[tuple[str, str]], before: str = "") -> None:
-        """Of a JSON document the values whose path a rule (pattern, kind) matches, the first one decides."""
+        """Keep the values of a JSON document whose path a rule (pattern, kind) matches; the first decides."""
         for path, value in _flat(document):
             name = before + ".".join(path)
             for pattern, kind in rules:
@@ -80,7 +84,7 @@ def _flat(document: Any, path: Keys = ()) -> Iterator[tuple[Keys, Any]]:
     if isinstance(document, Mapping):
         for key, value in document.items():
             yield from _flat(value, (*path, str(key)))
-    elif isinstance(document, list | tuple) and not all(isinstance(one, str) for one in document):
+    elif isinstance(document, list | tuple) and not all(isinstance(item, str) for item in document):
         for number, value in enumerate(document):
             named = value if isinstance(value, Mapping) else {}
             name = next((str(named[key]) for key in ("requirement", "name", "case") if key in named), None)
@@ -102,14 +106,15 @@ def flexlink(*words: object, folder: Path | None = None) -> tuple[int, str, list
     """Exit code, standard output, and the lines on standard error, names of folders left out."""
     from workflow.cli import main
 
-    out, error = io.StringIO(), io.StringIO()
+    out = io.StringIO()
+    error = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
         code = main([str(word) for word in words])
-    said = [out.getvalue(), _PROGRESS.sub("", error.getvalue())]
+    texts = [out.getvalue(), _PROGRESS.sub("", error.getvalue())]
     for place in filter(None, (folder, DATA, GAP, MACHINES, ROOT)):
         for name in (f"{place}/", f"{os.path.relpath(place)}/"):
-            said = [text.replace(name, "") for text in said]
-    return code, said[0], said[1].splitlines()
+            texts = [text.replace(name, "") for text in texts]
+    return code, texts[0], texts[1].splitlines()
 
 
 # Of the numbers of `run --json` and `identify --json`.
@@ -138,12 +143,12 @@ _RUN = (
 def of_run(summary: Any) -> Answer:
     """What is kept of a run: a `RunSummary`, or the document of --json."""
     document = summary if isinstance(summary, Mapping) else summary.to_document()
-    kept = Kept()
+    answer = Kept()
     if "certified" in document:
-        kept("said", certified=document["certified"])
-    kept("lines", verdict=document["verdict"])
-    kept.picked(document["numbers"], (*_RUN, *_MODEL))
-    return kept.answer
+        answer("said", certified=document["certified"])
+    answer("lines", verdict=document["verdict"])
+    answer.picked(document["numbers"], (*_RUN, *_MODEL))
+    return answer.answer
 
 
 def example(name: str, golden: bool = True) -> Answer:
@@ -183,7 +188,7 @@ _DIFFERS = ("manifest.json", "timings.json", "lock")
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    """All files but those that name times."""
+    """Contents of a folder's files by their path, but for those that name times."""
     files = (path for path in folder.rglob("*") if path.is_file() and path.name not in _DIFFERS)
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files}
 
@@ -195,17 +200,19 @@ def resumed() -> Answer:
     from workflow.config.run_config import load_config
     from workflow.tasks.pipeline import run_pipeline
 
-    config, kept = load_config(FAST_ARM)[0], Kept()
+    config = load_config(FAST_ARM)[0]
+    answer = Kept()
     with scratch() as folder:
-        kept.answer |= of_run(run_pipeline(config, folder / "whole"))
+        answer.answer |= of_run(run_pipeline(config, folder / "whole"))
         call = [sys.executable, "-c", _KILLED, FAST_ARM, folder / "stopped"]
-        kept("said", killed=subprocess.run(call, cwd=ROOT, check=False).returncode)
-        kept("said", stages_before=sorted(path.name for path in (folder / "stopped" / "stages").iterdir()))
+        answer("said", killed=subprocess.run(call, cwd=ROOT, check=False).returncode)
+        answer("said", stages_before=sorted(path.name for path in (folder / "stopped" / "stages").iterdir()))
         run_pipeline(config, folder / "stopped", resume=True)
-        whole, taken_up = _contents(folder / "whole"), _contents(folder / "stopped")
+        whole = _contents(folder / "whole")
+        taken_up = _contents(folder / "stopped")
     names = sorted(whole.keys() | taken_up.keys())
-    kept("said", files=names, other=[name for name in names if whole.get(name) != taken_up.get(name)])
-    return kept.answer
+    answer("said", files=names, other=[name for name in names if whole.get(name) != taken_up.get(name)])
+    return answer.answer
 
 
 # ---- controllers
@@ -221,13 +228,14 @@ def random_design(seed: int) -> Answer:
     except SpecificationError as error:
         return {"lines": {"refused": str(error)}}
     certificate = certify(result.controller, [plant], specification)
-    verdict, kept = certificate.plants[0], Kept()
-    kept("said", outcome=result.outcome.name, certified=certificate.certified, stable=verdict.stable)
-    kept("said", proved=verdict.all_frequencies.proved)
-    kept("said", unstable=unstable_samples(result.controller, posterior, np.random.default_rng([seed, 2])))
-    kept("margins", synthesis=result.gamma, gamma=certificate.gamma, bound=verdict.all_frequencies.gamma)
-    kept("margins", **_margins(verdict.worst_margins))
-    return kept.answer
+    verdict = certificate.plants[0]
+    answer = Kept()
+    answer("said", outcome=result.outcome.name, certified=certificate.certified, stable=verdict.stable)
+    answer("said", proved=verdict.all_frequencies.proved)
+    answer("said", unstable=unstable_samples(result.controller, posterior, np.random.default_rng([seed, 2])))
+    answer("margins", synthesis=result.gamma, gamma=certificate.gamma, bound=verdict.all_frequencies.gamma)
+    answer("margins", **_margins(verdict.worst_margins))
+    return answer.answer
 
 
 def _margins(worst: Any) -> dict[str, float]:
@@ -239,13 +247,15 @@ def flexible_link(scenario: str) -> Answer:
     from control_design.convex.convex_options import YoulaOptions
     from validation import example_plants
 
-    asked, plant = example_plants.flexible_link_specification(5), example_plants.flexible_link(scenario)
+    asked = example_plants.flexible_link_specification(5)
+    plant = example_plants.flexible_link(scenario)
     result = synthesise([plant], asked, rng=np.random.default_rng(0))
-    certificate, kept = certify(result.controller, [plant], asked), Kept()
-    kept("said", outcome=result.outcome.name, certified=certificate.certified)
-    kept("margins", gamma=certificate.gamma, youla=youla_bracket(plant, asked, YoulaOptions()).ellipse)
-    kept("margins", **_margins(certificate.plants[0].worst_margins))
-    return kept.answer
+    certificate = certify(result.controller, [plant], asked)
+    answer = Kept()
+    answer("said", outcome=result.outcome.name, certified=certificate.certified)
+    answer("margins", gamma=certificate.gamma, youla=youla_bracket(plant, asked, YoulaOptions()).ellipse)
+    answer("margins", **_margins(certificate.plants[0].worst_margins))
+    return answer.answer
 
 
 def two_joints(case: str) -> Answer:
@@ -255,12 +265,13 @@ def two_joints(case: str) -> Answer:
     plant, specification = (make() for make in CASES[case])
     options = MultivariableOptions()
     result = synthesise_multivariable(plant, specification, options)
-    certificate, kept = certify_multivariable(result.controller, plant, specification), Kept()
+    certificate = certify_multivariable(result.controller, plant, specification)
+    answer = Kept()
     verdict = certificate.verdicts[0]
-    kept("said", met=certificate.met, stable=verdict.stable)
-    kept("margins", synthesis=result.gamma, judge=judged(case, result.controller))
-    kept("margins", **{f"bound {name}": value for name, value in verdict.bounds.items()})
-    return kept.answer
+    answer("said", met=certificate.met, stable=verdict.stable)
+    answer("margins", synthesis=result.gamma, judge=judged(case, result.controller))
+    answer("margins", **{f"bound {name}": value for name, value in verdict.bounds.items()})
+    return answer.answer
 
 
 def joints_run() -> Answer:
@@ -272,15 +283,15 @@ def joints_run() -> Answer:
     with scratch() as folder:
         (folder / "two.toml").write_text(_SOURCE + _JOINTS + _REST)
         summary = run_pipeline(load_any(folder / "two.toml")[0], folder / "run")
-    kept = Kept()
-    kept("said", certified=summary.certified)
-    kept("lines", verdict=summary.verdict)
+    answer = Kept()
+    answer("said", certified=summary.certified)
+    answer("lines", verdict=summary.verdict)
     for path, value in _flat(summary.to_document()["numbers"]):
         if isinstance(value, bool | int | str):
-            kept("said", **{".".join(path): value})
+            answer("said", **{".".join(path): value})
         elif isinstance(value, float):
-            kept("margins", **{".".join(path): value})
-    return kept.answer
+            answer("margins", **{".".join(path): value})
+    return answer.answer
 
 
 # ---- models from logs
@@ -291,12 +302,13 @@ def simulated_effects() -> Answer:
     from plant import parse_effect, simulate
     from tests.plant.test_effects import EXAMPLES, RIG, VOLTAGE
 
-    still, kept = simulate(RIG, VOLTAGE, ()).output, Kept()
+    still = simulate(RIG, VOLTAGE, ()).output
+    answer = Kept()
     for name, size in EXAMPLES.items():
         added = simulate(RIG, VOLTAGE, [parse_effect({"name": name, **size})]).output - still
         hub, tip = np.sqrt(np.mean(added**2, axis=0)).tolist()
-        kept("model", **{f"{name} hub": hub, f"{name} tip": tip})
-    return kept.answer
+        answer("model", **{f"{name} hub": hub, f"{name} tip": tip})
+    return answer.answer
 
 
 def planned() -> Answer:
@@ -304,15 +316,16 @@ def planned() -> Answer:
     limits = "--band 0.5 40 --dt-s 0.005 --duration 60 --voltage 10 --rig paper_link --angle 30"
     with scratch() as folder:
         code, _, lines = flexlink("excite", "--out", folder / "plan", *limits.split(), folder=folder)
-        plan, kept = json.loads((folder / "plan" / "plan.json").read_text("utf-8")), Kept()
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines))
+        plan = json.loads((folder / "plan" / "plan.json").read_text("utf-8"))
+        answer = Kept()
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines))
     for record in plan["records"]:
-        kept(
+        answer(
             "model",
             **{f"{record['file']} {key}": record[key] for key in ("peak_V", "rms_V", "peak_angle_deg")},
         )
-    return kept.answer
+    return answer.answer
 
 
 def identified(**options: Any) -> Answer:
@@ -322,18 +335,26 @@ def identified(**options: Any) -> Answer:
     from workflow.config.run_config import SimulatedSource, built_in_config
     from workflow.tasks.log_identification import identify_records
 
-    source, band, seed = built_in_config()[0].source, options.pop("band_rad_s", None), options.pop("seed")
+    source = built_in_config()[0].source
+    band = options.pop("band_rad_s", None)
+    seed = options.pop("seed")
     assert isinstance(source, SimulatedSource)
-    given = IdentOptions(integrators=1, input_delay_samples=1, **options)
-    found = identify_records(weak_records(source, seed), (), given, band_rad_s=band, with_plot=False)
-    kept = Kept()
-    kept("said", modes=len(found.about.modes), true_modes=sum(map(found.about.is_mode, found.about.modes)))
-    for k, mode in enumerate(found.about.modes):
-        kept("model", **{f"mode {k} Hz": mode.frequency_Hz, f"mode {k} damping": mode.damping})
-        if found.spread.intervals is not None:
-            low, high = found.spread.intervals.modes[k].frequency_Hz
-            kept("spread", **{f"mode {k} from Hz": low, f"mode {k} to Hz": high})
-    return kept.answer
+    options_of_fit = IdentOptions(integrators=1, input_delay_samples=1, **options)
+    identified = identify_records(
+        weak_records(source, seed), (), options_of_fit, band_rad_s=band, with_plot=False
+    )
+    answer = Kept()
+    answer(
+        "said",
+        modes=len(identified.about.modes),
+        true_modes=sum(map(identified.about.is_mode, identified.about.modes)),
+    )
+    for k, mode in enumerate(identified.about.modes):
+        answer("model", **{f"mode {k} Hz": mode.frequency_Hz, f"mode {k} damping": mode.damping})
+        if identified.spread.intervals is not None:
+            low, high = identified.spread.intervals.modes[k].frequency_Hz
+            answer("spread", **{f"mode {k} from Hz": low, f"mode {k} to Hz": high})
+    return answer.answer
 
 
 def without_friction(torque_Nm: float, seed: int) -> Answer:
@@ -346,14 +367,15 @@ def without_friction(torque_Nm: float, seed: int) -> Answer:
     source = bench.with_friction(config.source, torque_Nm, 16384)
     records = bench.estimation_records(source, seed)
     friction, arms = bench.behind_friction(records, config.channels)
-    truth, kept = bench.true_responses(source, bench.OMEGA_RAD_S).T, Kept()
-    kept("model", level=friction.level)
-    kept("spread", level_std=friction.level_std)
+    truth = bench.true_responses(source, bench.OMEGA_RAD_S).T
+    answer = Kept()
+    answer("model", level=friction.level)
+    answer("spread", level_std=friction.level_std)
     for name, arm, true in zip(("hub", "tip"), arms, truth, strict=True):
         judged = bench.judged(arm.response.at(bench.OMEGA_RAD_S), true)
-        kept("spread", **{f"{name} {row}": float(judged[row].median()) for row in ("error", "radius")})
-        kept("spread", **{f"{name} inside": float(judged["inside"].mean())})
-    return kept.answer
+        answer("spread", **{f"{name} {row}": float(judged[row].median()) for row in ("error", "radius")})
+        answer("spread", **{f"{name} inside": float(judged["inside"].mean())})
+    return answer.answer
 
 
 def _logs(folder: Path) -> list[Path]:
@@ -364,19 +386,20 @@ def drafted(folder_of_logs: Path, keep: Path | None = None) -> Answer:
     """What `flexlink init` makes of logs: every key of the configuration. keep: where that stays."""
     import tomllib
 
-    logs, kept = _logs(folder_of_logs), Kept()
+    logs = _logs(folder_of_logs)
+    answer = Kept()
     with scratch() as folder:
         config = keep or folder / "my.toml"
         code, _, lines = flexlink("init", *logs, "--out", config, folder=folder_of_logs)
-        kept("said", exit=code)
+        answer("said", exit=code)
         if code:
-            kept("lines", refused=" | ".join(lines))
-            return kept.answer
+            answer("lines", refused=" | ".join(lines))
+            return answer.answer
         document = tomllib.loads(config.read_text("utf-8"))
-    document["source"]["records"] = [Path(one["path"]).name for one in document["source"]["records"]]
+    document["source"]["records"] = [Path(record["path"]).name for record in document["source"]["records"]]
     for path, value in _flat(document):
-        kept("sizes" if isinstance(value, float) else "said", **{".".join(path): value})
-    return kept.answer
+        answer("sizes" if isinstance(value, float) else "said", **{".".join(path): value})
+    return answer.answer
 
 
 # What says nothing about a log and takes half the time of a run.
@@ -408,14 +431,14 @@ def loop_run(folder_of_logs: Path, rows: int | None = None) -> Answer:
             document.setdefault(section, tomlkit.table()).update(values)
         (folder / "my.toml").write_text(tomlkit.dumps(document), "utf-8")
         try:
-            found = of_run(run_pipeline(load_config(folder / "my.toml")[0], folder / "run"))
+            of_the_run = of_run(run_pipeline(load_config(folder / "my.toml")[0], folder / "run"))
         except (InputError, StageError) as error:
-            found = {"lines": {"refused": str(error).replace(f"{folder}/", "")}}
-    return {kind: answer.get(kind, {}) | found.get(kind, {}) for kind in {**answer, **found}}
+            of_the_run = {"lines": {"refused": str(error).replace(f"{folder}/", "")}}
+    return {kind: answer.get(kind, {}) | of_the_run.get(kind, {}) for kind in {**answer, **of_the_run}}
 
 
 def made_loop(kind: str, seed: int, *, run: bool) -> Answer:
-    """Of logs of a generated machine: what is drafted, or what comes out of a run as well."""
+    """What is drafted from logs of a generated machine, or what comes out of a run as well."""
     from benchmarks.closed_loop_machines.logs import machine, write
 
     with scratch() as folder:
@@ -430,29 +453,38 @@ def diagnosed(case: Any, truth: Sequence[str] = ()) -> Answer:
     """Verdict, named effects with their sizes, probabilities of sets, gaps."""
     from diagnosis import diagnose
 
-    found, kept = diagnose(case), Kept()
-    entries = {e.name: e for e in found.effects}
-    named = found.combination or found.partial_model
-    kept("said", verdict=found.verdict, detail=found.detail_verdict, effects=sorted(found.combination))
-    kept("said", partly=sorted(found.partial_model), truth=sorted(truth))
+    diagnosis = diagnose(case)
+    answer = Kept()
+    entries = {e.name: e for e in diagnosis.effects}
+    named = diagnosis.combination or diagnosis.partial_model
+    answer(
+        "said",
+        verdict=diagnosis.verdict,
+        detail=diagnosis.detail_verdict,
+        effects=sorted(diagnosis.combination),
+    )
+    answer("said", partly=sorted(diagnosis.partial_model), truth=sorted(truth))
     for name in named:
-        kept("sizes", **{f"{name} {key}": value for key, value in entries[name].parameters.items()})
-    sets = {" + ".join(key) or "none": float(p) for key, p in found.sets.items() if p >= 0.02}
-    kept("probabilities", **sets)
-    kept("gaps", before=found.gap_before, refit=found.gap_refit, after=found.gap_after)
-    return kept.answer
+        answer("sizes", **{f"{name} {key}": value for key, value in entries[name].parameters.items()})
+    sets = {" + ".join(key) or "none": float(p) for key, p in diagnosis.sets.items() if p >= 0.02}
+    answer("probabilities", **sets)
+    answer("gaps", before=diagnosis.gap_before, refit=diagnosis.gap_refit, after=diagnosis.gap_after)
+    return answer.answer
 
 
 def shared_case(place: str) -> Answer:
-    """Of a folder below the shared cases, `:` and the rig file behind it where it is not the usual one."""
+    """The diagnosis of a folder below the shared cases.
+
+    place: the folder, with `:` and the rig file behind it where that is not the usual one.
+    """
     import tomllib
 
     from workflow.diagnose.case_files import load_case
 
     folder, _, rig = place.partition(":")
     answer = GAP / folder / "answer.toml"
-    told = tomllib.loads(answer.read_text("utf-8")) if answer.is_file() else {}
-    names = [e["name"] for e in told.get("effects", ())] or [told.get("verdict")]
+    label = tomllib.loads(answer.read_text("utf-8")) if answer.is_file() else {}
+    names = [e["name"] for e in label.get("effects", ())] or [label.get("verdict")]
     return diagnosed(load_case(GAP / folder, rig or None).case, list(filter(None, names)))
 
 
@@ -474,11 +506,11 @@ def diagnosed_by_command() -> Answer:
         case = write_case(folder / "case", dict(_FRICTION))
         words = case, "--out", folder / "out", "--json", "--quiet"
         code, out, lines = flexlink("diagnose", *words, folder=folder)
-    kept = Kept()
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines))
-    kept.picked(json.loads(out)["cases"][0] if out else {}, _DOCUMENT)
-    return kept.answer
+    answer = Kept()
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines))
+    answer.picked(json.loads(out)["cases"][0] if out else {}, _DOCUMENT)
+    return answer.answer
 
 
 _DOCUMENT = (
@@ -493,12 +525,12 @@ _DOCUMENT = (
 def checked(case: Path) -> Answer:
     """`flexlink check`: what logs can tell of a model."""
     code, out, lines = flexlink("check", case, "--json", folder=case.parent)
-    kept = Kept()
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines), **({"verdict": json.loads(out)["verdict"]} if out else {}))
+    answer = Kept()
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines), **({"verdict": json.loads(out)["verdict"]} if out else {}))
     for row in json.loads(out)["table"] if out else ():
-        kept("lines", **{f"{row['section']} {row['label']}": row["value"]})
-    return kept.answer
+        answer("lines", **{f"{row['section']} {row['label']}": row["value"]})
+    return answer.answer
 
 
 def mujoco_case(number: int, seed: int = 7352) -> Answer:
@@ -523,15 +555,15 @@ def fleet() -> Answer:
         cases = write_fleet(folder / "cases", 3, samples=150)
         words = *cases, "--out", folder / "out", "--jobs", "2", "--json", "--quiet"
         code, out, lines = flexlink("diagnose", *words, folder=folder)
-    kept = Kept()
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines))
-    for one in json.loads(out)["cases"] if out else ():
-        effects = [e for e in one["effects"] if e["probability"] > 0.5]
-        kept("said", **{f"{one['case']} verdict": one["verdict"]})
-        kept("sizes", **{f"{one['case']} {k}": v for e in effects for k, v in e["parameters"].items()})
-        kept("probabilities", **{f"{one['case']} {e['name']}": e["probability"] for e in effects})
-    return kept.answer
+    answer = Kept()
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines))
+    for case in json.loads(out)["cases"] if out else ():
+        effects = [e for e in case["effects"] if e["probability"] > 0.5]
+        answer("said", **{f"{case['case']} verdict": case["verdict"]})
+        answer("sizes", **{f"{case['case']} {k}": v for e in effects for k, v in e["parameters"].items()})
+        answer("probabilities", **{f"{case['case']} {e['name']}": e["probability"] for e in effects})
+    return answer.answer
 
 
 def study() -> Answer:
@@ -542,12 +574,13 @@ def study() -> Answer:
         (folder / "study.toml").write_text(TWO_POINTS)
         words = "--config", folder / "study.toml", "--jobs", "2", "--out", folder / "out", "--quiet"
         code, _, lines = flexlink("study", *words, folder=folder)
-        file, kept = folder / "out" / "table.json", Kept()
+        file = folder / "out" / "table.json"
+        answer = Kept()
         table = json.loads(file.read_text("utf-8")) if file.is_file() else {}
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines))
-    kept.picked(_without_digests(table), _STUDY)
-    return kept.answer
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines))
+    answer.picked(_without_digests(table), _STUDY)
+    return answer.answer
 
 
 _STUDY = (
@@ -570,7 +603,7 @@ def forty_logs(*endings: str) -> Answer:
     from ident import Record
     from tests.ident.test_forty_logs import LOGS
 
-    kept = Kept()
+    answer = Kept()
     for name, log in LOGS.items():
         if Path(log.file).suffix[1:] not in endings:
             continue
@@ -581,7 +614,7 @@ def forty_logs(*endings: str) -> Answer:
             try:
                 record = Record.from_file(path, columns[:1], columns[1:], time=time, **log.options)
             except ValueError as error:
-                kept("lines", **{name: str(error).replace(f"{folder}/", "")})
+                answer("lines", **{name: str(error).replace(f"{folder}/", "")})
                 continue
         signals = zip(
             (*record.input_names, *record.output_names),
@@ -589,10 +622,10 @@ def forty_logs(*endings: str) -> Answer:
             np.hstack([record.input, record.output]).T,
             strict=False,
         )
-        told = [f"{column} [{unit}] {np.sum(np.abs(values)):.6g}" for column, unit, values in signals]
-        line = f"{len(record.input)} rows every {record.dt_s:.6g} s: {', '.join(told)}"
-        kept("lines", **{name: line + (", repaired" if record.repair else "")})
-    return kept.answer
+        in_words = [f"{column} [{unit}] {np.sum(np.abs(values)):.6g}" for column, unit, values in signals]
+        line = f"{len(record.input)} rows every {record.dt_s:.6g} s: {', '.join(in_words)}"
+        answer("lines", **{name: line + (", repaired" if record.repair else "")})
+    return answer.answer
 
 
 def generated_logs(first: int, count: int) -> Answer:
@@ -600,13 +633,13 @@ def generated_logs(first: int, count: int) -> Answer:
     from benchmarks.log_oracle import outcome
     from tests.ident.generated_logs import generated
 
-    kept = Kept()
+    answer = Kept()
     with scratch() as folder:
         for number in range(first, first + count):
             what, why = outcome(generated(47, number, 1.0), folder)
-            kept("said", **{str(number): what})
-            kept("lines", **({str(number): " ".join(why.split())} if why else {}))
-    return kept.answer
+            answer("said", **{str(number): what})
+            answer("lines", **({str(number): " ".join(why.split())} if why else {}))
+    return answer.answer
 
 
 _LOOK = (
@@ -620,14 +653,14 @@ _LOOK = (
 def looked_at(log: Path) -> Answer:
     """`flexlink look` at a log."""
     code, out, lines = flexlink("look", log, "--json", folder=log.parent)
-    kept = Kept()
-    kept("said", exit=code)
-    kept("lines", error=" | ".join(lines))
+    answer = Kept()
+    answer("said", exit=code)
+    answer("lines", error=" | ".join(lines))
     if out:
         document = json.loads(out)
-        kept("lines", verdict=document["verdict"])
-        kept.picked(document["numbers"], _LOOK)
-    return kept.answer
+        answer("lines", verdict=document["verdict"])
+        answer.picked(document["numbers"], _LOOK)
+    return answer.answer
 
 
 _EXACT = {

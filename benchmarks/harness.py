@@ -77,8 +77,8 @@ def main(
     parser.add_argument("--name", help="write benchmarks/results/NAME.txt, whatever the options")
     for name, default in defaults.items():
         parser.add_argument(f"--{name.replace('_', '-')}", **_kind(default))
-    given = vars(parser.parse_args(arguments))
-    options = {name: tuple(value) if isinstance(value, list) else value for name, value in given.items()}
+    parsed = vars(parser.parse_args(arguments))
+    options = {name: tuple(value) if isinstance(value, list) else value for name, value in parsed.items()}
     target = options.pop("name") or (module if writes and options == defaults else None)
     # No path of the machine it ran on.
     shown = [os.path.relpath(each) if os.path.isabs(each) else each for each in arguments]
@@ -144,9 +144,9 @@ def flexlink(*words: str, longest_s: float | None = None) -> tuple[int, str, lis
         ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=longest_s)
     except subprocess.TimeoutExpired:
         return -1, "", [f"no answer in {longest_s} s"]
-    said = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
-    said = [line for line in said if not re.match(r"flexlink: \d+ s: ", line)]
-    return ended.returncode, ended.stdout, said or ["(nothing said)"]
+    lines = [line.strip() for line in (ended.stderr or ended.stdout).splitlines() if line.strip()]
+    lines = [line for line in lines if not re.match(r"flexlink: \d+ s: ", line)]
+    return ended.returncode, ended.stdout, lines or ["(nothing said)"]
 
 
 def reading(name: str, **values: object) -> str:
@@ -159,5 +159,5 @@ def reading(name: str, **values: object) -> str:
 def timed(call: Callable[[], R]) -> tuple[R, float]:
     """What the call returns, and CPU seconds of this process."""
     begin = time.process_time()
-    found = call()
-    return found, time.process_time() - begin
+    result = call()
+    return result, time.process_time() - begin

@@ -37,11 +37,11 @@ class Row:
 
     def line(self) -> str:
         text = (RESULTS / f"{self.file}.txt").read_text(encoding="utf-8")
-        found = re.search(self.pattern, text, re.DOTALL | re.MULTILINE)
-        if found is None:
+        values = re.search(self.pattern, text, re.DOTALL | re.MULTILINE)
+        if values is None:
             raise ValueError(f"{self.file}.txt has no line that answers: {self.question}")
-        said = self.answer.format(*found.groups())
-        return f"| {self.question} | {said} | {self._weakest(text)} | `{self.file}` |"
+        sentence = self.answer.format(*values.groups())
+        return f"| {self.question} | {sentence} | {self._weakest(text)} | `{self.file}` |"
 
     def _weakest(self, text: str) -> str:
         if not self.parts:
@@ -371,7 +371,7 @@ def page() -> str:
         "|---|---|---|---|",
     ]
     for what, words in WORKSHOP.items():
-        counted = [found[what] for found in series.values() if found.get(what, (0, 0))[1]]
+        counted = [answers[what] for answers in series.values() if answers.get(what, (0, 0))[1]]
         worst = (max if what in MISTAKES else min)(counted, key=lambda pair: pair[0] / pair[1])
         lines.append(
             "| {} | {} of {} | {} of {} | {} of {} |".format(words, *every[what], *recent[what], *worst)

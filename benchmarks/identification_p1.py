@@ -63,14 +63,16 @@ class Score:
 def score(fit: Callable[[Record], LinearModel], variant: Variant, truths: Sequence[Truth]) -> list[Score]:
     """Fit every truth's record (after one warm-up fit)."""
     fit(truths[0].record)
-    response, fresh = truths[0].response(GRID), variant.fresh_input()
+    response = truths[0].response(GRID)
+    fresh = variant.fresh_input()
     y = simulated(truths[0].system, fresh)
     scores = []
     for truth in truths:
         model, cpu_s = timed(partial(fit, truth.record))
         poles = poles_of(model)
         error = np.abs(model.frequency_response(GRID) / response - 1)
-        natural = np.abs(np.log(poles[poles.imag > 0])) / DT_S
+        is_upper = poles.imag > 0
+        natural = np.abs(np.log(poles[is_upper])) / DT_S
         scores.append(
             Score(
                 float(np.sqrt(np.mean(error**2))),
@@ -96,13 +98,13 @@ def row(name: str, scores: Sequence[Score]) -> str:
         np.quantile([getattr(item, key) for item in scores], [0.5, 0.9])
         for key in ("whole", "middle", "nrmse")
     ]
-    found = sum(item.mode_found for item in scores)
+    modes_found = sum(item.mode_found for item in scores)
     cpu_ms = 1e3 * np.median([item.cpu_s for item in scores])
     (w1, w2), (m1, m2), (n1, n2) = columns
     # A model that diverges on the validation input has any number there.
     nrmse = " ".join(f"{n:>7.4f}" if n < 100 else f"{n:>7.0e}" for n in (n1, n2))
     numbers = f"{w1:>8.3f} {w2:>9.3f}  {m1:>6.3f} {m2:>6.3f}  {nrmse}"
-    return f"{name:<44} {numbers}  {found:>3}/{len(scores):<3} {cpu_ms:>6.1f}"
+    return f"{name:<44} {numbers}  {modes_found:>3}/{len(scores):<3} {cpu_ms:>6.1f}"
 
 
 Fit = Callable[[Record], LinearModel]
@@ -129,8 +131,8 @@ def summed_oe(integrators: int) -> Fit:
 
     def fit(record: Record) -> LinearModel:
         summed = replace(record, input=filter_input(record.input[:, 0], integrators, 0)[:, None])
-        found = oe(summed, 4, 4 - integrators, arx_start=False)
-        return replace(found, f=np.convolve(found.f, np.poly(np.ones(integrators))))
+        model = oe(summed, 4, 4 - integrators, arx_start=False)
+        return replace(model, f=np.convolve(model.f, np.poly(np.ones(integrators))))
 
     return fit
 
@@ -195,32 +197,32 @@ def run(out: Print, *, seeds: int = 50) -> None:
     scores = compared(out, PLAIN, plain, 2)
     compared(out, FRICTION, friction, 1)
     out(f"{'what':<58} {'reach':<18} {'measured':<18} met")
-    for said, name, key, band, limits, least in (
+    for knowledge, name, key, band, limits, least in (
         ("nothing known", NOTHING, "middle", "1-100", (0.042, 0.09), 0.006),
         ("known", KNOWN.format(2), "whole", "0.1-600", (0.013, 0.025), 0.005),
     ):
-        found = scores[name]
-        error = quantile(found, key, 0.5), quantile(found, key, 0.9)
+        of_variant = scores[name]
+        error = quantile(of_variant, key, 0.5), quantile(of_variant, key, 0.9)
         out(
             reach_line(
-                f"{said}: RMS error {band} rad/s, median / 90th",
+                f"{knowledge}: RMS error {band} rad/s, median / 90th",
                 f"{limits[0]} / {limits[1]}",
                 f"{error[0]:.4f} / {error[1]:.4f}",
                 error[0] <= limits[0] and error[1] <= limits[1],
             )
         )
-        nrmse = quantile(found, "nrmse", 0.5)
-        out(reach_line(f"{said}: validation NRMSE, median", str(least), f"{nrmse:.4f}", nrmse <= least))
+        nrmse = quantile(of_variant, "nrmse", 0.5)
+        out(reach_line(f"{knowledge}: validation NRMSE, median", str(least), f"{nrmse:.4f}", nrmse <= least))
     modes = {name: sum(item.mode_found for item in items) for name, items in scores.items()}
     every = f"{modes[NOTHING]}/{seeds}"
     out(reach_line("nothing known: mode found", f"{seeds}/{seeds}", every, modes[NOTHING] == seeds))
-    most = int(0.05 * seeds)
-    both = {"integrators", "relative_degree"}
+    most_wrong = int(0.05 * seeds)
+    known_keys = {"integrators", "relative_degree"}
     orders = {"n_real": 0, "n_pairs": 1}
     trials: list[tuple[Variant, list[Truth], dict[str, int], set[str]]] = [
-        (PLAIN, plain, {"integrators": 2, "relative_degree": 2}, both),
+        (PLAIN, plain, {"integrators": 2, "relative_degree": 2}, known_keys),
         (PLAIN, plain, {"integrators": 2, "relative_degree": 3}, {"integrators"}),
-        (FRICTION, friction, {"integrators": 1, "relative_degree": 2}, both),
+        (FRICTION, friction, {"integrators": 1, "relative_degree": 2}, known_keys),
         (FRICTION, friction, {"integrators": 2}, set()),
         (FRICTION, friction, {"integrators": 2} | orders, set()),
     ]
@@ -232,9 +234,9 @@ def run(out: Print, *, seeds: int = 50) -> None:
             out(
                 reach_line(
                     f"    {prior} ({'true' if holds else 'wrong'}) refused",
-                    f"<= {most}/{seeds}" if holds else f"{seeds}/{seeds}",
+                    f"<= {most_wrong}/{seeds}" if holds else f"{seeds}/{seeds}",
                     f"{count}/{seeds}",
-                    count <= most if holds else count == seeds,
+                    count <= most_wrong if holds else count == seeds,
                 )
             )
 

@@ -60,7 +60,8 @@ class Law:
 def values(law: Law, load: tuple[tuple[float, ...], tuple[float, ...]]) -> dict[str, float] | None:
     """The raw value of each item for one load (A, B), or None if the loop is unstable."""
     a, b = (np.asarray(p, dtype=float) for p in load)
-    ar, bs = np.convolve(a, law.R), np.convolve(b, law.S)
+    ar = np.convolve(a, law.R)
+    bs = np.convolve(b, law.S)
     size = max(ar.size, bs.size)
     closed = np.pad(ar, (0, size - ar.size)) + np.pad(bs, (0, size - bs.size))
     if not np.max(np.abs(np.roots(closed)), initial=0.0) < 1:
@@ -104,12 +105,14 @@ def _delay_margin(ar: np.ndarray, bs: np.ndarray) -> float:
     cross = np.flatnonzero(size[1:] * size[:-1] <= 0)
     if not cross.size:
         return float("inf")
-    low, high = _FINE[cross], _FINE[cross + 1]
+    low = _FINE[cross]
+    high = _FINE[cross + 1]
     rising = size[cross] < 0
     for _ in range(40):
         mid = 0.5 * (low + high)
         below = (np.abs(loop(mid)) < 1.0) == rising
-        low, high = np.where(below, mid, low), np.where(below, high, mid)
+        low = np.where(below, mid, low)
+        high = np.where(below, high, mid)
     phase = np.mod(np.angle(loop(mid)) + np.pi, 2 * np.pi)
     return float(np.min(phase / mid))
 
@@ -121,23 +124,23 @@ def points(item: str, value: float) -> float:
 
 def all_values(law: Law) -> dict[str, dict[str, float]] | None:
     """Values of every load, or None if one is unstable."""
-    found = {name: values(law, load) for name, load in LOADS.items()}
-    if any(value is None for value in found.values()):
+    by_load = {name: values(law, load) for name, load in LOADS.items()}
+    if any(value is None for value in by_load.values()):
         return None
-    return {name: value for name, value in found.items() if value is not None}
+    return {name: value for name, value in by_load.items() if value is not None}
 
 
 def score(law: Law) -> float:
     """0 to 100."""
-    found = all_values(law)
-    if found is None:
+    by_load = all_values(law)
+    if by_load is None:
         return 0.0
-    return float(np.mean([min(points(item, v[item]) for v in found.values()) for item in ITEMS]))
+    return float(np.mean([min(points(item, v[item]) for v in by_load.values()) for item in ITEMS]))
 
 
 def margins(law: Law) -> dict[str, float]:
     """Smallest margin of every item over the loads; -inf everywhere if a load is unstable."""
-    found = all_values(law)
-    if found is None:
+    by_load = all_values(law)
+    if by_load is None:
         return dict.fromkeys(ITEMS, -np.inf)
-    return {item: min(ITEMS[item].margin(v[item]) for v in found.values()) for item in ITEMS}
+    return {item: min(ITEMS[item].margin(v[item]) for v in by_load.values()) for item in ITEMS}

@@ -58,7 +58,8 @@ def synthesised(seed: int) -> tuple[np.ndarray, float]:
     """Parameters (6,) of our order-3 controller, S first, and its gamma."""
     result = synthesise(plants(), SPECIFICATION, QUICK, rng=np.random.default_rng(seed))
     transfer = control.tf(result.controller.to_control())
-    r, s = np.asarray(transfer.den[0][0]), np.asarray(transfer.num[0][0])
+    r = np.asarray(transfer.den[0][0])
+    s = np.asarray(transfer.num[0][0])
     s = np.concatenate([np.zeros(r.size - s.size), s]) / r[0]
     inner = np.polydiv(r / r[0], np.array([1.0, -1.0]))[0]
     return np.concatenate([s, inner[1:]]), result.gamma
@@ -88,7 +89,8 @@ def batch_margins(x: np.ndarray, s_length: int) -> np.ndarray:
     t = TS_S * np.arange(SAMPLES)
     powers = np.exp(-2j * np.pi * _HZ[:, None] * TS_S * np.arange(12))
     for a, b in LOADS.values():
-        ar, bs = _times(r, np.array(a)), _times(s, np.array(b))
+        ar = _times(r, np.array(a))
+        bs = _times(s, np.array(b))
         size = max(ar.shape[1], bs.shape[1])
         closed = np.zeros((count, size))
         closed[:, : ar.shape[1]] += ar
@@ -190,7 +192,8 @@ def _settled(size: np.ndarray) -> np.ndarray:
     last = size.shape[1] - 1 - np.argmax(above[:, ::-1], axis=1)
     row = np.arange(last.size)
     after = np.minimum(last + 1, size.shape[1] - 1)
-    high, low = size[row, last], size[row, after]
+    high = size[row, last]
+    low = size[row, after]
     share = np.where(high > low, (high - _THRESHOLD) / np.where(high > low, high - low, 1.0), 1.0)
     return TS_S * (last + np.clip(share, 0.0, 1.0))
 
@@ -201,7 +204,8 @@ def _first_above_one(sensitivity: np.ndarray) -> np.ndarray:
     index = np.argmax(above, axis=1)
     row = np.arange(index.size)
     before = np.maximum(index - 1, 0)
-    low, high = sensitivity[row, before], sensitivity[row, index]
+    low = sensitivity[row, before]
+    high = sensitivity[row, index]
     share = np.where(high > low, (1.0 - low) / np.where(high > low, high - low, 1.0), 1.0)
     value = _HZ[before] + np.clip(share, 0, 1) * (_HZ[index] - _HZ[before])
     return np.where(np.any(above, axis=1), value, 10.0)
@@ -215,8 +219,8 @@ def _delay_margin(loop: np.ndarray) -> np.ndarray:
     cross = size[:, 1:] * size[:, :-1] <= 0
     share = np.where(cross, size[:, :-1] / np.where(cross, size[:, :-1] - size[:, 1:], 1.0), 0.0)
     at = omega[:-1] + share * np.diff(omega)
-    there = phase[:, :-1] + share * np.diff(phase, axis=1)
-    delay = np.mod(there + np.pi, 2 * np.pi) / at
+    phase_at_crossing = phase[:, :-1] + share * np.diff(phase, axis=1)
+    delay = np.mod(phase_at_crossing + np.pi, 2 * np.pi) / at
     return np.min(np.where(cross, delay, np.inf), axis=1)
 
 
@@ -233,12 +237,12 @@ def run(out: Print, *, seed: int = 1) -> None:
         f"{designed - begin:.1f} s CPU; with the direct search: score {score(law):.1f}, "
         f"6 parameters, {done - begin:.1f} s CPU in all"
     )
-    found = all_values(law)
-    assert found is not None
+    by_load = all_values(law)
+    assert by_load is not None
     smallest = margins(law)
-    out(f"  {'item':<15} {'limit':>8}  " + "  ".join(f"{load:>8}" for load in found) + "   margin %")
+    out(f"  {'item':<15} {'limit':>8}  " + "  ".join(f"{load:>8}" for load in by_load) + "   margin %")
     for item in ITEMS:
-        cells = "  ".join(f"{v[item]:>8.3f}" for v in found.values())
+        cells = "  ".join(f"{v[item]:>8.3f}" for v in by_load.values())
         out(f"  {item:<15} {ITEMS[item].limit:>8}  {cells}  {100 * smallest[item]:>8.1f}")
     out(f"  R = {np.round(law.R, 7).tolist()}")
     out(f"  S = {np.round(law.S, 7).tolist()}, T = S(1) = {law.T[0]:.7f}")

@@ -98,17 +98,17 @@ def run(out: Print, *, seeds: int = 300, first_seed: int = 0, rate_limited: floa
             continue
         rate = bool(rng.random() < rate_limited)
         try:
-            found, count = judged(draw, rate)
+            errors, count = judged(draw, rate)
         except ValueError as refusal:
             refused.append(f"seed {seed} ({draw.form}): {refusal}")
             continue
         runs += count
         for group in groups(draw, rate):
             drawn[group] += 1
-            wrong[group] += bool(found)
-        if found:
+            wrong[group] += bool(errors)
+        if errors:
             kind = f"{draw.form}, {draw.plant_kind}, {draw.integrators} integrators, roll-off {draw.rolloff}"
-            faults.append(f"seed {seed} ({kind}{', rate limit' if rate else ''}): {'; '.join(found)}")
+            faults.append(f"seed {seed} ({kind}{', rate limit' if rate else ''}): {'; '.join(errors)}")
     total = drawn["all"]
     out(f"wrong: {wrong['all']} of {total} laws, in {runs} runs of compiled code; refused: {len(refused)}; "
         f"no stable loop drawn: {drawn['no loop drawn']}")  # fmt: skip
@@ -216,14 +216,18 @@ def _delayed(plant: StateSpace) -> StateSpace:
 
 def _in_a_row(sections: list[tuple[Array, Array]]) -> StateSpace:
     """Series of the sections' companion forms."""
-    a, b = np.zeros((0, 0)), np.zeros((0, 1))
-    c, d = np.zeros((1, 0)), np.ones((1, 1))
+    a = np.zeros((0, 0))
+    b = np.zeros((0, 1))
+    c = np.zeros((1, 0))
+    d = np.ones((1, 1))
     for top, bottom in sections:
-        own = scipy.signal.tf2ss(top, bottom)
-        own_a, own_b, own_c, own_d = own if np.size(bottom) > 1 else _constant(float(top[0] / bottom[0]))
+        section = scipy.signal.tf2ss(top, bottom)
+        own_a, own_b, own_c, own_d = section if np.size(bottom) > 1 else _constant(float(top[0] / bottom[0]))
         upper = np.hstack([a, np.zeros((a.shape[0], own_a.shape[0]))])
-        a, b = np.vstack([upper, np.hstack([own_b @ c, own_a])]), np.vstack([b, own_b @ d])
-        c, d = np.hstack([own_d @ c, own_c]), own_d @ d
+        a = np.vstack([upper, np.hstack([own_b @ c, own_a])])
+        b = np.vstack([b, own_b @ d])
+        c = np.hstack([own_d @ c, own_c])
+        d = own_d @ d
     return a, b, c, d
 
 
@@ -243,9 +247,11 @@ def _written(
         a, b, c, d = in_a_row
         back = np.linalg.inv(turn)
         return turn @ a @ back, turn @ b, c @ back, d
-    top, bottom = np.ones(1), np.ones(1)
+    top = np.ones(1)
+    bottom = np.ones(1)
     for above, below in sections:
-        top, bottom = np.polymul(top, above), np.polymul(bottom, below)
+        top = np.polymul(top, above)
+        bottom = np.polymul(bottom, below)
     if form == "tf2ss":
         return scipy.signal.tf2ss(top, bottom)
     # Observer form: the coefficients in a column, the delays above the diagonal.
@@ -291,7 +297,8 @@ class Compiled:
         """Outputs and commands (T,) from rest; plant None: the error is the reference."""
         nothing = (np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1)))
         a, b, c = (np.ascontiguousarray(each, dtype=float) for each in (plant or nothing)[:3])
-        output, command = np.empty(samples), np.empty(samples)
+        output = np.empty(samples)
+        command = np.empty(samples)
         pointers = [each.ctypes.data_as(ctypes.c_void_p) for each in (a, b, c, output, command)]
         self._run(ctypes.c_int(samples), ctypes.c_double(reference), ctypes.c_int(a.shape[0]), *pointers)
         return output, command
@@ -311,9 +318,9 @@ def judged(draw: Draw, rate: bool) -> tuple[list[str], int]:
     law = flexlink.Controller(*draw.law, draw.dt_s, input_limit=1.0, **settings)
     with tempfile.TemporaryDirectory() as folder:
         code = Compiled(law, Path(folder))
-        found, constant_runs = _constant_errors(draw, code, settling, rise if rate else 0)
-        more, loop_runs = _steps(draw, code, settling, output, command, peak)
-    return found + more, constant_runs + loop_runs
+        constant_errors, constant_runs = _constant_errors(draw, code, settling, rise if rate else 0)
+        step_errors, loop_runs = _steps(draw, code, settling, output, command, peak)
+    return constant_errors + step_errors, constant_runs + loop_runs
 
 
 def _linear(draw: Draw, samples: int) -> tuple[Array, Array]:
@@ -327,12 +334,12 @@ def _linear(draw: Draw, samples: int) -> tuple[Array, Array]:
         np.hstack([-own_d @ c, own_c]),
     ])  # fmt: skip
     x = np.zeros(closed.shape[0])
-    found = np.empty((samples, 2))
+    outputs = np.empty((samples, 2))
     direct = np.array([0.0, own_d[0, 0]])
     for k in range(samples):
-        found[k] = seen @ x + direct
+        outputs[k] = seen @ x + direct
         x = closed @ x + enters[:, 0]
-    return found[:, 0], found[:, 1]
+    return outputs[:, 0], outputs[:, 1]
 
 
 def _constant_errors(draw: Draw, code: Compiled, settling: int, ramp: int) -> tuple[list[str], int]:
@@ -341,7 +348,7 @@ def _constant_errors(draw: Draw, code: Compiled, settling: int, ramp: int) -> tu
     asked = np.ones(samples)
     for top, bottom in draw.sections:
         asked = scipy.signal.lfilter(top, bottom, asked)
-    found = []
+    errors = []
     factors = (1.5, 15.0, 150.0)
     for factor in factors:
         error = factor / abs(float(asked[-1]))
@@ -350,16 +357,20 @@ def _constant_errors(draw: Draw, code: Compiled, settling: int, ramp: int) -> tu
         end = float(np.sign(asked[-1]))
         tail = command[-max(1, samples // 10) :]
         away = float(np.max(np.abs(tail - end)))
-        changes, expected = _sign_changes(command), _sign_changes(clipped)
+        changes = _sign_changes(command)
+        expected = _sign_changes(clipped)
         if away > _LEFT:
-            found.append(f"constant error {factor:g}: {away:.2g} away from the limit, {changes} sign changes")
+            errors.append(
+                f"constant error {factor:g}: {away:.2g} away from the limit, {changes} sign changes"
+            )
         elif changes > expected + 2:  # an overshoot may be cut off where clipping alone did not
-            found.append(f"constant error {factor:g}: {changes} sign changes, clipped {expected}")
-    return found, len(factors)
+            errors.append(f"constant error {factor:g}: {changes} sign changes, clipped {expected}")
+    return errors, len(factors)
 
 
 def _sign_changes(command: Array) -> int:
-    signs = np.sign(command[np.abs(command) > _LEFT])
+    has_sign = np.abs(command) > _LEFT
+    signs = np.sign(command[has_sign])
     return int(np.sum(np.diff(signs) != 0))
 
 
@@ -377,7 +388,7 @@ def _steps(
     # A plant next to its limit moves no faster than by itself.
     own_radius = float(np.max(np.abs(np.linalg.eigvals(draw.plant[0]))))
     slow = settling if integrating else max(settling, int(np.log(1e-3) / np.log(own_radius)))
-    found = []
+    errors = []
     for size in sizes:
         share = min(size, largest)
         run_output, run_command = code.loop(min(16 * slow, 1_000_000), size, draw.plant)
@@ -385,10 +396,10 @@ def _steps(
         off = np.max(np.abs(run_output[tail] - share * output[-1])) / (size * np.max(np.abs(output)))
         off_command = np.max(np.abs(run_command[tail] - share * at_rest))
         if max(off, off_command) > _LEFT:
-            found.append(
+            errors.append(
                 f"step {size * peak:.3g} times the limit: output {off:.2g}, command {off_command:.2g} away"
             )
-    return found, len(sizes)
+    return errors, len(sizes)
 
 
 if __name__ == "__main__":

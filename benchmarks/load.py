@@ -53,11 +53,12 @@ def used_by(*arguments: object) -> tuple[float, float]:
     those of a fork server."""
     command = [sys.executable, "-m", "workflow", *map(str, arguments), "--quiet"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, start_new_session=True)
-    cpu_s, mib = 0.0, 0.0
+    cpu_s = 0.0
+    mib = 0.0
     while process.poll() is None:
-        found = list(of_session(process.pid))
-        cpu_s = max(cpu_s, sum(seconds for seconds, _ in found))
-        mib = max([mib, *(largest for _, largest in found)])
+        processes = list(of_session(process.pid))
+        cpu_s = max(cpu_s, sum(seconds for seconds, _ in processes))
+        mib = max([mib, *(largest for _, largest in processes)])
         time.sleep(0.1)
     if process.returncode:
         raise RuntimeError(f"{arguments[0]} ended with {process.returncode}")
@@ -65,7 +66,7 @@ def used_by(*arguments: object) -> tuple[float, float]:
 
 
 def of_session(leader: int) -> Iterator[tuple[float, float]]:
-    """Of each process there: CPU seconds with those of the dead that it waited for, and its largest MiB."""
+    """CPU seconds and largest MiB of each process of a session, with those of the dead it waited for."""
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError, IndexError):
             # After the name, which may hold blanks: state, parent, group, session, ...
@@ -101,8 +102,8 @@ def run(
             told(out, "identification, samples of one record", size, used_by("identify", log, *roles))
         logs = [write_log(folder / f"{k}.npz", record_samples, k) for k in range(max(records, default=0))]
         for size in filter(None, records):
-            found = used_by("identify", *logs[:size], *roles)
-            told(out, f"identification, records of {record_samples}", size, found)
+            used = used_by("identify", *logs[:size], *roles)
+            told(out, f"identification, records of {record_samples}", size, used)
         for size in filter(None, points):
             values = np.linspace(1.0, 1.5, size).round(4).tolist()
             (folder / "study.toml").write_text(CHEAP_POINTS.replace("[1.0, 1.5]", str(values)))
@@ -110,12 +111,12 @@ def run(
             told(out, "study, points", size, used_by(*call))
         places = [write_case(folder / f"case{k}", seed=k) for k in range(max(cases, default=0))]
         for size in filter(None, cases):
-            more = ("--out", folder / f"out{size}", "--no-controller", "--jobs", 1)
-            told(out, "diagnosis, cases", size, used_by("diagnose", *places[:size], *more))
+            options = ("--out", folder / f"out{size}", "--no-controller", "--jobs", 1)
+            told(out, "diagnosis, cases", size, used_by("diagnose", *places[:size], *options))
         for size in filter(None, case_samples):
             place = write_case(folder / f"long{size}", records=6, samples=size)
-            more = ("--out", folder / f"outlong{size}", "--no-controller", "--jobs", 1)
-            told(out, "diagnosis, samples of each of 6 records", size, used_by("diagnose", place, *more))
+            options = ("--out", folder / f"outlong{size}", "--no-controller", "--jobs", 1)
+            told(out, "diagnosis, samples of each of 6 records", size, used_by("diagnose", place, *options))
 
 
 if __name__ == "__main__":

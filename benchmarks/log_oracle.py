@@ -27,7 +27,12 @@ from ident.data.record import Record
 from tests.ident.generated_logs import Log, generated
 from workflow.cli import main as flexlink
 
-WRONG, UNHELPFUL, HINT = "read wrongly without a word", "refused, no hint helps", "refused, the hint helps"
+# A log that is read otherwise than it was written, and no doubt is told.
+WRONG = "read wrongly without a word"
+# One that is refused, and whose refusal leads nowhere.
+UNHELPFUL = "refused, no hint helps"
+# One that is read once the hint of its refusal is followed.
+HINT = "refused, the hint helps"
 GOOD = ("right", "asked")
 # A refusal is followed that often.
 _HINTS = 4
@@ -46,19 +51,19 @@ def _stop(logs: Any, **_: object) -> None:
 
 def told_by(arguments: Sequence[str]) -> tuple[Record | None, str]:
     """The record that a command goes on with, if it gets so far, and what it prints."""
-    said = io.StringIO()
+    printed = io.StringIO()
     with (
         mock.patch("workflow.commands.identify.identify_logs", _stop),
-        contextlib.redirect_stdout(said),
-        contextlib.redirect_stderr(said),
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(printed),
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("error")
         try:
             flexlink(list(arguments))
         except ReadError as read:
-            return read.record, said.getvalue()
-    return None, said.getvalue()
+            return read.record, printed.getvalue()
+    return None, printed.getvalue()
 
 
 def pasted(said: str, log: Log, path: Path) -> list[str]:
@@ -73,27 +78,27 @@ def pasted(said: str, log: Log, path: Path) -> list[str]:
         "--dt-s": repr(log.dt_s),
     }
     known |= {"--time-unit": log.clock or log.unit, "--decimal": {".": "point", ",": "comma"}[log.decimal]}
-    found: dict[str, list[str]] = {}
+    options: dict[str, list[str]] = {}
     for k, word in enumerate(words):
-        if word.startswith("--") and word not in found:
+        if word.startswith("--") and word not in options:
             value = words[k + 1] if k + 1 < len(words) and not words[k + 1].startswith("--") else ""
             if not command or value.isupper() or not value:
                 value = known.get(word, value)
-            found[word] = [] if word == "--repair" else [value]
-    if "--time" in found:
-        found.pop("--dt-s", None)  # one of them is to be given
-    return [part for option, value in found.items() for part in (option, *value)]
+            options[word] = [] if word == "--repair" else [value]
+    if "--time" in options:
+        options.pop("--dt-s", None)  # one of them is to be given
+    return [part for option, value in options.items() for part in (option, *value)]
 
 
 def difference(record: Record, log: Log) -> str:
     """From the truth; empty if there is none."""
     if abs(record.dt_s - log.dt_s) > 2e-3 * log.dt_s:
         return f"every {record.dt_s:g} s, true {log.dt_s:g} s"
-    for what, found, true in (("input", record.input, log.u), ("output", record.output, log.y)):
-        if len(true) and len(found) != len(true):
-            return f"{len(found)} samples, true {len(true)}"
-        if len(true) and np.any(np.abs(found[:, 0] - true) > 1e-6 * (1 + np.abs(true))):
-            return f"{what} {found[:3, 0]}, true {true[:3]}"
+    for what, signal, true in (("input", record.input, log.u), ("output", record.output, log.y)):
+        if len(true) and len(signal) != len(true):
+            return f"{len(signal)} samples, true {len(true)}"
+        if len(true) and np.any(np.abs(signal[:, 0] - true) > 1e-6 * (1 + np.abs(true))):
+            return f"{what} {signal[:3, 0]}, true {true[:3]}"
     if log.reference and record.reference_names != (log.reference,):
         return f"reference {record.reference_names}, true {log.reference}"
     for unit, true_unit in zip((*record.input_units, *record.output_units), log.units, strict=False):
@@ -104,14 +109,20 @@ def difference(record: Record, log: Log) -> str:
 
 def outcome(log: Log, folder: Path) -> tuple[str, str]:
     """What became of a log, and the words that say why."""
-    path, options = folder / log.file, list[str]()
+    path = folder / log.file
+    options = list[str]()
     path.write_bytes(log.content)
     record, first = told_by(["identify", str(path)])
-    said, follows = first, 0
-    while record is None and follows < _HINTS and (more := pasted(said, log, path)):
-        options, follows = [*options, *more], follows + 1
-        record, said = told_by(["identify", str(path), *options])
-    why = f"{first.strip()} -> {shlex.join(options)} -> {said.strip()}".replace(str(folder), "")
+    last = first
+    follows = 0
+    while record is None and follows < _HINTS:
+        hinted = pasted(last, log, path)
+        if not hinted:
+            break
+        options = [*options, *hinted]
+        follows = follows + 1
+        record, last = told_by(["identify", str(path), *options])
+    why = f"{first.strip()} -> {shlex.join(options)} -> {last.strip()}".replace(str(folder), "")
     if record is None:
         return ("right" if log.answer == "refuse" else UNHELPFUL), why
     if log.told and log.told not in told_by(["look", str(path)])[1]:
@@ -122,22 +133,25 @@ def outcome(log: Log, folder: Path) -> tuple[str, str]:
     if not follows:
         if wrong and log.answer == "ask" and record.doubts:
             return "asked", ""
-        return ("read wrongly, a doubt is told" if record.doubts else WRONG) if wrong else "right", wrong
+        if not wrong:
+            return "right", wrong
+        return "read wrongly, a doubt is told" if record.doubts else WRONG, wrong
     if wrong and not (log.answer == "refuse" or (log.answer == "ask" and record.doubts)):
         return "read wrongly after its hint", f"{wrong}: {why}"
     return ("asked" if log.answer != "read" else HINT), why
 
 
 def run(out: Print, *, seed: int = 47, count: int = 1000, examples: int = 40) -> None:
-    found, shown = Counter[str](), list[str]()
+    outcomes = Counter[str]()
+    shown = list[str]()
     with tempfile.TemporaryDirectory(prefix="flexlink-") as folder:
         for number in range(count):
             log = generated(seed, number)
             what, why = outcome(log, Path(folder))
-            found[what] += 1
+            outcomes[what] += 1
             shown += [] if what in GOOD else [f"{what}: [{number}] {log.kind}: {why}"]
     out(f"{count} logs")
-    for what, many in found.most_common():
+    for what, many in outcomes.most_common():
         out(f"{what:<40}{many:6d}{many / count:9.1%}")
     for line in shown[:examples]:
         out(f"    {' '.join(line.split())[:500]}")

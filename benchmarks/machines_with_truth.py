@@ -30,8 +30,8 @@ def answered(folder: Path, work: Path) -> tuple[float, int, str]:
     logs = [str(path) for path in sorted(folder.glob("run*.csv"))]
     call = ["run", *logs, "--out", str(work / "run"), "--replace", "--json"]
     begun = time.monotonic()
-    code, text, said = flexlink(*call)
-    line = str(json.loads(text).get("verdict")) if text.lstrip().startswith("{") else said[-1]
+    code, text, lines = flexlink(*call)
+    line = str(json.loads(text).get("verdict")) if text.lstrip().startswith("{") else lines[-1]
     return time.monotonic() - begun, code, line
 
 
@@ -41,20 +41,23 @@ def told(folder: Path, work: Path) -> list[str]:
     from workflow.tasks.results import RunResults
 
     truth = json.loads((folder / "truth.json").read_text())
-    run, said = RunDirectory(work / "run"), list[str]()
+    run = RunDirectory(work / "run")
+    sentences = list[str]()
     if run.stage_file("uncertainty") is None:
         return ["no ellipses"]
     results = RunResults(run)
-    channel, spread = results.identify.channels[0], results.uncertainty.channels[0]
+    channel = results.identify.channels[0]
+    spread = results.uncertainty.channels[0]
     response = truth["friction_free_response"]
     omega = np.array(response["omega_rad_s"])
     g = np.array(response["real"]) + 1j * np.array(response["imag"])
     records = results.records.of_role("estimation")
     power = np.zeros(omega.size)
     for item in records:
-        u, dt = item.record.input[:, 0], item.record.dt_s
-        f, own = scipy.signal.welch(u - u.mean(), 1 / dt, nperseg=min(u.size, round(4 / dt)))
-        power = power + np.interp(omega / (2 * np.pi), f, own, right=0.0)
+        u = item.record.input[:, 0]
+        dt = item.record.dt_s
+        f, spectrum = scipy.signal.welch(u - u.mean(), 1 / dt, nperseg=min(u.size, round(4 / dt)))
+        power = power + np.interp(omega / (2 * np.pi), f, spectrum, right=0.0)
     excited = power > 1e-3 * power.max()
     inside = np.zeros(np.count_nonzero(excited), bool)
     for member in spread.members:
@@ -64,27 +67,28 @@ def told(folder: Path, work: Path) -> list[str]:
         inside |= distance <= _RADIUS_2
     ellipses = spread.posterior.at(omega[excited], spread.level)
     low, high = omega[excited][[0, -1]] / (2 * np.pi)
-    said.append(f"ellipses {np.mean(inside):.0%} of {low:.2f} to {high:.1f} Hz")
+    sentences.append(f"ellipses {np.mean(inside):.0%} of {low:.2f} to {high:.1f} Hz")
     width = np.sqrt(np.trace(ellipses.covariance, axis1=1, axis2=2)) / np.abs(g[excited])
     error = np.abs(g[excited] - ellipses.centre) / np.abs(g[excited])
-    said.append(f"error {np.median(error):.1%}, width {np.median(width):.1%}")
+    sentences.append(f"error {np.median(error):.1%}, width {np.median(width):.1%}")
     if results.identify.friction is not None:
-        found = results.identify.friction
+        friction = results.identify.friction
         true = sum(truth["coulomb_at_each_inertia_in_command_units"])
-        said.append(f"friction {found.level:.4g} ± {found.level_std:.2g} (Coulomb {true:.4g})")
-    told = (
+        sentences.append(f"friction {friction.level:.4g} ± {friction.level_std:.2g} (Coulomb {true:.4g})")
+    is_told = (
         [True] * len(channel.modes) if spread.intervals is None else [m.told for m in spread.intervals.modes]
     )
     modes = [
         f"{mode.frequency_Hz:.2f} ({mode.damping:.3f})"
-        for mode, known in zip(channel.modes, told, strict=True)
+        for mode, known in zip(channel.modes, is_told, strict=True)
         if known and channel.is_mode(mode)
     ]
     true_modes = [
         f"{f:.2f} ({z:.3f})" for f, z in zip(truth["modes_hz"], truth["mode_dampings"], strict=True)
     ]
-    said.append(f"modes {', '.join(modes) or 'none'} Hz (true {', '.join(true_modes)})")
-    law, verdict = results.design.controller, results.certify.certificate
+    sentences.append(f"modes {', '.join(modes) or 'none'} Hz (true {', '.join(true_modes)})")
+    law = results.design.controller
+    verdict = results.certify.certificate
     if law is not None and verdict is not None:
         z = np.exp(1j * omega * law.dt_s)
         k = np.array(
@@ -92,10 +96,10 @@ def told(folder: Path, work: Path) -> list[str]:
         )
         nearest = np.min(np.abs(1 + k * g))
         stated = min(plant.worst_margins.modulus for plant in verdict.plants)
-        said.append(f"modulus margin {nearest:.3f}, stated {stated:.3f}")
+        sentences.append(f"modulus margin {nearest:.3f}, stated {stated:.3f}")
         if nearest < 0.99 * stated:
-            said.append("VIOLATED")
-    return said
+            sentences.append("VIOLATED")
+    return sentences
 
 
 def run(
@@ -111,8 +115,8 @@ def run(
             work.mkdir(parents=True, exist_ok=True)
             return answered(folder.absolute(), work), told(folder, work)
 
-        for folder, ((seconds, code, line), said) in zip(folders, pool.map(one, folders), strict=True):
-            out(f"{folder.name}: exit {code}, {seconds:.0f} s, {'; '.join(said)}; {line}")
+        for folder, ((seconds, code, line), sentences) in zip(folders, pool.map(one, folders), strict=True):
+            out(f"{folder.name}: exit {code}, {seconds:.0f} s, {'; '.join(sentences)}; {line}")
     out(f"CPU {resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime:.0f} s")
 
 

@@ -50,7 +50,8 @@ def tustin(a, b, c, d, dt_s):
 
 def continuous(controller: Controller):
     """A, B, C, D of the controller in Tustin's s."""
-    a, dt = controller.A, controller.dt_s
+    a = controller.A
+    dt = controller.dt_s
     inverse = np.linalg.inv(a + np.eye(a.shape[0]))
     c = controller.C
     return (
@@ -65,7 +66,8 @@ def plant_t(ball: float = 1.0) -> MultivariablePlant:
     """Problem T, its ball `ball` times as large."""
     a, b, c = two_joints()
     parts = []
-    top, bottom = 0.008 * np.polymul([1 / 10, 1], [1 / 300, 1]), np.polymul([1, 0.02], [1 / 3, 1])
+    top = 0.008 * np.polymul([1 / 10, 1], [1 / 300, 1])
+    bottom = np.polymul([1, 0.02], [1 / 3, 1])
     rows = [(tf2ss(top, bottom), row) for row in SHAPE_T]
     rows += [(tf2ss([0.008 * size], [1 / w**2, 0.04 / w, 1]), np.array(v)) for w, size, v in MODES_T]
     for (fa, fb, fc, fd), row in rows:
@@ -131,13 +133,14 @@ def run(out: Print, *, cases: str = "all") -> None:
     for name, (plant, specification) in CASES.items():
         if cases not in ("all", name):
             continue
-        given, asked = plant(), specification()
+        nominal_plant = plant()
+        asked = specification()
         for starts in (1, 3):
             options = MultivariableOptions(starts=starts)
             start = time.process_time()
-            result = synthesise_multivariable(given, asked, options)
+            result = synthesise_multivariable(nominal_plant, asked, options)
             seconds = time.process_time() - start
-            verdict = certify_multivariable(result.controller, given, asked).verdicts[0]
+            verdict = certify_multivariable(result.controller, nominal_plant, asked).verdicts[0]
             bound = max(verdict.bounds.values())
             out(
                 f"{name:18s} order {asked.controller_order}, starts {starts}: synthesis "

@@ -36,8 +36,10 @@ def two_joints() -> tuple[Array, Array, Array]:
     a = np.block([[np.zeros((4, 4)), np.eye(4)], [-solve(m, stiffness), -solve(m, damping)]])
     b = np.vstack([np.zeros((4, 2)), solve(m, force)])
     whole = np.zeros((10, 10))
-    whole[:8, :8], whole[:8, 8:] = a * TS, b * TS
-    power, exponential = np.eye(10), np.eye(10)
+    whole[:8, :8] = a * TS
+    whole[:8, 8:] = b * TS
+    power = np.eye(10)
+    exponential = np.eye(10)
     for k in range(1, 40):  # |A Ts| < 3: the series reaches rounding by then
         power = power @ whole / k
         exponential = exponential + power
@@ -87,19 +89,23 @@ def w3_t(s: Array) -> Array:
 
 def grid_t(finer: int = 1) -> Array:
     """omega (F,) of the judge of T, rad/s."""
-    low, high = 1e-3, 0.9999 * np.pi / TS
+    low = 1e-3
+    high = 0.9999 * np.pi / TS
     t = np.linspace(-6, 6, 150 * finer)
     near = [f * np.exp(0.5 * np.sinh(t) / np.sinh(6)) for f in (12, 12.62, 26, 28.2)]
     omega = np.concatenate([np.geomspace(low, high, 500 * finer), *near])
-    return np.sort(omega[(omega >= low) & (omega <= high)])
+    is_inside = (omega >= low) & (omega <= high)
+    return np.sort(omega[is_inside])
 
 
 def stable_t(a: Array, b: Array, c: Array, d: Array) -> bool:
     """Whether K(s) = C (sI - A)^-1 B + D by Tustin's rule stabilises the nominal plant of T."""
     n = a.shape[0]
     inverse = np.linalg.inv(np.eye(n) - a * TS / 2)
-    ad, bd = inverse @ (np.eye(n) + a * TS / 2), inverse @ b * TS
-    cd, dd = c @ inverse, d + c @ inverse @ b * TS / 2
+    ad = inverse @ (np.eye(n) + a * TS / 2)
+    bd = inverse @ b * TS
+    cd = c @ inverse
+    dd = d + c @ inverse @ b * TS / 2
     ga, gb, gc = two_joints()
     closed = np.block([[ga - gb @ dd @ gc, -gb @ cd], [bd @ gc, ad]])
     return bool(np.max(np.abs(np.linalg.eigvals(closed))) < 1)
@@ -107,12 +113,16 @@ def stable_t(a: Array, b: Array, c: Array, d: Array) -> bool:
 
 def worst_gain(m11: Array, m12: Array, m21: Array, m22: Array, chi: float) -> Array:
     """Largest norm of the upper LFT over the ball, per frequency (F,): one convex scalar search, exact."""
-    h11, h12 = herm(m11) @ m11, herm(m11) @ m12
+    h11 = herm(m11) @ m11
+    h12 = herm(m11) @ m12
     norm = chi * np.linalg.norm(m11, 2, axis=(1, 2))
     inside = norm < 1
     eye1 = np.eye(m11.shape[2])
-    r11, r12, r22 = herm(m21) @ m21, herm(m21) @ m22, herm(m22) @ m22
-    c2, g22 = chi**2, herm(m12) @ m12
+    r11 = herm(m21) @ m21
+    r12 = herm(m21) @ m22
+    r22 = herm(m22) @ m22
+    c2 = chi**2
+    g22 = herm(m12) @ m12
     base = eye1 - c2 * h11
     inverse = np.linalg.inv(np.where(inside[:, None, None], base, eye1))
     # A > 0 from here on: x0 = largest eigenvalue of M21'M21 against I - chi^2 M11'M11.
@@ -125,13 +135,17 @@ def worst_gain(m11: Array, m12: Array, m21: Array, m22: Array, chi: float) -> Ar
         whole = x * c2 * g22 + r22 + herm(b) @ np.linalg.solve(a, b)
         return np.linalg.eigvalsh((whole + herm(whole)) / 2)[:, -1]
 
-    low, high = np.full(norm.size, -30.0), np.full(norm.size, 40.0)
+    low = np.full(norm.size, -30.0)
+    high = np.full(norm.size, 40.0)
     share = (np.sqrt(5) - 1) / 2
-    left, right = high - share * (high - low), low + share * (high - low)
-    f_left, f_right = value(left), value(right)
+    left = high - share * (high - low)
+    right = low + share * (high - low)
+    f_left = value(left)
+    f_right = value(right)
     for _ in range(90):
         smaller = f_left < f_right
-        high, low = np.where(smaller, right, high), np.where(smaller, low, left)
+        high = np.where(smaller, right, high)
+        low = np.where(smaller, low, left)
         new = np.where(smaller, high - share * (high - low), low + share * (high - low))
         f_new = value(new)
         left, f_left, right, f_right = (
@@ -165,16 +179,18 @@ def judge_t(
     omega = grid_t() if omega is None else omega
     s = 2j / TS * np.tan(omega * TS / 2)
     k = c @ solve(s[:, None, None] * np.eye(a.shape[0]) - a, b + 0j) + d
-    g, li = nominal_t(s), factor_t(s)
+    g = nominal_t(s)
+    li = factor_t(s)
     s0 = np.linalg.inv(np.eye(2) + g @ k)
-    found, nominal = [], 0.0
+    largest = []
+    nominal = 0.0
     for weighted in (w1_t(s) @ s0, w3_t(s) @ k @ s0):
         # chi goes with Li: |Delta| <= 1 then, and the formula's chi is 1.
         chi = CHI * ball
         m = chi * li @ k @ s0
-        found.append(float(np.max(worst_gain(m @ LO, m, weighted @ LO, weighted, 1.0))))
+        largest.append(float(np.max(worst_gain(m @ LO, m, weighted @ LO, weighted, 1.0))))
         nominal = max(nominal, float(np.max(np.linalg.norm(weighted, 2, axis=(1, 2)))))
-    return Judged(*found, nominal)
+    return Judged(*largest, nominal)
 
 
 def reference_t() -> tuple[Array, Array, Array, Array]:
@@ -183,7 +199,8 @@ def reference_t() -> tuple[Array, Array, Array, Array]:
     for k, wi, zero, pole in ((8.0255, 0.0467, 1.1844, 28.1681), (12.7493, 0.0263, 3.2877, 55.733)):
         top = k * np.polymul([1, wi], [1 / zero, 1])
         bottom = np.polymul([1, 0], np.polymul([1 / pole, 1], [1 / pole, 1]))
-        top, bottom = top / bottom[0], bottom / bottom[0]
+        top = top / bottom[0]
+        bottom = bottom / bottom[0]
         companion = np.array([[0.0, 1, 0], [0, 0, 1], -bottom[:0:-1]])
         parts.append((companion, np.array([[0.0], [0], [1]]), top[::-1][None, :]))
     (a1, b1, c1), (a2, b2, c2) = parts
@@ -236,9 +253,12 @@ def judge_d(k: Response) -> float:
     """mu of problem D: the D-scaled bound, exact for its three blocks. Stability is the caller's."""
     omega = np.geomspace(1e-6, 1e4, 1201)
     s = 1j * omega
-    g, kk = nominal_d(s), k(s)
+    g = nominal_d(s)
+    kk = k(s)
     s0 = np.linalg.inv(np.eye(2) + g @ kk)
-    ks, wi, wp = kk @ s0, w_i(s)[:, None, None], w_p(s)[:, None, None]
+    ks = kk @ s0
+    wi = w_i(s)[:, None, None]
+    wp = w_p(s)[:, None, None]
     m = np.concatenate(
         [np.concatenate([wi * ks @ g, wi * ks], axis=2), np.concatenate([wp * s0 @ g, wp * s0], axis=2)],
         axis=1,
@@ -256,7 +276,8 @@ def judge_d(k: Response) -> float:
             :, None
         ]
     )
-    best, step = norm(x), np.full(omega.size, 1.0)
+    best = norm(x)
+    step = np.full(omega.size, 1.0)
     angles = np.arange(8) * np.pi / 4
     for _ in range(150):
         moved = False
@@ -265,7 +286,8 @@ def judge_d(k: Response) -> float:
             trial = x + step[:, None] * np.array([np.cos(angle), np.sin(angle)])
             value = norm(trial)
             better = value < best
-            x, best = np.where(better[:, None], trial, x), np.where(better, value, best)
+            x = np.where(better[:, None], trial, x)
+            best = np.where(better, value, best)
             gained |= better
             moved |= bool(np.any(better))
         step = np.where(gained, step, step / 2)

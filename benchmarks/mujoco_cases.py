@@ -32,13 +32,35 @@ from benchmarks.harness import Print, main, timed
 from diagnosis import PlantCase, PlantExperiment, diagnose
 from diagnosis.machine.mujoco_plant import MujocoArm
 
-DT_S, STEP_S, SAMPLES, NOISE_RAD, MODEL_ERROR = 0.01, 0.0025, 300, 2e-4, 0.02
+# Sampling period of the logs.
+DT_S = 0.01
+# Step of the simulation.
+STEP_S = 0.0025
+# Rows of a log.
+SAMPLES = 300
+# Noise of an angle, standard deviation.
+NOISE_RAD = 2e-4
+# Share of the motion that does not matter.
+MODEL_ERROR = 0.02
+# Acceleration of gravity, m/s^2.
 GRAVITY = 9.81
 INTEGRATORS = ("Euler", "RK4", "implicit", "implicitfast")
-# Motors, motors behind a gear, position servos (stiffness, damping).
-DRIVES, GEAR, SERVO = ("motor", "gear", "servo"), 20.0, ((60.0, 6.0), (25.0, 2.0))
-MOVING = 70  # rows that a log lacks at its start
-LENGTHS_M, MASSES_KG, DAMPING, ARMATURE = (0.3, 0.25), (1.2, 0.8), (0.25, 0.12), (0.03, 0.015)
+# Motors, motors behind a gear, position servos.
+DRIVES = ("motor", "gear", "servo")
+# Ratio of the gears.
+GEAR = 20.0
+# Stiffness and damping of each servo.
+SERVO = ((60.0, 6.0), (25.0, 2.0))
+# Rows that a log lacks at its start.
+MOVING = 70
+# Lengths of the links.
+LENGTHS_M = (0.3, 0.25)
+# Their masses.
+MASSES_KG = (1.2, 0.8)
+# Viscous damping of the joints, N m s/rad.
+DAMPING = (0.25, 0.12)
+# Armature inertia of the joints, kg m^2.
+ARMATURE = (0.03, 0.015)
 JOINTS = ("shoulder", "elbow")
 
 # Effect, joints of the arm, joint it is at. Where gravity does not act ("tilt"), the arm lies flat.
@@ -87,7 +109,7 @@ class Truth:
 
     @property
     def name(self) -> str:
-        """Of the candidate that is right."""
+        """Name of the candidate that is right."""
         joint = JOINTS[self.joint]
         names = {
             "none": "none",
@@ -103,7 +125,7 @@ class Truth:
 
     @property
     def value(self) -> float:
-        """Of the quantity in the repaired model."""
+        """Value of the quantity in the repaired model."""
         if self.effect == "tilt":
             return GRAVITY * float(np.sin(self.size))
         whole = {"damping": self.damping, "armature": self.armature}
@@ -111,10 +133,10 @@ class Truth:
 
     def of(self, effect: str, without: float) -> Any:
         """(n,) of a quantity of the joints, with the effect's size at its joint."""
-        found = np.full(self.n, without)
+        values = np.full(self.n, without)
         if self.effect == effect:
-            found[self.joint] = self.size
-        return found
+            values[self.joint] = self.size
+        return values
 
 
 def xml_of(
@@ -184,10 +206,12 @@ class InMujoco:
         return self.data.qpos.copy()
 
     def step(self, torque: Any) -> None:
-        level, spring = self.truth.of("frictionloss", 0.0), self.truth.of("stiffness", 0.0)
+        level = self.truth.of("frictionloss", 0.0)
+        spring = self.truth.of("stiffness", 0.0)
         kp, kv = np.array(SERVO[: self.truth.n]).T
         for _ in range(round(5 * DT_S / STEP_S)):
-            v, held = self.data.qvel, torque
+            v = self.data.qvel
+            held = torque
             if self.truth.drive == "servo":  # the command is an angle
                 held = kp * (torque - self.data.qpos) - kv * v
             self.data.ctrl[:] = held * self.truth.of("gain", 1.0)
@@ -253,7 +277,9 @@ def _slope(y, torque, n, m, d, a, level, spring, load, along, across):  # type: 
     q1, q2, v1, v2 = y
     i1 = m[0] * (l1 * l1 / 3 + 0.02 * 0.02 / 12)
     i2 = m[1] * (l2 * l2 / 3 + 0.02 * 0.02 / 12)
-    s1, s2, m2 = m[0] * l1 / 2, m[1] * l2 / 2, m[1]
+    s1 = m[0] * l1 / 2
+    s2 = m[1] * l2 / 2
+    m2 = m[1]
     if n == 1:
         i1 += load * l1 * l1
         s1 += load * l1
@@ -261,13 +287,15 @@ def _slope(y, torque, n, m, d, a, level, spring, load, along, across):  # type: 
         i2 += load * l2 * l2
         s2 += load * l2
         m2 += load
-    c, s = np.cos(q2), np.sin(q2)
+    c = np.cos(q2)
+    s = np.sin(q2)
     h = l1 * s2
     j11 = i1 + i2 + m2 * l1 * l1 + 2 * h * c + a[0]
-    j12, j22 = i2 + h * c, i2 + a[1]
+    j12 = i2 + h * c
+    j22 = i2 + a[1]
     # Gravity moments: a rod at angle q points along (cos q, sin q); its weight pulls along (along, across).
-    one = s1 + m2 * l1
-    g1 = -one * np.sin(q1) * along + one * np.cos(q1) * across
+    shoulder_moment = s1 + m2 * l1
+    g1 = -shoulder_moment * np.sin(q1) * along + shoulder_moment * np.cos(q1) * across
     g2 = -s2 * np.sin(q1 + q2) * along + s2 * np.cos(q1 + q2) * across
     f1 = torque[0] - d[0] * v1 - level[0] * np.tanh(v1 / 5e-3) - spring[0] * q1 + g1 + g2
     f2 = torque[1] - d[1] * v2 - level[1] * np.tanh(v2 / 5e-3) - spring[1] * q2 + g2
@@ -287,16 +315,20 @@ def at_rest(truth: Truth) -> Any:
 def record(truth: Truth, rng: np.random.Generator, *, by_equations: bool) -> tuple[Any, Any]:
     """Commands and readings (T, n) under the controller."""
     machine: InMujoco | ByEquations = ByEquations(truth) if by_equations else InMujoco(truth)
-    n, rows = truth.n, SAMPLES + (MOVING if truth.moving else 0)
+    n = truth.n
+    rows = SAMPLES + (MOVING if truth.moving else 0)
     steps = np.repeat(rng.uniform(-1.0, 1.0, (rows // 60 + 1, n)), 60, axis=0)[:rows]
     steps[:20] = 0.0
     reference = at_rest(truth) + sosfilt(butter(2, 2.5, fs=1 / DT_S, output="sos"), steps, axis=0)
-    kp, kd = np.array([25.0, 10.0])[:n], np.array([2.5, 0.8])[:n]
+    kp = np.array([25.0, 10.0])[:n]
+    kd = np.array([2.5, 0.8])[:n]
     offset = truth.of("sensor_offset", 0.0)
     first = at_rest(truth) if truth.drive == "servo" else np.zeros(n)
     queue = deque([first] * 40, maxlen=40)
-    lagged, last = first, None
-    U, Y = np.zeros((rows, n)), np.zeros((rows, n))
+    lagged = first
+    last = None
+    U = np.zeros((rows, n))
+    Y = np.zeros((rows, n))
     for k in range(rows):
         q = machine.angle + offset + NOISE_RAD * rng.standard_normal(n)
         speed = np.zeros(n) if last is None else (q - last) / DT_S
@@ -313,7 +345,9 @@ def record(truth: Truth, rng: np.random.Generator, *, by_equations: bool) -> tup
         mean = sent + (lagged - sent) * np.where(T > 0, T / DT_S * (1 - keep), 0.0)
         lagged = keep * lagged + (1 - keep) * sent
         machine.step(mean if isinstance(machine, InMujoco) else mean * truth.of("gain", 1.0))
-        U[k], Y[k], last = u / (GEAR if truth.drive == "gear" else 1.0), q, q
+        U[k] = u / (GEAR if truth.drive == "gear" else 1.0)
+        Y[k] = q
+        last = q
     return U[rows - SAMPLES :], Y[rows - SAMPLES :]
 
 
@@ -432,10 +466,11 @@ def answer(number: int, seed: int) -> Answer:
             size_in_words += " (in its interval)"
 
     source = "equations" if _by_equations(number) else "MuJoCo"
-    said = ", ".join(diagnosis.combination) or diagnosis.verdict
+    answer = ", ".join(diagnosis.combination) or diagnosis.verdict
     line = (
         f"{number:3d} {source:9s} {truth.integrator:12s} {truth.drive:5s} "
-        f"{'moving' if truth.moving else 'rest':6s} {truth.n} {truth.name:26s} {size_in_words:42s} -> {said} "
+        f"{'moving' if truth.moving else 'rest':6s} {truth.n} {truth.name:26s} {size_in_words:42s} "
+        f"-> {answer} "
         f"{diagnosis.probability:.3f} (gap {diagnosis.gap_refit:.1f} to {diagnosis.gap_after:.1f}, "
         f"{cpu_s:.0f} s)"
     )

@@ -80,9 +80,9 @@ def workshop_case(seed: int, count: int, number: int) -> LabelledCase:
     """The number-th of `count` cases of independent rigs; another count makes other cases."""
     names = [case_name(k) for k in range(count)]
     # Cases that count as finished are not made.
-    others: dict[str, dict[str, Any]] = {name: {} for name in names if name != names[number]}
+    finished: dict[str, dict[str, Any]] = {name: {} for name in names if name != names[number]}
     with tempfile.TemporaryDirectory() as folder:
-        answers = generate(count, seed, Path(folder), workshop=True, finished=others)
+        answers = generate(count, seed, Path(folder), workshop=True, finished=finished)
         case = load_case(Path(folder) / names[number]).case
     answer = answers[number]
     present = tuple(effect["name"] for effect in answer["effects"])
@@ -197,13 +197,13 @@ def training_case(labelled: LabelledCase) -> TrainingCase | str:
     explanations = explanations_to_judge(search, judge.judgement.nominal)
     sets = tuple(
         TrainingSet(
-            one.log_prior,
-            one.features,
-            one.rest_features,
-            one.repair_share,
-            features_of_effects(search, one.explanation, explanations),
+            of_set.log_prior,
+            of_set.features,
+            of_set.rest_features,
+            of_set.repair_share,
+            features_of_effects(search, of_set.explanation, explanations),
         )
-        for one in features_of_sets(search, explanations, shares_of_sets(judge.trials))
+        for of_set in features_of_sets(search, explanations, shares_of_sets(judge.trials))
     )
     return TrainingCase(
         labelled.route,
@@ -237,16 +237,17 @@ def case_of_line(line: str) -> TrainingCase | str:
     if stored["feature_names"] != {title: list(names) for title, names in TABLES.items()}:
         raise ValueError("made with other features than this version has; delete the file")
     sets = []
-    for one in stored["sets"]:
+    for stored_set in stored["sets"]:
         effects = [
-            EffectFeatures(**{**effect, "features": tuple(effect["features"])}) for effect in one["effects"]
+            EffectFeatures(**{**effect, "features": tuple(effect["features"])})
+            for effect in stored_set["effects"]
         ]
         sets.append(
             TrainingSet(
-                one["log_prior"],
-                tuple(one["features"]),
-                tuple(one["rest_features"]),
-                one["repair_share"],
+                stored_set["log_prior"],
+                tuple(stored_set["features"]),
+                tuple(stored_set["rest_features"]),
+                stored_set["repair_share"],
                 tuple(effects),
             )
         )
@@ -262,7 +263,7 @@ def case_of_line(line: str) -> TrainingCase | str:
 
 
 def collected(route: Route, folder: Path) -> list[TrainingCase | str]:
-    """All cases of a route; those that its file in the folder lacks are made and added to it.
+    """Cases of a route; those that its file in the folder lacks are made and added to it.
 
     Raises
     ------
@@ -283,12 +284,12 @@ def collected(route: Route, folder: Path) -> list[TrainingCase | str]:
             raise ValueError(f"{file}, line {number + 1}: {error}") from None
     for number in range(len(cases), route.count):
         labelled = route.case(number)
-        found, cpu_s = timed(partial(training_case, labelled))
+        case, cpu_s = timed(partial(training_case, labelled))
         with file.open("a", encoding="utf-8") as end:
-            end.write(line_of(found) + "\n")
-        cases.append(found)
+            end.write(line_of(case) + "\n")
+        cases.append(case)
         truth = ", ".join((*labelled.present, *(f"({name})" for name in labelled.unlisted))) or "none"
-        result = found if isinstance(found, str) else f"{len(found.sets)} sets"
+        result = case if isinstance(case, str) else f"{len(case.sets)} sets"
         print(f"{route.name} {number + 1}: {truth}: {result} ({cpu_s:.1f} s)", flush=True)
     return cases
 
@@ -297,7 +298,7 @@ def collected(route: Route, folder: Path) -> list[TrainingCase | str]:
 
 
 def by_route_and_truth(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
-    """All outcomes, those of each route, and those of each sort of truth."""
+    """Outcomes by the name of their group: "all", each route, and each sort of truth."""
     groups: dict[str, list[Outcome]] = {"all": list(outcomes)}
     for route in sorted({each.case.route for each in outcomes}):
         groups[route] = [each for each in outcomes if each.case.route == route]
@@ -367,18 +368,21 @@ def calibration_picture(outcomes: Sequence[Outcome], path: Path) -> None:
         (f"first answer ({len(answers)})", "o", ANSWER_EDGES, answers),
         (f"presence of an effect ({len(presences)})", "s", PRESENCE_EDGES, presences),
     ):
-        said, right, below, above = [], [], [], []
+        probabilities = []
+        right = []
+        below = []
+        above = []
         for low, high in pairwise(edges):
             within = [pair for pair in pairs if low <= pair[0] < high or pair[0] == high == 1]
             if not within:
                 continue
             share = float(np.mean([is_right for _, is_right in within]))
             interval = binomtest(sum(is_right for _, is_right in within), len(within)).proportion_ci(0.95)
-            said.append(float(np.mean([probability for probability, _ in within])))
+            probabilities.append(float(np.mean([probability for probability, _ in within])))
             right.append(share)
             below.append(max(share - interval.low, 0.0))
             above.append(max(interval.high - share, 0.0))
-        axes.errorbar(said, right, yerr=[below, above], fmt=marker, capsize=3, label=label)
+        axes.errorbar(probabilities, right, yerr=[below, above], fmt=marker, capsize=3, label=label)
     axes.set_xlabel("probability that was said (1)")
     axes.set_ylabel("share that was right (1), with 95 % interval")
     axes.set_title(f"Names beside a model error: {len(outcomes)} cases, cross-validated")
@@ -419,13 +423,13 @@ def run(
     """
     place = Path(folder)
     place.mkdir(parents=True, exist_ok=True)
-    found: list[TrainingCase | str] = []
+    collected_cases: list[TrainingCase | str] = []
     for route in routes(workshop=workshop, mujoco=mujoco, mujoco_off_list=mujoco_off_list, made=made):
-        found += collected(route, place)
-    cases = [each for each in found if isinstance(each, TrainingCase)]
+        collected_cases += collected(route, place)
+    cases = [each for each in collected_cases if isinstance(each, TrainingCase)]
     counts = Counter(case.route for case in cases)
     out(f"{len(cases)} cases: {', '.join(f'{count} {route}' for route, count in counts.items())}")
-    for reason, count in Counter(each for each in found if isinstance(each, str)).items():
+    for reason, count in Counter(each for each in collected_cases if isinstance(each, str)).items():
         out(f"left out {count}: {reason}")
     if not fit:
         return

@@ -229,7 +229,11 @@ class TrainingData:
         # Effects of all sets one below the other. places: (S, most effects of a set) -> row of the effect,
         # the one that carries most first; E, a row behind the last, where the set has fewer.
         pairs: dict[tuple[int, str], int] = {}
-        features, is_answer, interests, by_name, pair_of_effect = [], [], [], [], []
+        features = []
+        is_answer = []
+        interests = []
+        by_name = []
+        pair_of_effect = []
         rows = [[] for _ in sets]  # type: list[list[int]]
         for row, (i, fitted) in zip(rows, sets, strict=True):
             for effect in fitted.effects:
@@ -240,13 +244,13 @@ class TrainingData:
                 by_name.append(effect.by_name)
                 pair_of_effect.append(pairs.setdefault((i, effect.name), len(pairs)))
         count = len(features)
-        most = max(map(len, rows))
+        longest_row = max(map(len, rows))
         self.effect_features = np.array(features).reshape(count, len(EFFECT_FEATURES))
         self.is_answer = np.array(is_answer, dtype=bool)
         self.interests = np.array(interests)
         self.by_name = np.array(by_name)
-        self.places = np.array([row + [count] * (most - len(row)) for row in rows], dtype=int)
-        self.places = self.places.reshape(len(sets), most)
+        self.places = np.array([row + [count] * (longest_row - len(row)) for row in rows], dtype=int)
+        self.places = self.places.reshape(len(sets), longest_row)
         # Effects without a set of their own belong to the pair behind the last.
         self.pair_of_effect = np.array([*pair_of_effect, len(pairs)], dtype=int)
         self.pairs = tuple(pairs)
@@ -412,23 +416,23 @@ class Outcome:
 
 def outcome(case: TrainingCase, model: NamingModel) -> Outcome:
     """How a model answers a case."""
-    said = answered(case, model)
-    first = said.answer
+    answer = answered(case, model)
+    first = answer.answer
     shares: dict[str, float] = {}
     weights = model.set_probabilities(case.sets)  # type: ignore[arg-type]
     for place in np.argsort(weights):  # the likeliest set last: its shares count
         shares |= {effect.name: effect.share for effect in case.sets[place].effects}
     is_right = first in case.right_causes
-    is_exact = is_right and set(accepted_set(said, first, shares)) == case.present
-    squares = [(p - (name in case.present)) ** 2 for name, p in said.presence.items()]
-    right = sum(said.cause.get(name, 0.0) for name in case.right_causes)
+    is_exact = is_right and set(accepted_set(answer, first, shares)) == case.present
+    squares = [(p - (name in case.present)) ** 2 for name, p in answer.presence.items()]
+    right = sum(answer.cause.get(name, 0.0) for name in case.right_causes)
     return Outcome(
         case,
         first,
-        said.cause[first],
+        answer.cause[first],
         is_right,
         is_exact,
-        said.presence,
+        answer.presence,
         float(sum(squares)),
         float(-np.log(right + SMALLEST)),
     )
@@ -446,8 +450,8 @@ def cross_validated(cases: Sequence[TrainingCase], seed: int = 0) -> list[Outcom
     fold = np.random.default_rng(seed).permutation(len(cases)) % FOLDS
     outcomes: dict[int, Outcome] = {}
     for left_out in range(min(FOLDS, len(cases))):
-        others = [case for case, number in zip(cases, fold, strict=True) if number != left_out]
-        model = fitted(others)
+        rest_of_cases = [case for case, number in zip(cases, fold, strict=True) if number != left_out]
+        model = fitted(rest_of_cases)
         for i in np.flatnonzero(fold == left_out):
             outcomes[int(i)] = outcome(cases[i], model)
     return [outcomes[i] for i in range(len(cases))]
@@ -479,9 +483,9 @@ def table(rows: Mapping[str, Sequence[Outcome]]) -> list[str]:
             if not within:
                 line.append("-")
                 continue
-            said = np.mean([each.said for each in within])
+            mean_probability = np.mean([each.said for each in within])
             right = np.mean([each.is_right for each in within])
-            line.append(f"{len(within)}, {said:.2f}, {right:.2f}")
+            line.append(f"{len(within)}, {mean_probability:.2f}, {right:.2f}")
         lines.append(line)
     widths = [max(len(line[column]) for line in lines) for column in range(len(head))]
     return [

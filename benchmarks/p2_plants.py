@@ -42,7 +42,8 @@ def draw(setting: Setting, rng: np.random.Generator) -> Truth:
     """A run of this setting; everything random comes from rng."""
     modes = np.array(MODES[: setting.n_modes])
     hertz, zeta, gain = modes.T
-    slow, fast = 0.1, 25.0
+    slow = 0.1
+    fast = 25.0
     if setting.random_plant:
         hertz = np.concatenate([[rng.uniform(2, 3), rng.uniform(8, 15), rng.uniform(25, 30)], hertz[3:]])
         zeta = np.concatenate([rng.uniform(0.01, 0.02, 3), zeta[3:]])

@@ -42,17 +42,17 @@ def search(data: Regression, options: IdentOptions, rescan: bool) -> tuple[float
 def run(out: Print, *, seeds: int = 50) -> None:
     plain = IdentOptions(estimate_offset=False, estimate_initial_state=False)
     data = [prepare([p2(seed).record], plain.structure()) for seed in range(seeds)]
-    found: dict[str, list[tuple[float, int, float]]] = {}
+    outcome: dict[str, list[tuple[float, int, float]]] = {}
     for name, changes in {**ROWS, "best known": {"evaluations": 3000, "starts": 20}}.items():
         options = plain.model_copy(update=changes)
         search(data[0], options, name != NO_RESCAN)
-        found[name] = [search(each, options, name != NO_RESCAN) for each in data]
-    best = np.min([[rss for rss, *_ in results] for results in found.values()], axis=0)
+        outcome[name] = [search(each, options, name != NO_RESCAN) for each in data]
+    best = np.min([[rss for rss, *_ in results] for results in outcome.values()], axis=0)
     out(f"{'':<26}  within 0.2 %   evaluations       CPU ms")
     out(f"{'search':<26}  of the best    median   most   median    most")
     out(f"{'reach':<26}  >= 96 %                <= 2000          < 1000")
     for name in ROWS:
-        rss, evaluations, cpu = (np.array(column) for column in zip(*found[name], strict=True))
+        rss, evaluations, cpu = (np.array(column) for column in zip(*outcome[name], strict=True))
         hits = int(np.sum(rss <= 1.002 * best))
         out(
             f"{name:<26}  {hits:>3}/{seeds} {hits / seeds:>6.0%}  {np.median(evaluations):>7.0f} "

@@ -114,16 +114,17 @@ def posterior_of(plant: Physical, rng: np.random.Generator) -> ResponsePosterior
             ]
         )
     )
-    omega = omega[omega <= np.pi / DT_S]
+    below_nyquist = omega <= np.pi / DT_S
+    omega = omega[below_nyquist]
     rows = basis_response(poles, np.exp(1j * omega * DT_S))
     stacked = np.vstack([rows.real, rows.imag])
 
     def project(value: np.ndarray, tolerance: float) -> np.ndarray:
         target = np.concatenate([value.real, value.imag])
-        found = np.linalg.lstsq(stacked, target, rcond=1e-13)[0]
-        residual = np.linalg.norm(stacked @ found - target) / np.linalg.norm(target)
+        coefficients = np.linalg.lstsq(stacked, target, rcond=1e-13)[0]
+        residual = np.linalg.norm(stacked @ coefficients - target) / np.linalg.norm(target)
         assert residual < tolerance, f"projection onto the basis misses by {residual:.1e}"
-        return found
+        return coefficients
 
     mean = project(plant.without_integrators(omega), 1e-6)
     columns = []

@@ -59,7 +59,10 @@ def _described(out: Print, described: UncertaintyOptions, seeds: int) -> None:
     true = [mode.frequency_Hz for mode in truth_of(source).modes["hub_angle_rad"]]
     true = [hertz for hertz in true if hertz < EXCITED_HZ]
     options = IdentOptions(integrators=1, input_delay_samples=1, noise="auto", n_real=1, n_pairs=2)
-    errors, held, right, cpu = [], [], 0, []
+    errors = []
+    held = []
+    right = 0
+    cpu = []
     for seed in range(seeds):
         records = [
             simulate_record(source, entry, seed).siso("voltage_V", "hub_angle_rad") for entry in entries
@@ -69,12 +72,12 @@ def _described(out: Print, described: UncertaintyOptions, seeds: int) -> None:
         )
         cpu.append(spent)
         modes = [mode.frequency_Hz for mode in result.about.modes if result.about.is_mode(mode)]
-        error = [min((abs(hertz / one - 1) for hertz in modes), default=1.0) for one in true]
+        error = [min((abs(hertz / true_hertz - 1) for hertz in modes), default=1.0) for true_hertz in true]
         right += len(modes) == len(true) and max(error) < 0.03
         errors.append(error)
         if result.spread.intervals is not None:
             intervals = [mode.frequency_Hz for mode in result.spread.intervals.modes]
-            held.append([any(low <= one <= high for low, high in intervals) for one in true])
+            held.append([any(low <= true_hertz <= high for low, high in intervals) for true_hertz in true])
     e = np.array(errors)
     out(f"{len(entries)} records a seed; true modes {true[0]:.2f} and {true[1]:.2f} Hz")
     out(f"both within 3 % and no false mode: {right} of {seeds}")

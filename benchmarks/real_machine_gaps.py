@@ -68,10 +68,10 @@ def emps(out: Print, folder: Path) -> None:
             out("")
             out(f"{_SIMULATED[simulated]}; {_HELD_OUT[held_out]}{listed}")
             case = emps_axis.case(folder, held_out, simulated, refined=refined)
-            found = diagnose(case)
-            tell(out, found)
+            diagnosis = diagnose(case)
+            tell(out, diagnosis)
             if not refined:
-                against_published(out, found)
+                against_published(out, diagnosis)
 
 
 _SIMULATED = {
@@ -116,13 +116,15 @@ def quanser(out: Print, folder: Path) -> None:
         )
     windows = {1: (150, 1400), 2: (1450, 2650)}
     for stage, window in windows.items():
-        found = diagnose(serial_link_stage.case(folder, stage))
+        diagnosis = diagnose(serial_link_stage.case(folder, stage))
         out("")
         out(f"Stage {stage}")
-        tell(out, found)
-        e, part = found.case.experiments[0], slice(*window)
-        alpha, noise = e.output[part, 1], found.case.noise[1]
-        model = alpha - found.residuals_before[e.name][part, 1] * noise
+        tell(out, diagnosis)
+        e = diagnosis.case.experiments[0]
+        part = slice(*window)
+        alpha = e.output[part, 1]
+        noise = diagnosis.case.noise[1]
+        model = alpha - diagnosis.residuals_before[e.name][part, 1] * noise
         out(
             f"  while only the other stage's reference moves ({window[0] * 0.002:.1f} to "
             f"{window[1] * 0.002:.1f} s): deflection {1e3 * np.std(alpha):.2f} mrad RMS measured, "
@@ -149,12 +151,12 @@ def slfr(out: Print, folder: Path) -> None:
             error = ruler_robot.simulate(fit, {}, data[:, :1])[:, 0] - data[:, 1]
             out(f"    fitted at {a}, repeat 2 at {b}: RMS error {np.sqrt(np.mean(error**2)):.3f} counts")
     for fitted in ((50, 75), (50,)):
-        found = diagnose(ruler_robot.case(folder, fitted))
+        diagnosis = diagnose(ruler_robot.case(folder, fitted))
         out("")
         out(f"Fitted at {' and '.join(map(str, fitted))}, judged at both (second repeats)")
-        tell(out, found)
-        for e in found.case.held_out:
-            gaps = [pooled_rms(r[e.name]) for r in (found.residuals_refit, found.residuals_after)]
+        tell(out, diagnosis)
+        for e in diagnosis.case.held_out:
+            gaps = [pooled_rms(r[e.name]) for r in (diagnosis.residuals_refit, diagnosis.residuals_after)]
             out(f"    {e.name}: gap {gaps[0]:.2f} values moved, {gaps[1]:.2f} repaired")
 
 

@@ -21,7 +21,10 @@ from benchmarks.own_plant import SHARE, Real, constants, held_input, lagged, lat
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 from diagnosis.machine.machine_protocol import Role
 
-DT_S, SUBSTEPS = 0.002, 1
+# Sampling period of the records.
+DT_S = 0.002
+# Steps of the simulation a sample.
+SUBSTEPS = 1
 # A spring that pushes away makes the arm unstable: such a fit has to end somewhere finite.
 RUNAWAY_COUNTS = 1e4
 COUNTS_PER_RAD = 1024 / (2 * np.pi)
@@ -88,12 +91,18 @@ def _run(reference: Real, A: Real, B: Real, p: np.record) -> Real:
     """Dry friction as the drive that it takes off, so that the hub truly sticks."""
     T = reference.size
     h = DT_S / SUBSTEPS
-    theta, command = np.zeros(T), np.zeros(T)
-    x, y = np.zeros(6), np.zeros(6)
-    pull, limit = 0.0, p.actuator_saturation_limit_counts
-    dry, static = p.coulomb_friction_drive_counts, p.stribeck_friction_static_counts
-    coulomb, static = dry + static * p.stribeck_friction_coulomb_share, dry + static
-    quadratic, cubic = p.quadratic_friction_counts_at_10_counts_s, p.hardening_spring_counts_at_10_counts
+    theta = np.zeros(T)
+    command = np.zeros(T)
+    x = np.zeros(6)
+    y = np.zeros(6)
+    pull = 0.0
+    limit = p.actuator_saturation_limit_counts
+    dry = p.coulomb_friction_drive_counts
+    static = p.stribeck_friction_static_counts
+    coulomb = dry + static * p.stribeck_friction_coulomb_share
+    static = dry + static
+    quadratic = p.quadratic_friction_counts_at_10_counts_s
+    cubic = p.hardening_spring_counts_at_10_counts
     for k in range(T):
         theta[k] = x[0] + p.angle_offset_counts
         command[k] = min(max(reference[k] - theta[k], -limit), limit)
@@ -133,8 +142,8 @@ def linear_fit(data: Real) -> dict[str, float]:
         error = simulate(parameters, {}, data[:, :1])[:, 0] - data[:, 1]
         return np.asarray(np.nan_to_num(error, nan=1e3, posinf=1e3, neginf=-1e3).clip(-1e3, 1e3))
 
-    found = least_squares(residual, start, x_scale=0.1, max_nfev=80)
-    return dict(zip(GUESS, map(float, np.exp(found.x)), strict=True))
+    fit = least_squares(residual, start, x_scale=0.1, max_nfev=80)
+    return dict(zip(GUESS, map(float, np.exp(fit.x)), strict=True))
 
 
 def case(folder: Path, fitted: tuple[int, ...] = (50, 75), judged: tuple[int, ...] = (50, 75)) -> PlantCase:

@@ -33,24 +33,24 @@ _UNITS = {"deg": ("rad", np.pi / 180), "Grad": ("rad", np.pi / 180), "rad": ("de
 
 def _rounded(decimals: int) -> Callable[[pd.DataFrame], pd.DataFrame]:
     def way(table: pd.DataFrame) -> pd.DataFrame:
-        found = table.copy()
+        rounded = table.copy()
         for name in table.columns[1:]:
             size = 10 ** np.floor(np.log10(np.abs(table[name]).max()))
-            found[name] = np.round(table[name] / size, decimals) * size
-        return found
+            rounded[name] = np.round(table[name] / size, decimals) * size
+        return rounded
 
     return way
 
 
 def _in_other_units(table: pd.DataFrame) -> pd.DataFrame:
-    found = table.copy()
+    converted = table.copy()
     for name in table.columns[1:]:
         for unit, (other, factor) in _UNITS.items():
             if name.endswith((f"_{unit}", f"[{unit}]")):
-                found[name] = found[name] * factor
-                found = found.rename(columns={name: name.replace(unit, other)})
+                converted[name] = converted[name] * factor
+                converted = converted.rename(columns={name: name.replace(unit, other)})
                 break
-    return found
+    return converted
 
 
 def _with_more_columns(table: pd.DataFrame) -> pd.DataFrame:
@@ -87,28 +87,32 @@ def answer(logs: list[Path], way: str, work: Path) -> Answer:
         table = WAYS[way](pd.read_csv(log, sep=sep, decimal=point))
         table.to_csv(work / log.name, index=False, sep=sep, decimal=point)
     call = ["run", *map(str, sorted(work.glob("*.csv"))), "--out", str(work / "out"), "--json"]
-    code, text, said = flexlink(*call)
+    code, text, lines = flexlink(*call)
     directory = RunDirectory(work / "out")
     if directory.stage_file("identify") is None:
-        return Answer(False, None, None, said[-1])
+        return Answer(False, None, None, lines[-1])
     results = RunResults(directory)
     channel = results.identify.channels[0]
     modes = [mode.frequency_Hz for mode in channel.modes if channel.is_mode(mode)]
-    told = modes
+    told_modes = modes
     if directory.stage_file("uncertainty") is not None:
         intervals = results.uncertainty.channels[0].intervals
         if intervals is not None:
             known = zip(channel.modes, intervals.modes, strict=True)
-            told = [mode.frequency_Hz for mode, own in known if channel.is_mode(mode) and own.told]
-    verdict = json.loads(text).get("verdict") if text.startswith("{") else said[-1]
-    return Answer(code == 0, min(modes, default=None), min(told, default=None), str(verdict))
+            told_modes = [
+                mode.frequency_Hz for mode, interval in known if channel.is_mode(mode) and interval.told
+            ]
+    verdict = json.loads(text).get("verdict") if text.startswith("{") else lines[-1]
+    return Answer(code == 0, min(modes, default=None), min(told_modes, default=None), str(verdict))
 
 
 def flips(first: Answer, found: Answer, *, told: bool) -> bool:
     """Whether the certificate or the first mode differ; told: of the modes whose intervals tell them."""
-    before, after = first.mode_Hz, found.mode_Hz
+    before = first.mode_Hz
+    after = found.mode_Hz
     if told:
-        before, after = first.told_Hz, found.told_Hz
+        before = first.told_Hz
+        after = found.told_Hz
     if found.certified != first.certified or (after is None) != (before is None):
         return True
     return bool(before and after and abs(after / before - 1) > _SAME_MODE)
@@ -121,25 +125,28 @@ def _named(mode_Hz: float | None) -> str:
 def run(out: Print, *, machines: str = "../shared/machines", only: str = "", ways: str = "") -> None:
     """A line a machine and way; then how many flipped."""
     asked = [way for way in WAYS if way == "as it is" or not ways or way in ways.split(",")]
-    flipped, flipped_told, count = 0, 0, 0
+    flipped = 0
+    flipped_told = 0
+    count = 0
     for folder in sorted(path for path in Path(machines).iterdir() if path.is_dir()):
         if only and folder.name not in only.split(","):
             continue
         first: Answer | None = None
         for way in asked:
             with tempfile.TemporaryDirectory() as scratch:
-                found = answer(sorted(folder.glob("run*.csv")), way, Path(scratch))
-            first = first or found
-            by_model = flips(first, found, told=False)
-            by_told = flips(first, found, told=True)
-            flipped, flipped_told = flipped + by_model, flipped_told + by_told
+                of_way = answer(sorted(folder.glob("run*.csv")), way, Path(scratch))
+            first = first or of_way
+            by_model = flips(first, of_way, told=False)
+            by_told = flips(first, of_way, told=True)
+            flipped = flipped + by_model
+            flipped_told = flipped_told + by_told
             count += way != "as it is"
-            verdict = "certified" if found.certified else "not certified"
-            modes = _named(found.mode_Hz)
-            if found.told_Hz != found.mode_Hz:
-                modes += f" (told: {_named(found.told_Hz)})"
+            verdict = "certified" if of_way.certified else "not certified"
+            modes = _named(of_way.mode_Hz)
+            if of_way.told_Hz != of_way.mode_Hz:
+                modes += f" (told: {_named(of_way.told_Hz)})"
             mark = " FLIPPED" * by_model + " (by told modes not)" * (by_model and not by_told)
-            out(f"{folder.name}, {way}: {verdict}, {modes}{mark}; {found.words:.120}")
+            out(f"{folder.name}, {way}: {verdict}, {modes}{mark}; {of_way.words:.120}")
     out(f"{flipped} of {count} flipped; {flipped_told} by the modes that intervals tell")
 
 

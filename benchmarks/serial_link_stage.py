@@ -18,8 +18,16 @@ from scipy.signal import lfilter
 from benchmarks.own_plant import SHARE, Real, constants, held_input, lagged, late_value
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment
 
-DT_S, PERIOD, SUBSTEPS = 0.002, 5000, 2
-LIMIT_A, FILTER_RAD_S = 0.94, 150.0
+# Sampling period of the records.
+DT_S = 0.002
+# Samples after which the reference repeats.
+PERIOD = 5000
+# Steps of the simulation a sample.
+SUBSTEPS = 2
+# Largest current of the drive.
+LIMIT_A = 0.94
+# Corner of the controller's filter.
+FILTER_RAD_S = 150.0
 # First stage, second stage, and relative tolerance: the manufacturer states none, so what a data sheet is
 # usually good for.
 _STATED = {
@@ -73,16 +81,19 @@ def simulation(gains: Real):
 
 def state_space(p: Mapping[str, float]) -> tuple[Real, Real]:
     """A (4, 4), B (4, 2) for current and an angular acceleration of the load from outside."""
-    hub, load = p["hub_inertia_kg_m2"], p["load_inertia_kg_m2"]
-    spring, link = p["spring_Nm_rad"], p["link_damping_Nms"]
-    both = 1 / hub + 1 / load
-    friction, drive = p["hub_damping_Nms"] / hub, p["torque_constant_Nm_A"] / hub
+    hub = p["hub_inertia_kg_m2"]
+    load = p["load_inertia_kg_m2"]
+    spring = p["spring_Nm_rad"]
+    link = p["link_damping_Nms"]
+    inverse_inertias = 1 / hub + 1 / load
+    friction = p["hub_damping_Nms"] / hub
+    drive = p["torque_constant_Nm_A"] / hub
     A = np.array(
         [
             [0, 0, 1, 0],
             [0, 0, 0, 1],
             [0, spring / hub, -friction, link / hub],
-            [0, -spring * both, friction, -link * both],
+            [0, -spring * inverse_inertias, friction, -link * inverse_inertias],
         ]
     )
     return A, np.array([[0, 0], [0, 0], [drive, 0], [-drive, 1.0]])
@@ -95,21 +106,30 @@ def _run(inputs: Real, A: Real, B: Real, gains: Real, p: np.record) -> Real:
     h = DT_S / SUBSTEPS
     out = np.zeros((T, 3))
     command = np.zeros(T)
-    x, y = np.zeros(4), np.zeros(4)
+    x = np.zeros(4)
+    y = np.zeros(4)
     x[0] = inputs[0, 2]
     keep = np.exp(-FILTER_RAD_S * DT_S)
-    last0, last1, speed0, speed1 = x[0], p.strain_offset_angle_rad, 0.0, 0.0
+    last0 = x[0]
+    last1 = p.strain_offset_angle_rad
+    speed0 = 0.0
+    speed1 = 0.0
     pull = gains[0] * (inputs[0, 0] - x[0])
-    dry, static = p.coulomb_friction_current_A, p.stribeck_friction_static_A
-    coulomb, static = dry + static * p.stribeck_friction_coulomb_share, dry + static
+    dry = p.coulomb_friction_current_A
+    static = p.stribeck_friction_static_A
+    coulomb = dry + static * p.stribeck_friction_coulomb_share
+    static = dry + static
     for k in range(T):
-        reference, outside = inputs[k, 0], p.other_stage_share * inputs[k, 1]
+        reference = inputs[k, 0]
+        outside = p.other_stage_share * inputs[k, 1]
         theta = x[0]
         alpha = (1 + p.strain_gain_relative_error) * x[1] + p.strain_offset_angle_rad
-        out[k, 0], out[k, 1] = theta, alpha
+        out[k, 0] = theta
+        out[k, 1] = alpha
         speed0 = keep * speed0 + (1 - keep) * (theta - last0) / DT_S
         speed1 = keep * speed1 + (1 - keep) * (alpha - last1) / DT_S
-        last0, last1 = theta, alpha
+        last0 = theta
+        last1 = alpha
         i = gains[0] * (reference - theta) - gains[1] * alpha - gains[2] * speed0 - gains[3] * speed1
         command[k] = out[k, 2] = min(max(i, -LIMIT_A), LIMIT_A)
         late = late_value(command, k, p.input_delay_delay_s / DT_S, p.actuator_dead_zone_width_A)
@@ -169,12 +189,14 @@ def case(folder: Path, stage: int) -> PlantCase:
         spring = MANUFACTURER[2]["spring_Nm_rad"] / MANUFACTURER[1]["load_inertia_kg_m2"]
         outside = spring * other_alpha
     else:
-        tip, n = other_theta + other_alpha, 15
+        tip = other_theta + other_alpha
+        n = 15
         padded = np.pad(tip, n, mode="edge")
         outside = -(padded[2 * n :] - 2 * tip + padded[: -2 * n]) / (n * DT_S) ** 2
     inputs = np.column_stack([reference, outside, theta])
     output = np.column_stack([theta, alpha, command])
-    first, second = slice(0, PERIOD), slice(PERIOD, 2 * PERIOD)
+    first = slice(0, PERIOD)
+    second = slice(PERIOD, 2 * PERIOD)
     noise = np.sqrt(np.mean((output[first] - output[second]) ** 2, axis=0) / 2)
     plant = Plant(
         simulation(manufacturers_gains(folder, stage)),

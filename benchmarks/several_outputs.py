@@ -66,7 +66,8 @@ PLANTS: dict[str, tuple[Callable[[], control.StateSpace], int, int, int, float, 
 
 def record_of(name: str, seed: int) -> tuple[control.StateSpace, Record]:
     make, _, samples, hold, amplitude, noise = PLANTS[name]
-    plant, rng = make(), np.random.default_rng([seed, samples])
+    plant = make()
+    rng = np.random.default_rng([seed, samples])
     u = np.column_stack([prbs(13, hold, amplitude, samples, rng) for _ in range(2)])
     y = dlsim((plant.A, plant.B, plant.C, plant.D, plant.dt), u)[1]
     y = y + (rng.normal(size=y.shape) @ CORRELATION.T) * np.array(noise)
@@ -84,8 +85,8 @@ def n4sid(record: Record, order: int) -> control.StateSpace:
     frame = pd.DataFrame(np.hstack([record.input, record.output]), columns=[*NAMES[0], *NAMES[1]])
     search = NFourSID(frame, list(NAMES[1]), input_columns=list(NAMES[0]), num_block_rows=20)
     search.subspace_identification()
-    found, _ = search.system_identification(rank=order)
-    return control.ss(found.a, found.b, found.c, found.d, record.dt_s)
+    system, _ = search.system_identification(rank=order)
+    return control.ss(system.a, system.b, system.c, system.d, record.dt_s)
 
 
 def run(out: Print, *, seeds: int = 50, first: int = 0, plants: str = "joints,links") -> None:
@@ -98,7 +99,10 @@ def run(out: Print, *, seeds: int = 50, first: int = 0, plants: str = "joints,li
 
 def _plant(out: Print, name: str, seeds: range) -> None:
     errors: dict[str, list[np.ndarray]] = {}
-    held, states, seconds, enclosure = [], [], [], []
+    held = []
+    states = []
+    seconds = []
+    enclosure = []
     for seed in seeds:
         plant, record = record_of(name, seed)
         truth = response(plant, ERRORS)
@@ -111,8 +115,11 @@ def _plant(out: Print, name: str, seeds: range) -> None:
         result, taken = timed(partial(identify_mimo, [record], options))
         seconds.append(taken)
         noted("shared poles", result.model.frequency_response(ERRORS))
-        alone = [identify_mimo([record.only(k)], options).model.outputs[0] for k in range(2)]
-        noted("channel by channel", np.stack([one.frequency_response(ERRORS) for one in alone], axis=1))
+        single_outputs = [identify_mimo([record.only(k)], options).model.outputs[0] for k in range(2)]
+        noted(
+            "channel by channel",
+            np.stack([output.frequency_response(ERRORS) for output in single_outputs], axis=1),
+        )
         states.append(len(result.model.state_space()[0]))
         balls = matrix_posterior([record], result).at(BALLS)
         held.append(balls.holds(response(plant, BALLS)))
@@ -135,7 +142,8 @@ def _plant(out: Print, name: str, seeds: range) -> None:
 
 def _cd_player(out: Print, path: Path) -> None:
     columns = pd.read_csv(path).to_numpy(float)[:, 1:]
-    u, y = columns[:, :2], columns[:, 2:]
+    u = columns[:, :2]
+    y = columns[:, 2:]
     record = Record("CD player", u[:1024], y[:1024], 1.0, *NAMES)
     out("CD player arm, fit % on the second half, y1 y2 (published common-pole output error in brackets)")
     published = {4: "65.2 78.1", 6: "70.9 77.9", 8: "71.4 83.2", 10: "72.6 84.0"}
@@ -156,14 +164,18 @@ def _cd_player(out: Print, path: Path) -> None:
 def _free_run_fit(system: Any, u: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Fit in % of the outputs from the best initial state, (2,)."""
     a, b, c, d = system
-    x, power = np.zeros(len(a)), np.eye(len(a))
-    driven, seen = np.empty_like(y), np.empty((len(y), y.shape[1], len(a)))
+    x = np.zeros(len(a))
+    power = np.eye(len(a))
+    driven = np.empty_like(y)
+    seen = np.empty((len(y), y.shape[1], len(a)))
     for k in range(len(y)):
-        driven[k], seen[k] = c @ x + d @ u[k], c @ power
-        x, power = a @ x + b @ u[k], a @ power
+        driven[k] = c @ x + d @ u[k]
+        seen[k] = c @ power
+        x = a @ x + b @ u[k]
+        power = a @ power
     start = np.linalg.lstsq(seen.reshape(-1, len(a)), (y - driven).ravel(), rcond=None)[0]
-    rest = np.linalg.norm(y - driven - seen @ start, axis=0)
-    return 100 * (1 - rest / np.linalg.norm(y - y.mean(axis=0), axis=0))
+    residual = np.linalg.norm(y - driven - seen @ start, axis=0)
+    return 100 * (1 - residual / np.linalg.norm(y - y.mean(axis=0), axis=0))
 
 
 if __name__ == "__main__":

@@ -39,20 +39,36 @@ from plant import SampledArm, paper_link
 
 ROUTES = ("mujoco", "python", "rig")
 VARIABLES = ("angle", "speed", "time", "load", "other")
-DT_S, STEP_S, SAMPLES, NOISE_RAD = 0.01, 0.0025, 400, 2e-4
+# Sampling period of the logs.
+DT_S = 0.01
+# Step of the simulation.
+STEP_S = 0.0025
+# Rows of a log.
+SAMPLES = 400
+# Noise of an angle, standard deviation.
+NOISE_RAD = 2e-4
 LOGS = (("first", "estimation"), ("second", "estimation"), ("third", "held_out"))
 JOINTS = ("shoulder", "elbow")
 OUTPUTS = ("shoulder_rad", "elbow_rad")
-KP, KD = np.array([25.0, 10.0]), np.array([2.5, 0.8])
-# Stated values are off by so much (relative standard deviations).
-MASS_OFF, DAMPING_OFF, ARMATURE_OFF = 0.01, 0.1, 0.05
-# ... a rig's by this part of their tolerances, which records without a controller show tenfold.
+# Proportional gains of the joints' controllers.
+KP = np.array([25.0, 10.0])
+# Derivative gains.
+KD = np.array([2.5, 0.8])
+# Stated masses are off by so much (relative standard deviation).
+MASS_OFF = 0.01
+# Stated damping.
+DAMPING_OFF = 0.1
+# Stated armature inertia.
+ARMATURE_OFF = 0.05
+# ... a rig's values by this part of their tolerances, which records without a controller show tenfold.
 RIG_OFF = 0.2
 # RMS of the force over that of the torques of its joint.
 SHARES = (0.05, 0.2)
 NONE = 8
-# Of the series whose machine is a rig.
-RIG_STEPS, RIG_VOLTS = 5, 1.0
+# Steps of a rig's simulation a sample.
+RIG_STEPS = 5
+# Size of its voltage.
+RIG_VOLTS = 1.0
 
 
 @dataclass(frozen=True)
@@ -92,11 +108,12 @@ class Machine:
     def answer(self) -> tuple[str, str]:
         """Quantity and what it is of, as the finding has them; a joint's angle and speed are of its
         output."""
-        own, other = self.outputs[self.joint], self.outputs[1 - self.joint]
+        moved_output = self.outputs[self.joint]
+        other = self.outputs[1 - self.joint]
         assert self.force is not None
         return {
-            "angle": ("position", own),
-            "speed": ("speed", own),
+            "angle": ("position", moved_output),
+            "speed": ("speed", moved_output),
             "time": ("time", ""),
             "load": ("beside", "load_N"),
             "other": ("beside", other) if self.route == "rig" else ("position", other),
@@ -153,12 +170,15 @@ def controlled(
     """
     reference = rest + smooth(rng, 2, 2.5, 60, SAMPLES)
     load = smooth(rng, 1, 1.5, 45, SAMPLES)[:, 0]
-    U, Y, last = np.zeros((SAMPLES, 2)), np.zeros((SAMPLES, 2)), rest
+    U = np.zeros((SAMPLES, 2))
+    Y = np.zeros((SAMPLES, 2))
+    last = rest
     for k in range(SAMPLES):
         q = angles_of() + NOISE_RAD * rng.standard_normal(2)
         U[k] = KP * (reference[k] - q) - KD * (q - last) / DT_S * (k > 0)
         advance(U[k], k * DT_S, load[k])
-        Y[k], last = q, q
+        Y[k] = q
+        last = q
     return U, Y, load
 
 
@@ -190,11 +210,14 @@ def accelerations(q, v, torque, m, d, a):  # type: ignore[no-untyped-def]
     l1, l2 = LENGTHS_M
     i1 = m[0] * (l1 * l1 / 3 + 0.02 * 0.02 / 12)
     i2 = m[1] * (l2 * l2 / 3 + 0.02 * 0.02 / 12)
-    s1, s2 = m[0] * l1 / 2, m[1] * l2 / 2
+    s1 = m[0] * l1 / 2
+    s2 = m[1] * l2 / 2
     h = l1 * s2
-    c, s = np.cos(q[1]), np.sin(q[1])
+    c = np.cos(q[1])
+    s = np.sin(q[1])
     j11 = i1 + i2 + m[1] * l1 * l1 + 2 * h * c + a[0]
-    j12, j22 = i2 + h * c, i2 + a[1]
+    j12 = i2 + h * c
+    j22 = i2 + a[1]
     g2 = s2 * np.cos(q[0] + q[1]) * GRAVITY
     g1 = (s1 + m[1] * l1) * np.cos(q[0]) * GRAVITY + g2
     f1 = torque[0] - d[0] * v[0] + g1 + h * s * (2 * v[0] * v[1] + v[1] * v[1])
@@ -205,7 +228,8 @@ def accelerations(q, v, torque, m, d, a):  # type: ignore[no-untyped-def]
 
 def by_equations(machine: Machine, rng: np.random.Generator) -> tuple[Any, Any, Any]:
     """One log of the arm as its equations of motion."""
-    state, count = np.concatenate([REST, np.zeros(2)]), 20
+    state = np.concatenate([REST, np.zeros(2)])
+    count = 20
 
     def slope(y: Any, torque: Any, time_s: float, load: float) -> Any:
         total = np.array(torque)
@@ -230,17 +254,19 @@ def by_equations(machine: Machine, rng: np.random.Generator) -> tuple[Any, Any, 
 @njit(cache=True)
 def _two_steps(inputs, m, d, a):  # type: ignore[no-untyped-def]
     """(T, 2) angles of the arm under torques (T, 2), from rest."""
-    found, count = np.zeros((len(inputs), 2)), 10
+    angles = np.zeros((len(inputs), 2))
+    count = 10
     h = DT_S / count
-    q, v = np.array([np.pi / 2, 0.0]), np.zeros(2)
+    q = np.array([np.pi / 2, 0.0])
+    v = np.zeros(2)
     for k in range(len(inputs)):
-        found[k] = q
+        angles[k] = q
         for _ in range(count):
             half = v + h / 2 * accelerations(q, v, inputs[k], m, d, a)
             middle = q + h / 2 * v
             v = v + h * accelerations(middle, half, inputs[k], m, d, a)
             q = q + h * half
-    return found
+    return angles
 
 
 def simulate(parameters: Any, effects: Any, inputs: Any) -> Any:
@@ -256,12 +282,14 @@ def of_rig(machine: Machine, rig: Any, rng: np.random.Generator) -> tuple[Any, A
     wrist = 0.5 * smooth(rng, 1, 1.5, 50, SAMPLES)[:, 0]
     load = smooth(rng, 1, 1.5, 45, SAMPLES)[:, 0]
     voltage = RIG_VOLTS * smooth(rng, 1, 8.0, 25, SAMPLES)
-    Y, last = np.zeros((SAMPLES, 2)), 0.0
+    Y = np.zeros((SAMPLES, 2))
+    last = 0.0
     for k in range(SAMPLES):
         Y[k] = arm.true_output
         for part in range(RIG_STEPS):
             hub = float(arm.true_output[0])
-            speed, last = (hub - last) / (dt_s / RIG_STEPS), hub
+            speed = (hub - last) / (dt_s / RIG_STEPS)
+            last = hub
             time_s = (k + part / RIG_STEPS) * DT_S
             of = machine.torque(np.array([hub, wrist[k]]), np.array([speed, 0.0]), time_s, load[k])
             arm.advance(float(voltage[k, 0]), of)
@@ -278,10 +306,14 @@ def case_of(route: str, variable: str, number: int, seed: int) -> tuple[Machine,
         return np.array(values) * np.exp(share * rng.standard_normal(2))
 
     joint = 0 if route == "rig" else int(rng.integers(2))
-    rest = 0.0 if route == "rig" else (REST[1 - joint] if variable == "other" else REST[joint])
+    rest_angle = REST[joint]
+    if route == "rig":
+        rest_angle = 0.0
+    elif variable == "other":
+        rest_angle = REST[1 - joint]
     force = None
     if variable != "none":
-        middle = rest + rng.uniform(-0.2, 0.2)
+        middle = rest_angle + rng.uniform(-0.2, 0.2)
         force = Force(variable, int(rng.integers(3)), 0.0, middle if variable in ("angle", "other") else 0.0)
     known = 0.0 if variable in ("none", "shaken") else 1.0
     offs = ((MASSES_KG, MASS_OFF), (DAMPING, DAMPING_OFF), (ARMATURE, ARMATURE_OFF))
@@ -298,8 +330,8 @@ def case_of(route: str, variable: str, number: int, seed: int) -> tuple[Machine,
     if force is not None:
         # The size of a force is that which has the drawn share of the torques in the log without it.
         U, Y, beside = log(Machine(route, None, joint, *bodies), np.random.default_rng(draw))
-        one = Force(variable, force.law, 1.0, force.middle)
-        unit = Machine(route, one, joint, *bodies)
+        unit_force = Force(variable, force.law, 1.0, force.middle)
+        unit = Machine(route, unit_force, joint, *bodies)
         dt_s = rig[1].sampling.dt_s if route == "rig" else DT_S
         scale = rig_torque(rig[1]) if route == "rig" else 1.0
         whole = np.std(scale * U[:, joint]) * share
@@ -349,7 +381,8 @@ def along(machine: Machine, Y: Any, beside: Any, dt_s: float) -> Any:
         angles = np.column_stack([Y[:, 0], beside["wrist_rad"]])
         load = beside["load_N"]
     else:
-        angles, load = Y, beside
+        angles = Y
+        load = beside
     speeds = np.gradient(angles, dt_s, axis=0)
     steps = zip(angles, speeds, DT_S * np.arange(len(Y)), load, strict=True)
     return np.array([machine.torque(*step) for step in steps])
@@ -421,24 +454,26 @@ def answered(
         if route == "rig"
         else partial(where_in_records, case, residuals, DT_S)
     )
-    found, cpu_s = timed(look)
-    told = found.dependences
-    said = "; ".join(
-        f"{one.acts} {one.place}({one.quantity} {one.of}) {one.share:.2f} {one.shape}" for one in told
+    seen, cpu_s = timed(look)
+    dependences = seen.dependences
+    in_words = "; ".join(
+        f"{dependence.acts} {dependence.place}({dependence.quantity} {dependence.of}) "
+        f"{dependence.share:.2f} {dependence.shape}"
+        for dependence in dependences
     )
     begin = f"{route:7s} {variable:6s} {number}"
     if machine.force is None or variable == "shaken":
-        out(f"{begin} {'' if told else 'right':6s} {said or 'nothing'} ({cpu_s:.1f} s)")
-        return not told, not told, float("nan"), cpu_s
+        out(f"{begin} {'' if dependences else 'right':6s} {in_words or 'nothing'} ({cpu_s:.1f} s)")
+        return not dependences, not dependences, float("nan"), cpu_s
 
-    right = bool(told) and (told[0].quantity, told[0].of) == machine.answer
-    at_place = right and told[0].place == places(machine) and told[0].acts == "force"
-    error = missed(machine, case, told[0]) if at_place else float("nan")
+    right = bool(dependences) and (dependences[0].quantity, dependences[0].of) == machine.answer
+    at_place = right and dependences[0].place == places(machine) and dependences[0].acts == "force"
+    error = missed(machine, case, dependences[0]) if at_place else float("nan")
     of = f"law {machine.force.law} of {machine.force.size:.3g} Nm at {places(machine)}"
     off = f", curve off by {100 * error:.0f} %" if np.isfinite(error) else ""
     out(
-        f"{begin} {'right' if right else 'WRONG':6s} {of:36s} -> {said or 'nothing'}{off} "
-        f"(gap {found.gap.gap_rms:.1f}, {cpu_s:.1f} s)"
+        f"{begin} {'right' if right else 'WRONG':6s} {of:36s} -> {in_words or 'nothing'}{off} "
+        f"(gap {seen.gap.gap_rms:.1f}, {cpu_s:.1f} s)"
     )
     return right, at_place, error, cpu_s
 

@@ -33,15 +33,18 @@ OMEGA_RAD_S = np.geomspace(0.63, 627.0, 91)
 
 def with_friction(source: SimulatedSource, torque_Nm: float, counts: int) -> SimulatedSource:
     """The arm with dry friction of this size and an encoder of so many counts a turn."""
-    kept = tuple(effect for effect in source.effects if effect["name"] != "coulomb_friction")
+    other_effects = tuple(effect for effect in source.effects if effect["name"] != "coulomb_friction")
     friction = ({"name": "coulomb_friction", "torque_Nm": torque_Nm},) if torque_Nm else ()
     return source.model_copy(
-        update={"effects": (*friction, *kept), "encoder_step_rad": 2 * np.pi / counts if counts else 0.0}
+        update={
+            "effects": (*friction, *other_effects),
+            "encoder_step_rad": 2 * np.pi / counts if counts else 0.0,
+        }
     )
 
 
 def estimation_records(source: SimulatedSource, seed: int) -> list[Record]:
-    """Of all its experiments that are to be identified from."""
+    """Records of all experiments of a source that are to be identified from."""
     return [simulate_record(source, entry, seed) for entry in source.records if entry.role == "estimation"]
 
 
@@ -50,7 +53,8 @@ def true_responses(source: SimulatedSource, omega_rad_s: RealArray) -> ComplexAr
     rig = rig_of(source)
     added = sum(float(str(e["coefficient_Nms"])) for e in source.effects if e["name"] == "viscous_friction")
     hub = rig.hub.model_copy(update={"viscous_friction_Nms": rig.hub.viscous_friction_Nms + added})
-    arm, dt_s = linear_arm(rig.model_copy(update={"hub": hub})), rig.sampling.dt_s
+    arm = linear_arm(rig.model_copy(update={"hub": hub}))
+    dt_s = rig.sampling.dt_s
     # Modes in parallel behind a hold: every pole s becomes (exp(s dt) - 1) / s / (z - exp(s dt)).
     s, vectors = np.linalg.eig(arm.A)
     shares = (arm.C @ vectors) * np.linalg.solve(vectors, arm.B[:, :1])[:, 0]
@@ -108,14 +112,15 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
         source = with_friction(config.source, torque_Nm, counts)
         to_Nm = rig_of(source).motor.torque_per_volt_Nm_V
         truth = true_responses(source, OMEGA_RAD_S).T
-        found: dict[str, list[pd.DataFrame]] = {"hub": [], "tip": []}
-        levels, cpu = [], []
+        by_output: dict[str, list[pd.DataFrame]] = {"hub": [], "tip": []}
+        levels = []
+        cpu = []
         for seed in range(first, first + seeds):
             records = estimation_records(source, seed)
             (friction, arms), spent = timed(partial(behind_friction, records, config.channels))
             cpu.append(spent)
             levels.append((friction.level * to_Nm, friction.level_std * to_Nm))
-            for rows, arm, true in zip(found.values(), arms, truth, strict=True):
+            for rows, arm, true in zip(by_output.values(), arms, truth, strict=True):
                 rows.append(judged(arm.response.at(OMEGA_RAD_S), true))
         level, std = np.array(levels).T
         held = np.mean(np.abs(level - torque_Nm) <= 1.96 * std)
@@ -124,7 +129,7 @@ def run(out: Print, *, seeds: int = 40, counts: int = 16384, first: int = 0) -> 
             f"\nfriction {torque_Nm:g} N m: level {off}inside its 95 % interval {100 * held:.0f} %; "
             f"CPU {np.median(cpu):.1f} s, at most {max(cpu):.1f} s"
         )
-        for name, rows in found.items():
+        for name, rows in by_output.items():
             tell_bands(out, name, rows)
 
 

@@ -25,7 +25,7 @@ RECENT = 4
 
 def run(out: Print) -> None:
     series = all_series()
-    whole = ", ".join("{}: {}/{}".format(seed, *found[WHOLE]) for seed, found in series.items())
+    whole = ", ".join("{}: {}/{}".format(seed, *score[WHOLE]) for seed, score in series.items())
     out(f"{len(series)} series, {WHOLE.partition(',')[0]}: {whole}")
     for before, some in (("", series), (f"last {RECENT}: ", dict(list(series.items())[-RECENT:]))):
         for what, (right, asked) in together(some.values()).items():
@@ -36,13 +36,13 @@ def all_series() -> dict[str, Counts]:
     """Counts of every series by its seed, the earliest first."""
     earlier = (RESULTS / "workshop_series_earlier.txt").read_text(encoding="utf-8").splitlines()
     names = [line[4:] for line in earlier if line.startswith("#   ")]
-    found = {}
+    rows = {}
     for seed, _commit, _date, *cells in (line.split() for line in earlier if not line.startswith("#")):
         pairs = (tuple(map(int, cell.split("/"))) for cell in cells)
-        found[seed] = {name: (right, asked) for name, (right, asked) in zip(names, pairs, strict=True)}
+        rows[seed] = {name: (right, asked) for name, (right, asked) in zip(names, pairs, strict=True)}
     for path in sorted(RESULTS.glob("blind_workshop_*.txt")):
-        found[path.stem.rpartition("_")[2]] = counts(path.read_text(encoding="utf-8").partition(END)[0])
-    return found
+        rows[path.stem.rpartition("_")[2]] = counts(path.read_text(encoding="utf-8").partition(END)[0])
+    return rows
 
 
 def counts(text: str) -> Counts:
@@ -55,7 +55,8 @@ def counts(text: str) -> Counts:
 
 def together(series: Iterable[Counts]) -> Counts:
     """The sums over several series."""
-    right, asked = Counter[str](), Counter[str]()
+    right = Counter[str]()
+    asked = Counter[str]()
     for found in series:
         for what, (some, of) in found.items():
             right[what] += some

@@ -46,16 +46,16 @@ def run(
         return
     os.environ |= {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     with tempfile.TemporaryDirectory() as scratch, ProcessPoolExecutor(jobs) as pool:
-        one = partial(_one, series=series, folder=Path(keep or scratch), judge_only=judge_only)
-        found = []
-        for row in pool.map(one, cases):
+        judge_one = partial(_one, series=series, folder=Path(keep or scratch), judge_only=judge_only)
+        rows = []
+        for row in pool.map(judge_one, cases):
             out(_line(row))
-            found.append(row)
+            rows.append(row)
     out()
     out(_HEAD)
-    for kind in dict.fromkeys(row["kind"] for row in found):
-        out(_table_row(kind, [row for row in found if row["kind"] == kind]))
-    out(_table_row("all", found))
+    for kind in dict.fromkeys(row["kind"] for row in rows):
+        out(_table_row(kind, [row for row in rows if row["kind"] == kind]))
+    out(_table_row("all", rows))
 
 
 def _one(case: tuple[str, int], series: int, **options: Any) -> dict[str, Any]:

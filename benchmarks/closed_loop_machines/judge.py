@@ -48,7 +48,8 @@ _STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w
 def judged(one: Machine, folder: Path, judge_only: bool = False) -> dict[str, Any]:
     """Everything the table needs, also written to FOLDER/NAME/judged.json. judge_only: runs are there."""
     work = folder / one.name
-    run, told = work / "run", work / "told.json"
+    run = work / "run"
+    answers_file = work / "told.json"
     if not judge_only:
         logs = write(one, folder / "logs", folder / "truth")
         work.mkdir(parents=True, exist_ok=True)
@@ -60,14 +61,14 @@ def judged(one: Machine, folder: Path, judge_only: bool = False) -> dict[str, An
         row = {"kind": one.kind, "seed": one.seed, "code": code, "cpu_s": _cpu_s() - begin, "line": line}
         row["certified"] = code == 0 and bool(answer.get("certified"))
         row["next_step"] = (bool(answer) or len(lines) == 1) and bool(_STEP.search(line))
-        told.write_text(json.dumps(row, indent=1) + "\n")
-    found = json.loads(told.read_text())
+        answers_file.write_text(json.dumps(row, indent=1) + "\n")
+    row_found = json.loads(answers_file.read_text())
     truth = json.loads((folder / "truth" / f"{one.name}.json").read_text())
-    found |= _model(one, truth, run)
-    if found["certified"]:
-        found |= controller_on_machine(one, truth, run)
-    (work / "judged.json").write_text(json.dumps(found, indent=1, default=float) + "\n")
-    return found
+    row_found |= _model(one, truth, run)
+    if row_found["certified"]:
+        row_found |= controller_on_machine(one, truth, run)
+    (work / "judged.json").write_text(json.dumps(row_found, indent=1, default=float) + "\n")
+    return row_found
 
 
 def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:
@@ -76,8 +77,8 @@ def controller_on_machine(one: Machine, truth: dict[str, Any], run: Path) -> dic
     plant = replace(one.plant, delay=one.plant.delay + delay)
     certificate = json.loads((run / "stages" / "certify.json").read_text())["result"]["certificate"]
     verdict = worst_of(certificate["plants"])
-    both = one.plant, plant
-    good = [settles(one, truth, both[k % 2], law, run, verdict["bandwidth_rad_s"], k) for k in range(20)]
+    plants = one.plant, plant
+    good = [settles(one, truth, plants[k % 2], law, run, verdict["bandwidth_rad_s"], k) for k in range(20)]
     false = violations(plant, one.draft.q_operating, law, verdict)
     return {"violations": false, "settled": sum(good), "bad_runs": [k for k in range(20) if not good[k]]}
 
@@ -124,33 +125,37 @@ def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, An
     worst = {name: _number(value) for name, value in verdict["worst_margins"].items() if name != "$type"}
     theta = np.unique(np.concatenate([np.geomspace(1e-5, np.pi, 20_000), np.linspace(1e-3, np.pi, 20_000)]))
     gain = loop_gain(plant, q_operating, law, theta / plant.dt_s)
-    nearest, found = float(np.min(np.abs(1 + gain))), []
+    nearest = float(np.min(np.abs(1 + gain)))
+    violated = []
     if nearest < 0.99 * worst["modulus"]:
-        found.append(f"modulus {nearest:.4f}, stated {worst['modulus']:.4f}")
-    up, down = min(worst["gain_up"], 1e3), worst["gain_down"]
+        violated.append(f"modulus {nearest:.4f}, stated {worst['modulus']:.4f}")
+    up = min(worst["gain_up"], 1e3)
+    down = worst["gain_down"]
     ends = 1 + 0.99 * (up - 1), max(1 - 0.99 * (1 - down), 1e-3)
     gains = np.concatenate([np.geomspace(1, end, 20) for end in ends])
-    found += [f"gain {g:.4f} unstable, stated {down:.4f} to {up:.4f}" for g in gains if radius(g) >= 1][:1]
+    violated += [f"gain {g:.4f} unstable, stated {down:.4f} to {up:.4f}" for g in gains if radius(g) >= 1][:1]
     one = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))  # crossings of the unit circle
     phase = np.abs(np.angle(-gain[one]))
     if np.min(phase, initial=np.pi) < 0.99 * min(worst["phase_rad"], np.pi):
-        found.append(f"phase {np.min(phase):.4f} rad, stated {worst['phase_rad']:.4f}")
+        violated.append(f"phase {np.min(phase):.4f} rad, stated {worst['phase_rad']:.4f}")
     delay = np.min(np.mod(np.angle(-gain[one]), TAU) / theta[one], initial=np.inf) * plant.dt_s
     if delay < 0.99 * worst["delay_s"]:
-        found.append(f"delay {delay:.4g} s, stated {worst['delay_s']:.4g}")
+        violated.append(f"delay {delay:.4g} s, stated {worst['delay_s']:.4g}")
     within = theta < 0.99 * verdict["bandwidth_rad_s"] * plant.dt_s
     if np.any(within) and np.min(np.abs(1 + gain[within])) < 0.99 * np.sqrt(2):
-        found.append(f"bandwidth, stated {verdict['bandwidth_rad_s']:.4g} rad/s")
-    return found
+        violated.append(f"bandwidth, stated {verdict['bandwidth_rad_s']:.4g} rad/s")
+    return violated
 
 
 def settles(
     one: Machine, truth: dict[str, Any], plant: Plant, law: Law, run: Path, bandwidth_rad_s: float, k: int
 ) -> bool:
     """Run k of the docstring's 20."""
-    rng, dt = one.rng(1000 + k), plant.dt_s
+    rng = one.rng(1000 + k)
+    dt = plant.dt_s
     low, high = truth["output_range"]
-    start, size = rng.uniform(low, high), rng.uniform(0.1, 0.5) * (high - low)
+    start = rng.uniform(low, high)
+    size = rng.uniform(0.1, 0.5) * (high - low)
     step = size if start + size < high else -size
     friction = plant.friction.copy()
     friction[:, [0, 1, 3]] *= rng.uniform(0.8, 1.2)
@@ -159,7 +164,8 @@ def settles(
     varied = replace(plant, friction=friction, inertia=plant.inertia * load, gravity=plant.gravity * load)
     limit = json.loads((run / "controller.json").read_text())["input_limit"]
     varied = replace(varied, limit=min(plant.limit, limit or np.inf))
-    n, at = round(float(np.clip(40 / max(bandwidth_rad_s, 1e-3), 4, 30)) / dt), round(0.5 / dt)
+    n = round(float(np.clip(40 / max(bandwidth_rad_s, 1e-3), 4, 30)) / dt)
+    at = round(0.5 / dt)
     moved = np.where(np.arange(n) < at, 0.0, step)
     smoother = run / "controller_reference_filter.json"
     if smoother.exists():
@@ -172,7 +178,8 @@ def settles(
     stiffness = abs(at_bandwidth[0] + law.D[0])
     holding = friction[:, 1].sum() / plant.torque_per_u / max(stiffness, 1e-12)
     tolerance = max(0.05 * size, 3 * plant.count, float(holding))
-    away, last = np.abs(start + step - got["true"]), got["true"][-n // 4 :]
+    away = np.abs(start + step - got["true"])
+    last = got["true"][-n // 4 :]
     return bool(
         np.all(away < 2 * (high - low) + tolerance)
         and np.mean(np.abs(got["u"][n // 2 :]) >= varied.limit) < 0.01
@@ -186,43 +193,48 @@ def _model(one: Machine, truth: dict[str, Any], run: Path) -> dict[str, Any]:
     from workflow.engine.run_directory import RunDirectory
     from workflow.tasks.results import RunResults
 
-    found: dict[str, Any] = {}
+    judged: dict[str, Any] = {}
     try:
         results = RunResults(RunDirectory.open(run))
-        identify, spread = results.identify, results.uncertainty.channels[0]
+        identify = results.identify
+        spread = results.uncertainty.channels[0]
     except (OSError, ValueError, KeyError):  # refused before there was a model
-        return found
-    channel, intervals = identify.channels[0], spread.intervals
+        return judged
+    channel = identify.channels[0]
+    intervals = spread.intervals
     rows = [mode for mode in channel.modes if channel.is_mode(mode)]
     if rows:
         near = min(rows, key=lambda mode: abs(np.log(mode.frequency_Hz / truth["modes_hz"][0])))
         at = channel.modes.index(near)
-        found["frequency_error"] = near.frequency_Hz / truth["modes_hz"][0] - 1
-        found["damping"], found["damping_true"] = near.damping, truth["dampings"][0]
+        judged["frequency_error"] = near.frequency_Hz / truth["modes_hz"][0] - 1
+        judged["damping"] = near.damping
+        judged["damping_true"] = truth["dampings"][0]
         if intervals is not None and at < len(intervals.modes):
-            (low, high), (least, most) = intervals.modes[at].frequency_Hz, intervals.modes[at].damping
-            found["frequency_inside"] = bool(low <= truth["modes_hz"][0] <= high)
-            found["damping_inside"] = bool(least <= truth["dampings"][0] <= most)
+            (low, high) = intervals.modes[at].frequency_Hz
+            (smallest, largest) = intervals.modes[at].damping
+            judged["frequency_inside"] = bool(low <= truth["modes_hz"][0] <= high)
+            judged["damping_inside"] = bool(smallest <= truth["dampings"][0] <= largest)
     if identify.friction is not None:
-        law, level = identify.friction.law, identify.friction.level
+        law = identify.friction.law
+        level = identify.friction.level
         used = truth["friction_as_recorded_in_input_units"][:-1]
         true = truth["coulomb_in_input_units"] if law.excess > 0 else float(np.mean(used))
-        found["friction_error"] = level / true - 1
-        found["friction_inside"] = bool(abs(level - true) <= 1.96 * identify.friction.level_std)
+        judged["friction_error"] = level / true - 1
+        judged["friction_inside"] = bool(abs(level - true) <= 1.96 * identify.friction.level_std)
     if truth["unstable_1_s"]:
         growth = [pole for pole, _ in channel.unstable_poles]
-        found["unstable_error"] = growth[0] / truth["unstable_1_s"][0] - 1 if len(growth) == 1 else None
+        judged["unstable_error"] = growth[0] / truth["unstable_1_s"][0] - 1 if len(growth) == 1 else None
     omega = spread.frequency.omega_rad_s
     a, b, c = (np.array(truth[k]) for k in "ABC")
     excited = _excited(one, omega)
     true = response(a, b, c, omega, one.plant.dt_s)
     parts = [member.posterior.at(omega, spread.level) for member in spread.members]
     inside = np.any([_holds(ellipses, true) for ellipses in parts], axis=0)
-    found["ellipses"] = float(np.mean(inside[excited])) if np.any(excited) else None
+    judged["ellipses"] = float(np.mean(inside[excited])) if np.any(excited) else None
     band = np.floor(2 * np.log10(omega)).astype(int)
     shares = {k: float(np.mean(inside[excited & (band == k)])) for k in np.unique(band[excited])}
-    found["by_half_decade"] = {f"{10 ** (k / 2):.3g} rad/s": share for k, share in shares.items()}
-    return found
+    judged["by_half_decade"] = {f"{10 ** (k / 2):.3g} rad/s": share for k, share in shares.items()}
+    return judged
 
 
 def _holds(ellipses: Any, g: Array) -> Array:
@@ -237,6 +249,8 @@ def _excited(one: Machine, omega: Array) -> Array:
     for log in range(len(one.classes) - 1):
         got, begin = one.record(log, one.rng(log))
         u = np.clip(got["u"][begin:], -one.plant.limit, one.plant.limit)
-        f, own = scipy.signal.welch(u, 1 / one.plant.dt_s, nperseg=min(u.size, round(4 / one.plant.dt_s)))
-        power = power + own
+        f, spectrum = scipy.signal.welch(
+            u, 1 / one.plant.dt_s, nperseg=min(u.size, round(4 / one.plant.dt_s))
+        )
+        power = power + spectrum
     return np.interp(omega, TAU * f, power) > 1e-3 * np.max(power)

@@ -40,8 +40,10 @@ class Machine:
 
     def reference(self, log: int, rng: np.random.Generator) -> tuple[Array, int]:
         """Reference in output units, (T,), and the sample at which the log begins."""
-        d, dt = self.draft, self.plant.dt_s
-        before, n = round(_BEFORE_S / dt), round(self.duration_s / dt)
+        d = self.draft
+        dt = self.plant.dt_s
+        before = round(_BEFORE_S / dt)
+        n = round(self.duration_s / dt)
         shape = _shape(self.classes[log], n, before, dt, d, rng)
         size = self.levels[log] * d.motion_rad * self.plant.scale
         r = shape * size / np.std(shape[before:])
@@ -70,7 +72,8 @@ class Machine:
 def machine(kind: str, seed: int, series: int = 1) -> Machine:
     """The machine of a seed. Friction is 2 to 30 % of the rms command of its logs."""
     rng = np.random.default_rng([series, ALL_KINDS.index(kind), seed])
-    d, u = draft(kind, seed, rng), rng.uniform
+    d = draft(kind, seed, rng)
+    u = rng.uniform
     reported = kind == "belt" and (series, seed) == (1, 0)
     logs = int(rng.choice([3, 4]))
     main = str(rng.choice(CLASSES, p=[0.35, 0.25, 0.2, 0.2]))
@@ -78,28 +81,39 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
     if kind == "clipped":
         classes = ["chirp"] * logs
     levels = [1.0, 0.5, 1.0, 0.5][:logs] if rng.random() < 0.4 else [1.0] * logs
-    rest, duration = [bool(rng.random() < 0.6) for _ in range(logs)], round(float(u(8, 20)), 1)
+    begins_at_rest = [bool(rng.random() < 0.6) for _ in range(logs)]
+    duration = round(float(u(8, 20)), 1)
     if d.plant.dt_s < 4e-4:
         duration = min(duration, 10.0)
     away = 0.0 if kind == "pendulum" else float(u(-5, 5)) * d.motion_rad
-    share, model = float(np.exp(u(*np.log([0.1 if kind == "screw" else 0.02, 0.3])))), rng.random()
-    high, slow, shift = float(u(1.1, 1.4)), float(u(0.03, 0.2)), float(np.exp(u(*np.log([1e-4, 1e-3]))))
-    ripple, clip = float(u(0.003, 0.02)), float(u(0.96, 0.995))
+    share = float(np.exp(u(*np.log([0.1 if kind == "screw" else 0.02, 0.3]))))
+    model = rng.random()
+    high = float(u(1.1, 1.4))
+    slow = float(u(0.03, 0.2))
+    shift = float(np.exp(u(*np.log([1e-4, 1e-3]))))
+    ripple = float(u(0.003, 0.02))
+    clip = float(u(0.96, 0.995))
     if reported:
-        classes, levels, rest = ["multisine"] * 4, [1.0, 1.0, 0.5, 0.5], [True] * 4
-        duration, away, model, logs = 16.0, 0.0, 0.0, 4
+        classes = ["multisine"] * 4
+        levels = [1.0, 1.0, 0.5, 0.5]
+        begins_at_rest = [True] * 4
+        duration = 16.0
+        away = 0.0
+        model = 0.0
+        logs = 4
     centre = (d.q_operating + away) * d.plant.scale
-    habits = tuple(classes), tuple(levels), tuple(rest), duration, centre, seed % 6 < 4
+    habits = tuple(classes), tuple(levels), tuple(begins_at_rest), duration, centre, seed % 6 < 4
     is_limited = kind in ("saturation", "clipped")
     if kind == "clipped":  # a tenth of the samples more, and more
         clip -= 0.1
     bare = Machine(kind, seed, series, d, d.plant, *habits, is_limited and seed % 6 in (2, 4))
-    plant, level = replace(d.plant, ripple=np.zeros(3)), 0.0
+    plant = replace(d.plant, ripple=np.zeros(3))
+    level = 0.0
     for _ in range(10):  # friction raises the command that it is a share of
         ran = [replace(bare, plant=plant).record(log, bare.rng(log)) for log in range(logs)]
-        rms = [float(np.std(one["applied"][begin:])) for one, begin in ran]
+        rms = [float(np.std(signals["applied"][begin:])) for signals, begin in ran]
         command = min(max(share * np.exp(np.mean(np.log(rms))), 0.02 * max(rms)), 0.3 * min(rms))
-        speed = np.concatenate([one["speed"][begin:] for one, begin in ran])
+        speed = np.concatenate([signals["speed"][begin:] for signals, begin in ran])
         if 0 < level <= 0.305 * min(rms) * plant.torque_per_u or (level and reported):
             break
         level = 0.03 if reported else command * plant.torque_per_u
@@ -115,7 +129,7 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
     plant = replace(plant, ripple=waves * (0.0 if reported else 1.0))
     rough = replace(bare, plant=plant)
     ran = [rough.record(log, rough.rng(log)) for log in range(logs)]
-    peaks = np.concatenate([np.abs(one["u"][begin:]) for one, begin in ran])
+    peaks = np.concatenate([np.abs(signals["u"][begin:]) for signals, begin in ran])
     if not np.all(np.isfinite(peaks)):
         raise RuntimeError(f"{bare.name} of series {series} does not hold")
     limit = float(np.quantile(peaks, clip)) if is_limited else 2.5 * float(np.max(peaks))
@@ -124,8 +138,10 @@ def machine(kind: str, seed: int, series: int = 1) -> Machine:
 
 def _shape(name: str, n: int, before: int, dt: float, d: Draft, rng: np.random.Generator) -> Array:
     """Zero-mean shape of a reference, (before + n,)."""
-    u, total = rng.uniform, before + n
-    t, nyquist = (np.arange(total) - before) * dt, 0.5 / dt
+    u = rng.uniform
+    total = before + n
+    t = (np.arange(total) - before) * dt
+    nyquist = 0.5 / dt
     top = min(d.mode_hz * u(2, 6), 0.4 / dt)
     if name == "multisine":
         period = round(n / 2)
@@ -133,26 +149,31 @@ def _shape(name: str, n: int, before: int, dt: float, d: Draft, rng: np.random.G
         size = 1 / np.sqrt(1 + (lines / (period * dt) / (d.bandwidth_hz * u(0.5, 3))) ** 2)
         spectrum = np.zeros(period // 2 + 1, complex)
         spectrum[lines] = size * np.exp(1j * u(0, TAU, lines.size))
-        one = np.fft.irfft(spectrum, period)
-        return one[(np.arange(total) - before) % period]
+        wave = np.fft.irfft(spectrum, period)
+        return wave[(np.arange(total) - before) % period]
     if name == "prbs":
         hold = max(round(1 / (u(2, 4) * d.mode_hz) / dt), 1)
         levels = np.repeat(rng.choice([-1.0, 1.0], total // hold + 1), hold)[:total]
         keep = np.exp(-TAU * min(d.mode_hz * u(0.5, 1.5), nyquist) * dt)
         return scipy.signal.lfilter([(1 - keep) ** 2], [1, -2 * keep, keep**2], levels)
     if name == "chirp":
-        first, last = u(0.1, 0.3), min(2 * d.mode_hz, 0.4 / dt)
+        first = u(0.1, 0.3)
+        last = min(2 * d.mode_hz, 0.4 / dt)
         rate = np.log(last / first) / (n * dt)
         phase = TAU * first * np.where(t < 0, t, (np.exp(rate * np.maximum(t, 0)) - 1) / rate)
         return np.sin(phase)
-    shape, at, last = np.zeros(total), 0, 0.0  # moves of trapezoidal speed, with stops
+    # moves of trapezoidal speed, with stops
+    shape = np.zeros(total)
+    at = 0
+    last = 0.0
     while at < total:
-        there, moving = u(-2, 2), max(round(u(0.8, 3) / (TAU * d.bandwidth_hz) / dt), 8)
+        target = u(-2, 2)
+        moving = max(round(u(0.8, 3) / (TAU * d.bandwidth_hz) / dt), 8)
         s = np.clip(np.arange(moving + round(u(0.2, 0.8) / dt)) / moving, 0, 1)
         ramp = u(0.15, 0.3)
         up = np.where(s > 1 - ramp, 1 - ramp - (1 - s) ** 2 / (2 * ramp), s - ramp / 2)
         up = np.where(s < ramp, s**2 / (2 * ramp), up)
-        part = last + (there - last) * up / (1 - ramp)
+        part = last + (target - last) * up / (1 - ramp)
         last = float(part[-1])
         shape[at : at + s.size] = part[: total - at]
         at += s.size
@@ -163,7 +184,8 @@ def printed(one: Machine, got: dict[str, Array], begin: int, start_s: float, pat
     """A run from sample `begin` on, as a logger prints it."""
     time, reference, command, output = one.draft.columns
     u = got["u"] if one.as_commanded else np.clip(got["u"], -one.plant.limit, one.plant.limit)
-    u, n = u[begin:], got["u"].size - begin
+    u = u[begin:]
+    n = got["u"].size - begin
     clock = np.arange(n) * one.plant.dt_s + start_s
     digits = max(4 - int(np.floor(np.log10(np.std(u)))), 2)
     places = 6 if one.plant.scale == 1 else 5
@@ -181,7 +203,10 @@ def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
     where = folder / one.name
     where.mkdir(parents=True, exist_ok=True)
     truth.mkdir(parents=True, exist_ok=True)
-    levels, paths, moved, dt = [], [], [], one.plant.dt_s
+    levels = []
+    paths = []
+    moved = []
+    dt = one.plant.dt_s
     for log in range(len(one.classes)):
         rng = one.rng(log)
         got, begin = one.record(log, rng)
@@ -190,10 +215,12 @@ def write(one: Machine, folder: Path, truth: Path) -> list[Path]:
         printed(one, got, begin, start_s, paths[-1])
         moved.append(got["true"][begin:])
         levels.append(float(got["friction_Nm"]) / one.plant.torque_per_u)
-    p, d = one.plant, one.draft
+    p = one.plant
+    d = one.draft
     a, b, c = p.sampled(d.q_operating)
     poles = p.linear(d.q_operating)[3]
-    modes = sorted((poles[poles.imag > 1e-6]), key=abs)
+    is_upper = poles.imag > 1e-6
+    modes = sorted(poles[is_upper], key=abs)
     known = {
         "kind": one.kind, "seed": one.seed, "series": one.series, "dt_s": dt, "delay_samples": p.delay,
         "A": a.tolist(), "B": b.tolist(), "C": c.tolist(),  # friction-free, sampled, in the log's units

@@ -71,31 +71,45 @@ class Draft(NamedTuple):
 
 def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     """Plant, controller and habits of one machine; no friction, no limit."""
-    one: dict[str, Any] = dict(zip(_NAMES, (_ROWS | _FURTHER_ROWS)[kind], strict=True))
+    row: dict[str, Any] = dict(zip(_NAMES, (_ROWS | _FURTHER_ROWS)[kind], strict=True))
     u = rng.uniform
     reported = kind == "belt" and rng.bit_generator.seed_seq.entropy == [1, 0, 0]  # type: ignore[attr-defined]
-    motor, ratio = 1e-3 * float(np.exp(u(*np.log(one["inertia"])))), float(u(*one["ratio"]))
-    anti, zeta = float(u(*one["anti"])), float(u(*one["zeta"]))
-    letters = str(rng.choice(one["columns"].split()))
+    motor = 1e-3 * float(np.exp(u(*np.log(row["inertia"]))))
+    ratio = float(u(*row["ratio"]))
+    anti = float(u(*row["anti"]))
+    zeta = float(u(*row["zeta"]))
+    letters = str(rng.choice(row["columns"].split()))
     per_rad, time, reference, output = _OUTPUTS[letters[0]]
     columns = (time, reference, _INPUTS[letters[1]], output)
     gear = float(rng.choice([50, 80, 100])) if kind == "joint" else 1.0
-    torque = float(np.exp(u(*np.log(one["torque"])))) if letters[1] != "t" else gear
-    load, counts = motor * ratio, int(rng.choice(_COUNTS))
+    torque = float(np.exp(u(*np.log(row["torque"])))) if letters[1] != "t" else gear
+    load = motor * ratio
+    counts = int(rng.choice(_COUNTS))
     least = max(12 * anti * np.sqrt(1 + ratio), 1000 * (kind == "screw"))
     rates = [rate for rate in _RATES_HZ if rate >= least]
-    rate, delay = float(rng.choice(rates[:3])), int(rng.random() < 0.5)
+    rate = float(rng.choice(rates[:3]))
+    delay = int(rng.random() < 0.5)
     if kind == "quick":
         rate = 4000.0
     if kind == "late":
         delay = 5
     if reported:
-        motor, load, anti, zeta, torque, per_rad, counts = 2e-3, 5e-3, 5.0, 0.0374, 0.6, 1.0, 16384
-        columns, rate, delay = ("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), 1000.0, 1
+        motor = 2e-3
+        load = 5e-3
+        anti = 5.0
+        zeta = 0.0374
+        torque = 0.6
+        per_rad = 1.0
+        counts = 16384
+        columns = ("t_ms", "ref_rad", "i_cmd_A", "enc_rad")
+        rate = 1000.0
+        delay = 1
     total = motor + load
     # A coasting time of seconds; back-EMF, where the input is a voltage, brakes faster.
     viscous = np.array([total / u(1, 5) if letters[1] != "v" else total / u(0.3, 1.5), 0.0])
-    inertia, gravity, springs = np.array([motor, load]), np.zeros(2), _spring(motor, load, anti, zeta)
+    inertia = np.array([motor, load])
+    gravity = np.zeros(2)
+    springs = _spring(motor, load, anti, zeta)
     if reported:
         viscous[0] = 4e-3
     if kind == "play":
@@ -103,10 +117,13 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
     if kind == "quick":
         viscous[0] = total / u(5, 20)
     if kind == "link":  # a clamped beam: share of the inertia and frequency of its first three modes
-        shares, times = np.array([0.9707, 0.0247, 0.0032]), np.array([1, 6.267, 17.55])
+        shares = np.array([0.9707, 0.0247, 0.0032])
+        times = np.array([1, 6.267, 17.55])
         inertia = np.concatenate([[motor + load * (1 - shares.sum())], load * shares])
         rows = [_spring(motor, inertia[j], anti * times[j - 1], zeta, j) for j in (1, 2, 3)]
-        springs, viscous, gravity = np.concatenate(rows), np.append(viscous[:1], np.zeros(3)), np.zeros(4)
+        springs = np.concatenate(rows)
+        viscous = np.append(viscous[:1], np.zeros(3))
+        gravity = np.zeros(4)
     q_operating = 0.0
     if kind == "pendulum":  # odd seeds: an arm held above the horizontal
         gravity[1] = load * 9.81 / u(0.2, 0.8)
@@ -121,17 +138,18 @@ def draft(kind: str, seed: int, rng: np.random.Generator) -> Draft:
         int(at_load), scale, 1 / rate, delay, TAU * scale / (counts * gear), np.inf,
     )  # fmt: skip
     poles = plant.linear(q_operating)[3]
-    bandwidth = u(*one["bandwidth"]) * TAU * anti
+    bandwidth = u(*row["bandwidth"]) * TAU * anti
     if kind == "pendulum":
-        bandwidth = u(*one["bandwidth"]) * max(np.max(poles.real), 3.0)
+        bandwidth = u(*row["bandwidth"]) * max(np.max(poles.real), 3.0)
     law, bandwidth = _design(plant, q_operating, float(bandwidth), rng)
     if reported:
         law = _pid((1.5, 0.06, 0.0), 1e-6, 0.0, 1e-3, False, 0.0)
-    motion = float(np.exp(u(*np.log(one["motion"]))))
+    motion = float(np.exp(u(*np.log(row["motion"]))))
     motion = 0.22 if reported else max(motion, 20 * plant.count / scale)
     noisy = float(u(0.5, 2)) if counts >= 200_000 else 0.0
-    mode = float(np.min(np.abs(poles[poles.imag > 1e-6]))) / TAU
-    return Draft(kind, plant, law, q_operating, motion, one["share"], columns, bandwidth / TAU, mode, noisy)
+    is_upper = poles.imag > 1e-6
+    mode = float(np.min(np.abs(poles[is_upper]))) / TAU
+    return Draft(kind, plant, law, q_operating, motion, row["share"], columns, bandwidth / TAU, mode, noisy)
 
 
 def _spring(motor: float, load: float, anti_hz: float, zeta: float, to: int = 1) -> Any:
@@ -144,10 +162,13 @@ def _spring(motor: float, load: float, anti_hz: float, zeta: float, to: int = 1)
 def _pid(gains: Any, filter_s: float, low_pass_s: float, dt_s: float, on_output: bool, bias: float) -> Law:
     """P, filtered D (of the error or of the output), I with back-calculation, low-pass; gains P, D, I."""
     kp, kd, ki = gains
-    keep, soft = np.exp(-dt_s / filter_s), np.exp(-dt_s / low_pass_s) if low_pass_s else 0.0
-    slope, error = np.array([0.0, -1.0]) if on_output else np.array([1.0, -1.0]), np.array([1.0, -1.0])
+    keep = np.exp(-dt_s / filter_s)
+    soft = np.exp(-dt_s / low_pass_s) if low_pass_s else 0.0
+    slope = np.array([0.0, -1.0]) if on_output else np.array([1.0, -1.0])
+    error = np.array([1.0, -1.0])
     steep = kd * (1 - keep) / dt_s  # a backward difference where the filter is faster than the sampling
-    c, d = np.array([-steep, 1.0, 0.0]), kp * error + steep * slope
+    c = np.array([-steep, 1.0, 0.0])
+    d = kp * error + steep * slope
     a = np.diag([keep, float(ki > 0), soft]) + np.outer([0, 0, 1 - soft], c)
     b = np.array([(1 - keep) * slope, ki * dt_s * error, (1 - soft) * d])
     wind = np.array([0.0, ki * dt_s / kp, 0.0])
@@ -170,15 +191,20 @@ def loop_gain(plant: Plant, q_operating: float, law: Law, omega_rad_s: Any) -> A
 def _design(plant: Plant, q_operating: float, bandwidth: float, rng: Any) -> tuple[Law, float]:
     """PD, PID or PID with a low-pass that keeps |S| under 2.8; slower by a tenth until it does."""
     u = rng.uniform
-    kind, zeta, times, on_output = int(rng.integers(3)), u(0.5, 1.0), u(5, 15), bool(rng.random() < 0.4)
-    low, slow = u(6, 12), u(4, 10)
+    kind = int(rng.integers(3))
+    zeta = u(0.5, 1.0)
+    times = u(5, 15)
+    on_output = bool(rng.random() < 0.4)
+    low = u(6, 12)
+    slow = u(4, 10)
     held = -np.sum(plant.gravity) * np.sin(q_operating) / plant.torque_per_u * u(0.9, 1.1)
     gain = plant.torque_per_u * plant.scale / plant.inertia.sum()
     lift = max(np.sum(plant.gravity) * np.cos(q_operating) / plant.inertia.sum(), 0.0)
     theta = np.geomspace(1e-4, np.pi, 2000)
     for _ in range(40):
         natural = bandwidth / 1.5
-        kp, kd = (natural**2 + lift) / gain, 2 * zeta * natural / gain
+        kp = (natural**2 + lift) / gain
+        kd = 2 * zeta * natural / gain
         ki = kp * natural / slow if kind else 0.0
         soft = 1 / (low * bandwidth) if kind == 2 else 0.0
         law = _pid((kp, kd, ki), 1 / (times * bandwidth), soft, plant.dt_s, on_output, float(held))
@@ -187,5 +213,8 @@ def _design(plant: Plant, q_operating: float, bandwidth: float, rng: Any) -> tup
             return law, bandwidth
         bandwidth *= 0.9
         if lift and bandwidth < 2 * np.sqrt(lift):  # an unstable plant needs speed: give up filters instead
-            bandwidth, kind, times, low = 4 * np.sqrt(lift), min(kind, 1), 2 * times, 2 * low
+            bandwidth = 4 * np.sqrt(lift)
+            kind = min(kind, 1)
+            times = 2 * times
+            low = 2 * low
     raise RuntimeError(f"no PID holds {plant}")

@@ -49,26 +49,33 @@ class Plant:
     def linear(self, q_operating: float = 0.0) -> tuple[Array, Array, Array, Array]:
         """A, B, C of the friction-free continuous plant from u to y, play closed, and its poles in 1/s."""
         n = self.inertia.size
-        stiff, damp = -np.diag(self.gravity * np.cos(q_operating)), np.diag(self.viscous)
+        stiff = -np.diag(self.gravity * np.cos(q_operating))
+        damp = np.diag(self.viscous)
         for i, j, k, d, _ in self.springs:
             across = np.zeros(n)
-            across[int(i)], across[int(j)] = 1, -1
-            stiff, damp = stiff + k * np.outer(across, across), damp + d * np.outer(across, across)
+            across[int(i)] = 1
+            across[int(j)] = -1
+            stiff = stiff + k * np.outer(across, across)
+            damp = damp + d * np.outer(across, across)
         forces = -np.hstack([stiff, damp]) / self.inertia[:, None]
         a = np.vstack([np.eye(2 * n)[n:], forces])
-        b, c = np.zeros((2 * n, 1)), np.zeros((1, 2 * n))
-        b[n, 0], c[0, self.out] = self.torque_per_u / self.inertia[0], self.scale
+        b = np.zeros((2 * n, 1))
+        c = np.zeros((1, 2 * n))
+        b[n, 0] = self.torque_per_u / self.inertia[0]
+        c[0, self.out] = self.scale
         return a, b, c, np.linalg.eigvals(a)
 
     def sampled(self, q_operating: float = 0.0) -> tuple[Array, Array, Array]:
         """A, B, C of the friction-free plant at the sampling instants: zero-order hold, delay included."""
         a, b, c, _ = self.linear(q_operating)
         n = a.shape[0]
-        both = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * self.dt_s)
-        a, b = both[:n, :n], both[:n, n:]
+        sampled = scipy.linalg.expm(np.block([[a, b], [np.zeros((1, n + 1))]]) * self.dt_s)
+        a = sampled[:n, :n]
+        b = sampled[:n, n:]
         for _ in range(self.delay):  # the command waits one sample in each further state
             n = a.shape[0]
-            a, c = np.block([[a, b], [np.zeros((1, n + 1))]]), np.append(c, [[0.0]], 1)
+            a = np.block([[a, b], [np.zeros((1, n + 1))]])
+            c = np.append(c, [[0.0]], 1)
             b = np.eye(n + 1)[:, n:]
         return a, b, c
 
@@ -86,12 +93,12 @@ class Plant:
         """
         sub = int(np.ceil(self.dt_s / self.step_s()))
         names = ("y", "u", "applied", "true", "speed", "work", "path")
-        one = [np.ascontiguousarray(each, float) for each in law[:5]]
+        law_arrays = [np.ascontiguousarray(each, float) for each in law[:5]]
         p = self
         parts = p.inertia, p.viscous, p.gravity, p.springs, p.friction, p.ripple, p.torque_per_u
         sensor = p.out, p.scale, p.delay, p.count, p.limit
         signals = np.ascontiguousarray(reference, float), float(q_start), np.ascontiguousarray(noise, float)
-        every = _run(sub, p.dt_s / sub, *parts, *sensor, *one, float(law.bias), *signals, count_from)
+        every = _run(sub, p.dt_s / sub, *parts, *sensor, *law_arrays, float(law.bias), *signals, count_from)
         got = dict(zip(names, every, strict=True))
         got["friction_Nm"] = np.sum(got.pop("work") / np.maximum(got.pop("path"), 1e-12))
         return got
@@ -108,14 +115,27 @@ def response(a: Array, b: Array, c: Array, omega_rad_s: Array, dt_s: float) -> A
 @numba.njit(cache=True)  # type: ignore[untyped-decorator]
 def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, count, limit, A, B, C, D, L, bias,
          r, q_start, noise, count_from):  # fmt: skip
-    n, size, states = r.size, m.size, A.shape[0]
-    y, u, applied, true, speed = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n)
-    q, v, acc, z, f = np.full(size, q_start), np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
-    work, path = np.zeros(size), np.zeros(size)
-    x, new = np.zeros(states), np.zeros(states)
+    n = r.size
+    size = m.size
+    states = A.shape[0]
+    y = np.zeros(n)
+    u = np.zeros(n)
+    applied = np.zeros(n)
+    true = np.zeros(n)
+    speed = np.zeros(n)
+    q = np.full(size, q_start)
+    v = np.zeros(size)
+    acc = np.zeros(size)
+    z = np.zeros(size)
+    f = np.zeros(size)
+    work = np.zeros(size)
+    path = np.zeros(size)
+    x = np.zeros(states)
+    new = np.zeros(states)
     waiting = np.full(max(delay, 1), bias)
     for t in range(n):
-        true[t], speed[t] = q[out] * scale, v[0]
+        true[t] = q[out] * scale
+        speed[t] = v[0]
         y[t] = true[t] + noise[t]
         if count > 0:
             y[t] = np.round(y[t] / count) * count
@@ -137,8 +157,10 @@ def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, coun
                 f[i] = g[i] * np.sin(q[i])
             f[0] += kt * applied[t] + ripple[0] * np.sin(ripple[1] * q[0] + ripple[2])
             for s in range(springs.shape[0]):
-                i, j = int(springs[s, 0]), int(springs[s, 1])
-                twist, play = q[i] - q[j], springs[s, 4]
+                i = int(springs[s, 0])
+                j = int(springs[s, 1])
+                twist = q[i] - q[j]
+                play = springs[s, 4]
                 if abs(twist) > play:  # without play: always, but for a point
                     twist -= np.sign(twist) * play
                     # Speeds of the middle of the step, from the last acceleration.
@@ -148,7 +170,9 @@ def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, coun
                     f[j] += torque
             for i in range(size):
                 before = v[i]
-                low, high, slow = friction[i, 0], friction[i, 1], friction[i, 2]
+                low = friction[i, 0]
+                high = friction[i, 1]
+                slow = friction[i, 2]
                 level = low + (high - low) * np.exp(-((before / slow) ** 2))
                 if friction[i, 3] > 0:
                     grown = (z[i] + h * before) / (1 + h * friction[i, 3] * abs(before) / level)
@@ -159,9 +183,9 @@ def _run(sub, h, m, c, g, springs, friction, ripple, kt, out, scale, delay, coun
                     v[i] = ((m[i] - 0.5 * h * c[i]) * before + h * (f[i] - force)) / (m[i] + 0.5 * h * c[i])
                 else:
                     free = (m[i] - 0.5 * h * c[i]) * before + h * f[i]
-                    kept = max(abs(free) - h * level, 0.0)
-                    force = (free - np.sign(free) * kept) / h
-                    v[i] = np.sign(free) * kept / (m[i] + 0.5 * h * c[i])
+                    after_friction = max(abs(free) - h * level, 0.0)
+                    force = (free - np.sign(free) * after_friction) / h
+                    v[i] = np.sign(free) * after_friction / (m[i] + 0.5 * h * c[i])
                 acc[i] = (v[i] - before) / h
                 q[i] += 0.5 * h * v[i]
                 if t >= count_from:
