@@ -13,9 +13,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import control
 import numba
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +24,9 @@ from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
 from ident.data.arrays import COMPILED, INSIDE, kernel_array, lock
 from ident.data.shown import Shown
+
+if TYPE_CHECKING:
+    import control
 
 # Relative difference of two sampling times that counts as none: rounding of decimal numbers.
 _SAME_PERIOD = 1e-9

@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 
-import control
 import numpy as np
 
 from control_design.analysis.closed_loop import LinearMachine, simulate, simulate_joints
@@ -144,6 +143,8 @@ def limited_controller(controller: Controller) -> LimitedLoop:
 
     # What the linear controller asks for under an error of one: a machine that never moves leaves it there.
     linear = replace(law, input_limit=None, rate_limit=None)
+    import control  # here, because it brings a plotting library with it
+
     silent = LinearMachine(control.ss([[0.0]], [[0.0]], [[1.0]], [[0.0]], law.dt_s))
     asked = simulate(linear, silent, np.ones(samples)).command
     at_end = float(asked[-1])

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from control_design.plants.ellipses import Complex, Ellipses, Real
 from control_design.plants.frequency_grid import around_maxima, joined
@@ -333,6 +332,8 @@ def _crossings(
     omega_rad_s: rad/s, ascending. refinable: `loop_gain` (N,) may be asked between the points. Fewer than two
     points give no crossing. Nothing is checked.
     """
+    from scipy.optimize import brentq  # here: it takes its time to load
+
     omega = omega_rad_s
     values = _LoopValues.of(value)
     if refinable:

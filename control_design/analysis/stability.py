@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
@@ -193,6 +192,8 @@ def mode_changes(controller: Controller, plant: UncertainPlant) -> tuple[ModeCha
     mode of the plant has become and that are within a fifth of its frequency, a lighter one takes its place:
     where poles of plant and controller meet, the lighter branch is what rings.
     """
+    from scipy.optimize import linear_sum_assignment  # here: it takes its time to load
+
     modes = [mode for mode in plant.modes if mode.zeta > 0]
     loop = NominalLoop(plant, controller.computational_delay_samples)
 

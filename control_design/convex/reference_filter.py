@@ -13,9 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import control
 import numpy as np
-import scipy.optimize
 
 from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.biquads import imaginary_axis
@@ -128,6 +126,8 @@ def _filtered(law: ReferenceFilter, reference: bytes) -> Real:
     """Filtered reference (T,) for the bytes of a reference (T,) of doubles. Kept, because trials of one loop
     have one reference, and stepping through it in Python takes longer than the loop: the 8 used last, of a
     few laws. Read-only, as all callers share it."""
+    import control  # here, because it brings a plotting library with it
+
     outputs = control.forced_response(law.to_control(), inputs=np.frombuffer(reference)).outputs
     return np.asarray(readonly(outputs))
 
@@ -268,6 +268,8 @@ class _Matching:
     def _searched_poles(self) -> Poles:
         """Real poles in z by a simplex over the logarithms of their decay rates, on thinned grids with half
         the samples; the best of three starts. At least one pole (`options.order`)."""
+        import scipy.optimize  # here: it takes its time to load
+
         thin_grids = [grid[::_SEARCH_THINNING] for grid in self.grids]
         n_samples = _BOUNDARY_SAMPLES // 2
         n_poles = self.options.order

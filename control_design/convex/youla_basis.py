@@ -9,8 +9,8 @@ the plant's corners, modes and light zeros, and `with_constant` evaluates it.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 import scipy.linalg
 
@@ -19,6 +19,9 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant, matrix_response, modes_of
 from ident.basis.functions import basis_response
 from ident.basis.poles import Poles
+
+if TYPE_CHECKING:
+    import control
 
 # Slowest mirrored pole as a share of the fastest real one: zeros of sampling lie as far from z = -1 as the
 # plant turns in a sample, and farther. Chosen.
@@ -151,6 +154,8 @@ class Factors:
         # N and M differ in their outputs only: one system with two outputs is evaluated.
         outputs = np.vstack([self.N.C, self.M.C])
         output_feedthrough = np.vstack([self.N.D, self.M.D])
+        import control  # here, because it brings a plotting library with it
+
         plant_factors = control.ss(self.N.A, self.N.B, outputs, output_feedthrough, self.N.dt)
         n, m = matrix_response(plant_factors, omega_rad_s)[:, :, 0].T
         # X and Y differ in their inputs only.
@@ -190,6 +195,8 @@ def coprime_factors(plant: control.StateSpace) -> Factors:
     M = 1 + F(zI - A_F)^-1 B, N = D + (C + D F)(zI - A_F)^-1 B, X = F(zI - A_L)^-1 L, Y = 1 - F(zI - A_L)^-1
     (B + L D), with A_F = A + B F and A_L = A + L C (Nett, Jacobson and Balas, IEEE TAC 29, 1984).
     """
+    import control  # here, because it brings a plotting library with it
+
     a, b, c, d = (np.asarray(getattr(plant, name), dtype=np.float64) for name in "ABCD")
     state_weight = _STATE_WEIGHT_SHARE * np.eye(a.shape[0])
     output_weight = c.T @ c

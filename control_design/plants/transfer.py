@@ -8,11 +8,13 @@ poles at exactly one (integrators) and calls `of_roots`, which builds the sectio
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 import numpy.typing as npt
+
+if TYPE_CHECKING:
+    import control
 
 
 def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: float) -> control.StateSpace:
@@ -36,6 +38,8 @@ def of_polynomials(numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt_s: f
         If there are more zeros than poles. A nan is LinAlgError of numpy. A numerator of zeros alone gives a
         system that answers nothing.
     """
+    import control  # here, because it brings a plotting library with it
+
     zeros_polynomial = np.trim_zeros(np.atleast_1d(numerator), "f")
     poles_polynomial = np.trim_zeros(np.atleast_1d(denominator), "f")
     if zeros_polynomial.size > poles_polynomial.size:
@@ -85,6 +89,8 @@ def of_roots(zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt_s: floa
         By `zip`, where there are more factors of zeros than of poles. A complex root without its conjugate is
         not seen: it counts as a pair in the upper half plane, and is left out in the lower one.
     """
+    import control  # here, because it brings a plotting library with it
+
     denominators = _factors(np.atleast_1d(poles))
     numerators = _factors(np.atleast_1d(zeros))
     # Sections without a zero of their own have the numerator 1.

@@ -22,7 +22,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import casadi as ca
 import numba
 import numpy as np
 
@@ -92,6 +91,8 @@ def row_functions(sections: tuple[Section, ...]) -> tuple[Any, Any, Any]:
     centre, major axis, minor axis and delay, then the powers i of G and j of K in F. The order in which
     expressions are built decides the last digits of every design: keep it.
     """
+    import casadi as ca  # here: results, which nobody designs from, load without it
+
     cascade = Cascade(sections, 1.0, 1.0)
     x = ca.SX.sym("x", cascade.parameters)
     angle = ca.SX.sym("angle")

@@ -11,12 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import cont2discrete
 
 from control_design.analysis.certificate import certify
 from control_design.analysis.closed_loop import LinearMachine, SampledMachine, measure_sensitivity, simulate
@@ -35,6 +33,9 @@ from plant.rig import Rig
 from plant.simulation import SampledArm
 from workflow.engine import codec
 from workflow.tasks.loop_sensitivity import LEAD_IN, SETTLED, plan_sensitivity, rms_of, settling_samples
+
+if TYPE_CHECKING:
+    import control
 
 Real = npt.NDArray[np.float64]
 
@@ -128,6 +129,8 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
 
 def _plant(name: str, both: control.StateSpace) -> UncertainPlant:
     """The hub channel of a linear machine with both outputs, for the design."""
+    import control  # here, because it brings a plotting library with it
+
     hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
     try:
         return UncertainPlant(name, hub, None, performance=PlantChannel(tip))
@@ -279,10 +282,14 @@ def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> contr
     if past:
         B[n] = 1.0
         A[n + 1 :, n:-1] = np.eye(past - 1)
+    import control  # here, because it brings a plotting library with it
+
     return control.ss(A, B, np.hstack([c, np.zeros((c.shape[0], past))]), np.zeros((c.shape[0], 1)), dt_s)
 
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
     """e^(a t) and the integral of e^(a s) b over (0, t)."""
+    from scipy.signal import cont2discrete  # here: it takes its time to load
+
     step, held, *_ = cont2discrete((a, b, np.zeros((1, len(a))), np.zeros((1, b.shape[1]))), time_s, "zoh")
     return step, held

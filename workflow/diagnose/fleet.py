@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.stats import kendalltau, theilslopes
 
 from plant.effects import in_words
 from workflow.diagnose.words import closure_words, short_answer
@@ -159,6 +158,8 @@ def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
     Kendall's rank test over the machines whose cause is decided; an effect that a machine lacks has the size
     zero there (of a ratio: one). Neglected: that intervals of the sizes differ.
     """
+    from scipy.stats import kendalltau, theilslopes  # here: it takes its time to load
+
     numbers = serial_numbers([one.name for one in machines])
     known = [one for one in machines if one.name in numbers and one.decided]
     series: dict[tuple[str, str], list[tuple[int, float]]] = {}

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-import control
 import numpy as np
 
 from ident.basis.model import GobfModel
@@ -207,6 +206,8 @@ def draw_loop(run: RunView) -> Picture:
 
 def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
     """Crossovers of a nominal loop, with its gain and phase margin as python-control finds them."""
+    import control  # here, because it brings a plotting library with it
+
     margins = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
     factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in margins)
     limits: dict[str, Any] = {"color": style.MEASURED, "lw": 0.8, "ls": ":"}

@@ -7,9 +7,7 @@ meaning has a line style of its own as well, so a grey print still reads.
 from __future__ import annotations
 
 import importlib
-import pkgutil
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,30 +58,66 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
     return f"{output_unit or '?'} / {input_unit or '?'}" if output_unit or input_unit else "as logged"
 
 
-_DRAWINGS: dict[str, Drawing] = {}
+# Drawings by the module that makes them. A page loads those it draws with and no other: the drawings of a run
+# need the whole design, those of one log next to nothing.
+DRAWINGS_OF: dict[str, tuple[str, ...]] = {
+    "bode": ("bode", "response", "bode-loop", "distortion"),
+    "closed_loop": ("closed-loop", "measured-sensitivity", "closed-loop-conditions", "friction-in-the-loop"),
+    "gap_answer": (
+        *("gap_probabilities", "gap_waterfall", "gap_partial"),
+        *("gap_overview", "gap_next", "gap_controller"),
+    ),
+    "gap_records": ("gap_measured", "gap_traces", "gap_spectra"),
+    "gap_where": ("gap_bands", "gap_regimes", "gap_dependences"),
+    "joints": (
+        *("joint-steps", "matrix-response", "singular-values"),
+        *("joint-requirements", "joint-validation", "mode-shapes"),
+    ),
+    "nyquist": ("nyquist",),
+    "overview": ("overview",),
+    "pole_search": ("error-surface", "order"),
+    "poles": ("poles",),
+    "records": ("records", "log", "excitation"),
+    "sensitivity": ("sensitivities",),
+    "validation": ("validation", "residuals", "repeats"),
+}
+_MODULE_OF = {name: module for module, names in DRAWINGS_OF.items() for name in names}
+_LOADED: dict[str, Drawing] = {}
 
 
 def drawing(name: str) -> Callable[[D], D]:
     """Name of a drawing, by which a template asks for it: `figure("nyquist", run)`.
 
-    It takes typed results; None means there is nothing to draw.
+    It takes typed results; None means there is nothing to draw. Raises ValueError for a name that
+    `DRAWINGS_OF` does not have under its module.
     """
 
     def register(draw: D) -> D:
-        if name in _DRAWINGS:
-            raise ValueError(f"two drawings are called {name!r}")
-        _DRAWINGS[name] = draw
+        if draw.__module__ != f"{__package__}.{_MODULE_OF.get(name)}":
+            raise ValueError(f"DRAWINGS_OF lists no drawing {name!r} of {draw.__module__}")
+        _LOADED[name] = draw
         return draw
 
     return register
 
 
-@cache
+class _Drawings(Mapping[str, Drawing]):
+    """Every drawing by its name; its module is loaded when it is asked for."""
+
+    def __getitem__(self, name: str) -> Drawing:
+        importlib.import_module(f"{__package__}.{_MODULE_OF[name]}")
+        return _LOADED[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_MODULE_OF)
+
+    def __len__(self) -> int:
+        return len(_MODULE_OF)
+
+
 def drawings() -> Mapping[str, Drawing]:
-    """Every drawing of every module of this package, so that a new one is named in its own file only."""
-    for module in pkgutil.iter_modules(importlib.import_module("workflow.figures").__path__):
-        importlib.import_module(f"workflow.figures.{module.name}")
-    return _DRAWINGS
+    """Every drawing of this package by its name. KeyError: none is called so."""
+    return _Drawings()
 
 
 def tag_below(panel: Panel, x: float, text: str) -> None:

@@ -12,7 +12,6 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
-from scipy import signal
 
 from control_design.analysis.margins import nominal_margins
 from control_design.analysis.stability import closed_loop_poles, loop_integrators
@@ -349,6 +348,8 @@ class RunView(AnyRunView):
     def forms(law: Law) -> dict[str, Any]:
         """Zeros, poles and gain in z of a law with one input and output, its numerator and denominator with
         the highest power first, and its second-order sections, as lists of scipy.signal."""
+        from scipy import signal  # here: it takes its time to load
+
         system = law.to_control()
         here = np.exp(1j)
 

@@ -10,8 +10,6 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import scipy.signal
-from scipy.stats import binomtest
 
 from control_design.analysis.certificate import certify
 from control_design.analysis.joint_coverage import ResponseDraws, joint_coverage
@@ -281,6 +279,8 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
 
 def joint_numbers(found: SampledResponses) -> dict[str, Any]:
     """Numbers for JSON and tables; shares with Wilson intervals at 95 %."""
+    from scipy.stats import binomtest  # here: it takes its time to load
+
     joint = found.joint
     if joint is None:
         return {"reason": found.reason}
@@ -395,5 +395,7 @@ def model_answer(
     model: RationalWeight, reference: npt.NDArray[np.float64], dt_s: float
 ) -> npt.NDArray[np.float64]:
     """Answer (T,) of the reference model, by Tustin's map as the design sees it, to a reference (T,)."""
+    import scipy.signal  # here: it takes its time to load
+
     discrete = scipy.signal.bilinear(model.numerator, model.denominator, 1.0 / dt_s)
     return np.asarray(scipy.signal.lfilter(*discrete, reference), dtype=np.float64)

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 
 from control_design.analysis.joint_coverage import ResponseDraws, at_level
@@ -38,6 +38,9 @@ from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_documents import DOCUMENTS, read_document
 from workflow.tasks.system_files import read_state_space
 from workflow.text.templates import said, words
+
+if TYPE_CHECKING:
+    import control
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.checks.early_checks import held_readings, refuse_few_lines
@@ -251,6 +250,8 @@ def informed(draft: Draft, channel: IdentifiedChannel, uncertain: UncertainChann
 
 def _moved(records: Sequence[Record], look: FirstLook) -> float:
     """Rms of the output in the band that the logs tell: an integrating machine in open loop walks away."""
+    from scipy.signal import butter, sosfiltfilt  # here: it takes its time to load
+
     signals = [record.output[:, 0] for record in records]
     if look.told_rad_s is None:
         return rms_of(signals)

@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.optimize import minimize_scalar
-from scipy.signal import butter, sosfiltfilt
 
 from ident.basis.model import GobfModel
 from ident.checks.plausible_modes import LIGHT
@@ -202,6 +200,8 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
     With the command clipped there the rigid motion explains most of what it left unexplained before. None
     where no limit does that, or there is no rigid motion.
     """
+    from scipy.optimize import minimize_scalar  # here: it takes its time to load
+
     motion = look.motion
     told_rad_s = look.told_rad_s
     if motion is None or told_rad_s is None:
@@ -339,6 +339,8 @@ def rigid_motion(
     -----
     Neglected: noise in the output's derivatives.
     """
+    from scipy.signal import butter, sosfiltfilt  # here: it takes its time to load
+
     dt_s = records[0].dt_s
     low, high = (
         butter(3, min(omega * dt_s / np.pi, 0.6), output="sos")

@@ -8,10 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-import control
 import numpy as np
-import scipy.signal
-from scipy.stats import t as student
 
 from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory,
@@ -25,6 +22,7 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.specification import GIVES_WAY, Specification
 from ident.data.arrays import RealArray, kernel_array
+from ident.data.distributions import student_quantile
 from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.gauss_newton import lag_steps
@@ -239,6 +237,8 @@ class FrictionLoop:
 
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller
+        import control  # here, because it brings a plotting library with it
+
         answer = control.step_response(law.to_control(), np.arange(samples) * law.dt_s).outputs
         size = self.friction.breakaway / float(np.max(np.abs(answer)))
         low = size / _BISECTION_RANGE
@@ -345,7 +345,8 @@ def interval_of(values: Sequence[float]) -> Interval:
     """95 % interval in which one more of these positive values lies, two or more: Student's law of their
     logarithms."""
     logs = np.log(values)
-    reach = student.ppf(0.5 + LEVEL / 2, logs.size - 1) * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
+    quantile = student_quantile(0.5 + LEVEL / 2, logs.size - 1)
+    reach = quantile * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
     return float(np.exp(logs.mean() - reach)), float(np.exp(logs.mean() + reach))
 
 
@@ -484,6 +485,8 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
     None where the logs do not tell it: a law that does not repeat the recorded command is not the one that
     ran, nor is one that ran at another step than the arm is stepped.
     """
+    import scipy.signal  # here: it takes its time to load
+
     timing = stage.results.records.timing
     law = None if timing is None else timing.law
     if law is None or law.on_error is None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import reduce
 from operator import add
+from typing import TYPE_CHECKING
 
-import control
 import numpy as np
 
 from control_design.analysis.closed_loop import ClosedLoopTrajectory, LinearMachine, simulate
@@ -16,6 +16,9 @@ from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.data.arrays import RealArray
 from ident.uncertainty import ResponsePosterior
+
+if TYPE_CHECKING:
+    import control
 
 # Input at which a machine is clipped only so that a loop that runs away stays made of numbers.
 FINITE = 1e9
@@ -38,6 +41,8 @@ def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.St
     if not posterior.unstable.order:
         return stable
     drawn = inverse_all_pass(posterior.unstable.moved(coefficients[n + direct + taps :]))
+    import control  # here, because it brings a plotting library with it
+
     return control.ss(*drawn, stable.dt, remove_useless_states=False) * stable
 
 
@@ -79,6 +84,8 @@ def simulate_plant(
                 "a plant with a direct term needs at least one sample of computational delay in the loop"
             )
         controller = replace(controller, computational_delay_samples=delay - 1)
+        import control  # here, because it brings a plotting library with it
+
         plant = plant * control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], plant.dt)
         if input_disturbance is not None:
             input_disturbance = np.append(input_disturbance[1:], input_disturbance[-1])
