@@ -31,7 +31,7 @@ from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
 from tests.workflow.test_cli import good_table, write_case as write_own
 from workflow.cli import main
-from workflow.engine.executor import LocalProcesses
+from workflow.engine.executor import LocalProcesses, ThisProcess
 
 TINY_SIMULATION = """
 [run]
@@ -159,7 +159,8 @@ def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
         "simulate",
         lambda rig, voltage, *a, **k: simulate(rig, voltage, *a, **k) if len(voltage) < 2000 else _computes(),
     )
-    monkeypatch.setattr(LocalProcesses, "run", _computes)
+    for executor in (LocalProcesses, ThisProcess):
+        monkeypatch.setattr(executor, "run", _computes)
 
 
 def refusal(arguments: list[str], folder: Path) -> str | None:

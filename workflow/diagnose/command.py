@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, replace as changed
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,7 @@ from workflow.engine.errors import (
     StageError,
     one_line,
 )
-from workflow.engine.executor import Executor, Failure, Report, workers
+from workflow.engine.executor import Executor, Failure, Report, ThisProcess, workers
 from workflow.engine.progress import Progress
 from workflow.report.rendering import render_page
 from workflow.text.templates import RunSummary, rows_of
@@ -117,7 +118,12 @@ def diagnose_cases(
     preload = ["diagnosis.diagnosis", "workflow.diagnose.command"]
     inputs = {one.name: one.input_sha256 for one in work}
     directory = DiagnosisDirectory(out)
-    with workers(width, scheduler, preload) as executor, directory.writing(resume=resume, replace=replace):
+    # A model of a user's may end its process, or wait for ever in code that no interrupt reaches.
+    in_this_process = scheduler is None and len(work) == 1 and not work[0].of_simulator
+    computing: AbstractContextManager[Executor] = (
+        closing(ThisProcess()) if in_this_process else workers(width, scheduler, preload)
+    )
+    with computing as executor, directory.writing(resume=resume, replace=replace):
         begun_with = {"layout": LAYOUT_VERSION, "inputs": inputs, "options": options}
         directory.begin(begun_with, resume=resume, replace=replace)
         machines, failures = _compute(directory, work, executor, progress)
@@ -176,11 +182,17 @@ class PlacedCase:
     out: Path
     name: str = ""
     input_sha256: str = ""
+    of_simulator: bool = False
 
     def read(self) -> PlacedCase:
         """With name and hash of what stands there. Raises InputError."""
         loaded = load_any_case(self.place, self.rig)
-        return changed(self, name=loaded.case.name, input_sha256=loaded.input_sha256)
+        return changed(
+            self,
+            name=loaded.case.name,
+            input_sha256=loaded.input_sha256,
+            of_simulator=isinstance(loaded, SimulatorCase),
+        )
 
     @property
     def made_from(self) -> dict[str, Any]:

@@ -1,8 +1,9 @@
-"""Tasks somewhere else: in processes of this machine, or on the workers of a Dask cluster (extra
-`distributed`), for every command alike.
+"""Tasks of a command: in its own process, in processes of this machine, or on the workers of a Dask cluster
+(extra `distributed`), for every command alike.
 
-Here every task has a fresh process: one that dies takes nothing else with it, and digits do not depend on how
-many there are.
+On this machine every task has a fresh process: one that dies takes nothing else with it, and digits do not
+depend on how many there are. A single task that runs no code of a user's needs none: a process of its own
+would load all that the command has loaded again, which takes longer than some tasks.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from typing import Any, Protocol, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from workflow.engine import interrupts
 from workflow.engine.errors import InputError, StageError, one_line
 from workflow.engine.threads import one_thread_each
 
@@ -170,6 +172,31 @@ class Executor:
 
     def close(self) -> None:
         self.pool.shutdown(cancel_futures=True)
+
+
+class ThisProcess(Executor):
+    """Tasks one after another in the process of the command, one thread each.
+
+    For our own computation only: what a user's simulation does to the process, or to what is printed, it
+    would do to the command. An interrupt ends the task and is raised.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(futures.Executor(), 1)  # a pool that takes nothing
+
+    def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
+        """Position and result of every task, in their order. Raises KeyboardInterrupt."""
+        for index, task in enumerate(tasks):
+
+            def report(share: float, word: str, index: int = index) -> None:
+                if watch is not None:
+                    watch(index, share, word)
+
+            with threadpool_limits(1):
+                found = _done(task, report)
+            # A compiled library may have made a result out of an interrupt.
+            interrupts.check()
+            yield index, found
 
 
 def workers(
