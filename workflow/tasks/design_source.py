@@ -80,7 +80,7 @@ class DesignSource:
 
 
 def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource]:
-    """All plants of a design, by different names and with one sampling time.
+    """Plants of a design, by different names and with one sampling time.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def load_sources(paths: Sequence[Path], design: DesignFile) -> list[DesignSource
 
 
 def _sources_of_run(path: Path) -> list[DesignSource]:
-    """All plants of a run directory: several where its set has several parts. Raises InputError."""
+    """Plants of a run directory: several where its set has several parts. Raises InputError."""
     run = RunDirectory.open(path)
     config = config_of(run)
     results = RunResults(run)

@@ -135,7 +135,7 @@ class PlannedExperiment:
 
     @property
     def duration_s(self) -> float:
-        """Of all records together, lead-in included [s]."""
+        """Time of all records together, lead-in included [s]."""
         return self.plan.duration_s(self.limits.dt_s)
 
     @cached_property

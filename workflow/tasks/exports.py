@@ -21,6 +21,7 @@ from workflow.engine.run_directory import CONTROLLER_SUFFIXES
 from workflow.tasks.results import RecordsResult
 from workflow.text.templates import render_text, said
 
+# Formats of a controller file, by its ending.
 SUFFIXES = (".json", ".mat", ".c")
 
 

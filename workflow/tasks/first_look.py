@@ -99,7 +99,8 @@ class RigidMotion:
     def agrees(self, response: FrequencyUncertainty) -> bool:
         """Whether the response says the same, as far as friction lets it: a direct fit of records that the
         feedback made may show the controller instead."""
-        s = 1j * response.omega_rad_s[response.omega_rad_s <= self.below_rad_s]
+        is_below = response.omega_rad_s <= self.below_rad_s
+        s = 1j * response.omega_rad_s[is_below]
         if s.size == 0:
             return True
         stiffness = 0.0 if self.stiffness is None else self.stiffness.value

@@ -240,6 +240,7 @@ def identify_channel(
     options = _searched_around(channel, measured[0].dt_s)
     # The arm with friction was fitted without delay, and a closed loop looks like one.
     as_logged = options if friction is None and loop is None else options.with_delay_stated()
+
     # A free run of an integrating plant drifts away with friction; it is judged as it was fitted.
     fresh = [(as_fitted(record, channel, friction), role) for record, role in unseen]
     doubted = (*measured, *(record for record, _ in unseen))

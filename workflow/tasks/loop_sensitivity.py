@@ -113,6 +113,8 @@ def plan_sensitivity(
     at = int(np.argmax(size))
     centre = min(float(omega[at]), plant.nyquist_rad_s / 4)
     period = int(np.clip(round(2 * np.pi * _LINES_BELOW_PEAK / (centre * dt)), _SHORTEST, _LONGEST))
+
+    # A flat reference over the band; its size follows from the gain to the command.
     line = 2 * np.pi / (period * dt)
     band = (max(centre / _LINES_BELOW_PEAK, line), min(10 * centre, 0.8 * plant.nyquist_rad_s))
     inside = np.arange(band[0], band[1], line)

@@ -104,7 +104,7 @@ def run_pipeline(
         started = time.monotonic()
         with threadpool_limits(1):
             ready = stages[0].run(changed(stage_input, read=read)), time.monotonic() - started
-    # More threads round otherwise.
+    # With more threads sums round otherwise: a resumed run would have other digits.
     with run.writing(resume=resume, replace=replace), threadpool_limits(1):
         run.begin_run(
             config_text=config_text,
@@ -114,14 +114,17 @@ def run_pipeline(
             resume=resume,
             replace=replace,
         )
+
+        # Names and number type of the C code: as stated now, or when the run began.
         kept_dialect = run.manifest().get("c_code", {})
         with naming(str(run.manifest_path)):
             dialect_before = changed(
                 Dialect(), **{key: kept_dialect[key] for key in ("prefix", "number") if key in kept_dialect}
             )
-        # A key that is not stated now is as it was stated when the run began.
         dialect = changed(dialect_before, **(c_code or {}))
         run.record_status("running", c_code=asdict(dialect))
+
+        # The stages in order; each is taken over where a run has it already.
         stages = stages if page is None else (*stages, page)
         progress.plan([(stage.name, stage.expected_s) for stage in stages])
         if note:

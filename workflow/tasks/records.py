@@ -32,7 +32,7 @@ MOST_SAMPLES = 20_000_000
 
 
 def make_records(stage: StageInput) -> RecordsResult:
-    """All records of the configuration in its order, simulated or read.
+    """Records of a run in the order of its configuration, simulated or read.
 
     For several joints the `condition` of a record names the operating point.
 
@@ -55,6 +55,8 @@ def make_records(stage: StageInput) -> RecordsResult:
         made = simulated_records(stage.config, stage.called, partial(stage.progress.update, "records"))
     elif not made:
         made = read_records(source, stage.config.columns)
+
+    # One clock, commands as the amplifier gave them, and as they acted between two rows.
     limit = source.input_limit or np.inf
     timed = [record.limited(limit) for record in with_common_sampling_time(made)]
     timing = command_timing(stage.config, timed)
@@ -66,6 +68,8 @@ def make_records(stage: StageInput) -> RecordsResult:
     if isinstance(stage.config, RunConfig):
         with naming(f"{stage.called}: specification"):
             stage.config.specification.refuse_sampling(timed[0].dt_s)
+
+    # With what the configuration says of each; its excitation names its kind where it was simulated.
     records = list[RunRecord]()
     for about, record in zip(entries, timed, strict=True):
         of: Any = getattr(about, "excitation", about)

@@ -52,7 +52,19 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class RunRecord:
-    """A record of the run and what the configuration says about it; kind: of the excitation, or "file"."""
+    """A record of the run and what the configuration says about it.
+
+    Attributes
+    ----------
+    record : Record
+    role : Role
+        Fitted, kept for validation, or a repeat.
+    condition : str or None
+        Records of one condition are repeats; for several joints the operating point.
+    remark : str
+    kind : str
+        Of the excitation, or "file".
+    """
 
     record: Record
     role: Role
@@ -77,8 +89,11 @@ class RunRecord:
 
 @dataclass(frozen=True, eq=False)
 class RecordsResult:
-    """All records. timing: what their command did between two rows, for which they are corrected; None of
-    simulated ones, whose command is held from row to row."""
+    """Records of a run, in the order of the configuration.
+
+    timing: what their command did between two rows, for which they are corrected; None for simulated ones,
+    whose command is held from row to row.
+    """
 
     records: tuple[RunRecord, ...]
     timing: CommandTiming | None = field(default=None, metadata={"since": 2})
@@ -92,7 +107,11 @@ class RecordsResult:
 
     def unit(self, signal: str) -> str:
         """Unit of a signal, empty where nobody stated it."""
-        return next((units[signal] for item in self.records if (units := item.units).get(signal)), "")
+        for item in self.records:
+            unit = item.units.get(signal)
+            if unit:
+                return unit
+        return ""
 
 
 # Model
@@ -114,9 +133,29 @@ class ModelMode:
 class IdentifiedChannel:
     """One channel: what was fitted to what, and free runs on the records that were not fitted.
 
-    used: SISO estimation records as the fit saw them; bounded: the same as the ellipses see them; fresh: free
-    runs, fresh_roles the role of each; closed_loop: how logs made in a loop were used and why, None for
-    others; remote: friction of a shaft that the sensor does not see, which was taken off the records.
+    Attributes
+    ----------
+    name : str
+    identification : Identification
+        Model, fits and residuals.
+    used : tuple of Record
+        Of the fit, one input and one output, as the fit saw them.
+    bounded : tuple of Record
+        These records as the ellipses see them.
+    fresh : tuple of FreshFit
+        Free runs on the other records.
+    fresh_roles : tuple of Role
+        Role of each of these records.
+    stabilisation : Stabilisation or None
+        None where nobody asked for the plot.
+    increments : bool
+        The fit saw differences from sample to sample.
+    band_rad_s, bounds_band_rad_s : tuple of two float, or None
+        Bands to which the data of fit and ellipses were confined [rad/s].
+    closed_loop : Finding or None
+        How logs made in a loop were used and why; None for others.
+    remote : RemoteFriction or None
+        Friction of a shaft that the sensor does not see, which was taken off the records.
     """
 
     name: str
@@ -148,11 +187,11 @@ class IdentifiedChannel:
     def best_fit_percent(self) -> float:
         """Best fit of a free run of the model to a log, or to one in its loop where such runs were made; not
         below zero."""
-        in_loop = (
-            0.0 if self.closed_loop is None else self.closed_loop.values.get("most_in_loop_percent", 0.0)
-        )
-        fresh = (fit.fit_percent for fit in self.fresh)
-        return float(max(*self.identification.fit_percent.tolist(), *fresh, in_loop, 0.0))
+        percents = self.identification.fit_percent.tolist()
+        percents += [fit.fit_percent for fit in self.fresh]
+        if self.closed_loop is not None:
+            percents.append(self.closed_loop.values.get("most_in_loop_percent", 0.0))
+        return float(max(*percents, 0.0))
 
     @property
     def data_band_rad_s(self) -> Interval | None:
@@ -179,10 +218,12 @@ class IdentifiedChannel:
     def real_poles_per_s(self) -> tuple[float, ...]:
         """Decay rates, slowest first; a pole at or left of z = 0 has none."""
         real = self.model.stable_poles.real
-        return tuple(sorted((-np.log(real[real > 0]) / self.model.dt_s).tolist()))
+        decays = real > 0
+        return tuple(sorted((-np.log(real[decays]) / self.model.dt_s).tolist()))
 
     @property
     def real_poles_z(self) -> tuple[float, ...]:
+        """Real poles in z, largest first."""
         return tuple(sorted(self.model.stable_poles.real.tolist(), reverse=True))
 
     @property
@@ -194,9 +235,10 @@ class IdentifiedChannel:
     @property
     def fit_percent(self) -> dict[Role, dict[str, float]]:
         """By role and record: of the fit itself on the estimation records, of free runs on the others."""
-        found = self.identification
+        names = self.identification.record_names
+        percents = self.identification.fit_percent.tolist()
         fits: dict[Role, dict[str, float]] = {"estimation": {}, "validation": {}, "repeat": {}}
-        fits["estimation"] = dict(zip(found.record_names, found.fit_percent.tolist(), strict=True))
+        fits["estimation"] = dict(zip(names, percents, strict=True))
         for fit, role in zip(self.fresh, self.fresh_roles, strict=True):
             fits[role][fit.name] = fit.fit_percent
         return fits
@@ -204,7 +246,7 @@ class IdentifiedChannel:
 
 @dataclass(frozen=True, eq=False)
 class IdentifyResult:
-    """friction: of the shaft, where a channel's response is wanted without it."""
+    """Models of all channels; friction: of the shaft, where a channel's response is wanted without it."""
 
     channels: tuple[IdentifiedChannel, ...]
     friction: FrictionFit | None = None
@@ -230,7 +272,8 @@ class Band:
     largest_radius_percent: float
 
 
-STALLS = 5.0  # a step stalls that takes so many times as long with friction as without
+# A step stalls that takes so many times as long with friction as without. Chosen.
+STALLS = 5.0
 # A damping that may be anything is that of no mode: width of its interval.
 _ANYTHING = 0.5
 
@@ -254,7 +297,19 @@ class ModeInterval:
 
 @dataclass(frozen=True)
 class Intervals:
-    """Of the modes by frequency, of the decay rates slowest first, of the growth rates of unstable poles."""
+    """Confidence intervals of the poles of a model.
+
+    Attributes
+    ----------
+    level : float
+        Probability of each.
+    modes : tuple of ModeInterval
+        By frequency.
+    real_poles_per_s : tuple of (low, high)
+        Decay rates, slowest first [1/s].
+    growth_per_s : tuple of (low, high)
+        Growth rates of unstable poles [1/s].
+    """
 
     level: float
     modes: tuple[ModeInterval, ...]
@@ -264,8 +319,18 @@ class Intervals:
 
 @dataclass(frozen=True, eq=False)
 class UncertainMember:
-    """A part of the set that a channel may be in. about: which part; nominal: a member of it; bands: size of
-    its ellipses."""
+    """A part of the set that a channel may be in.
+
+    Attributes
+    ----------
+    about : str
+        Which part, in words.
+    posterior : ResponsePosterior
+    nominal : GobfModel
+        A model of it.
+    bands : tuple of Band
+        Size of its ellipses.
+    """
 
     about: str
     posterior: ResponsePosterior
@@ -284,11 +349,36 @@ class UncertainMember:
 class UncertainChannel:
     """Ellipses of one channel and what the residuals say about them.
 
-    nominal: model on the identified poles that is nearest to the posterior; frequency: ellipses on the
-    display grid; empirical: response without a model, where the records allow one; tests: whiteness and
-    independence of the residuals on the estimation records; advice: where they fail; repeat_scatter: None
-    without repeats; intervals: None where the method has none. about: which part of the set posterior and
-    nominal are of, "" where it has one part; others: the further parts. The channel is in one of them.
+    Attributes
+    ----------
+    name, method : str
+        Of the channel, and of the posterior.
+    level : float
+        Probability of each ellipse.
+    posterior : ResponsePosterior
+        Of the first part of the set.
+    nominal : GobfModel
+        Model on the identified poles that is nearest to that posterior.
+    frequency : FrequencyUncertainty
+        Its ellipses on the grid of the pictures.
+    empirical : FrequencyUncertainty or None
+        Response without a model, where the records allow one.
+    bands : tuple of Band
+        Size of the ellipses.
+    tests : Tests
+        Whiteness and independence of the residuals on the estimation records.
+    agreement : NominalAgreement
+        Of the nominal model with the ellipses.
+    intervals : Intervals or None
+        None where the method has none.
+    repeat_scatter : tuple of ScatterRow or None
+        None without repeats.
+    advice : tuple of Finding
+        What to do where a test fails.
+    about : str
+        Which part of the set posterior and nominal are of, "" where it has one part.
+    others : tuple of UncertainMember
+        Further parts. The channel is in one of all parts.
     """
 
     name: str
@@ -309,7 +399,7 @@ class UncertainChannel:
 
     @property
     def members(self) -> tuple[UncertainMember, ...]:
-        """All parts of the set, that of the identified model first."""
+        """Parts of the set, that of the identified model first."""
         return (UncertainMember(self.about, self.posterior, self.nominal, self.bands), *self.others)
 
     @property
@@ -361,7 +451,10 @@ class UncertainChannel:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyResult:
-    """equivalent: viscous friction that acts like the dry one, where ellipses are about an amplitude."""
+    """Ellipses of all channels.
+
+    equivalent: viscous friction that acts like the dry one, where ellipses are about an amplitude.
+    """
 
     channels: tuple[UncertainChannel, ...]
     equivalent: EquivalentFriction | None = None
@@ -443,9 +536,20 @@ class IdentifiedPlant:
 
 @dataclass(frozen=True, eq=False)
 class DesignResult:
-    """synthesis: None where the specification is impossible from the start; reason: met, or how far and which
-    frequency and requirement block it; jointly: what became of designing for sampled responses.
-    specification: what was designed for, where the one asked for gives way."""
+    """The controller that a search found, and how it stands against the specification.
+
+    Attributes
+    ----------
+    synthesis : SynthesisResult, MultivariableResult or None
+        None where the specification is impossible from the start.
+    met : bool
+    reason : str
+        One line: met, or how far it is missed, and which frequency and requirement block it.
+    jointly : str or None
+        What became of designing for sampled responses.
+    specification : Specification or None
+        What was designed for, where the one asked for gives way.
+    """
 
     synthesis: SynthesisResult | MultivariableResult | None
     met: bool
@@ -460,9 +564,10 @@ class DesignResult:
 
     @property
     def controller(self) -> Controller | None:
-        """Where there is one that means something."""
-        found = self.synthesis
-        return None if found is None or found.outcome is Outcome.NOT_CONVERGED else found.controller
+        """The controller, None where the search led to none that means something."""
+        if self.synthesis is None or self.synthesis.outcome is Outcome.NOT_CONVERGED:
+            return None
+        return self.synthesis.controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -484,7 +589,18 @@ class SampledResponses:
 
 @dataclass(frozen=True, eq=False)
 class CertifyResult:
-    """certificate: None with nothing to certify; reason: one line, in any case."""
+    """The certificate of a controller.
+
+    Attributes
+    ----------
+    certificate : Certificate or None
+        None with nothing to certify.
+    certified : bool
+    reason : str
+        One line, in any case.
+    sampled : SampledResponses
+        For how many sampled responses the worst case holds.
+    """
 
     certificate: Certificate | None
     certified: bool
@@ -494,7 +610,10 @@ class CertifyResult:
 
 @dataclass(frozen=True, eq=False)
 class ReferenceFilterResult:
-    """filter: None where none was asked for or is possible (reason); feedforward: of the friction."""
+    """Reference filter and friction feed-forward of a controller.
+
+    filter: None where none was asked for, or where `reason` says why none is possible.
+    """
 
     filter: ReferenceFilter | None = None
     reason: str | None = None
@@ -510,7 +629,17 @@ class ReferenceFilterResult:
 
 @dataclass(frozen=True, eq=False)
 class LoopRuns:
-    """Closed-loop runs (R, T); limited: where a limit was active; performance: None without a channel."""
+    """Closed-loop runs.
+
+    Attributes
+    ----------
+    output, command : (R, T) arrays
+        Of R runs with T samples.
+    performance : (R, T) array or None
+        None without a performance channel.
+    limited : (R, T) bool array
+        Where a limit of the command was active.
+    """
 
     output: RealArray
     command: RealArray
@@ -520,18 +649,28 @@ class LoopRuns:
     @classmethod
     def together(cls, several: Sequence[LoopRuns]) -> LoopRuns:
         """The runs of several, one after the other; all with a performance channel, or none."""
-        shown = [runs.performance for runs in several if runs.performance is not None]
+        performances = [runs.performance for runs in several if runs.performance is not None]
         return cls(
-            np.concatenate([runs.output for runs in several]),
-            np.concatenate([runs.command for runs in several]),
-            np.concatenate(shown) if shown else None,
-            np.concatenate([runs.limited for runs in several]),
+            output=np.concatenate([runs.output for runs in several]),
+            command=np.concatenate([runs.command for runs in several]),
+            performance=np.concatenate(performances) if performances else None,
+            limited=np.concatenate([runs.limited for runs in several]),
         )
 
 
 @dataclass(frozen=True)
 class LoopMetrics(StepMetrics):
-    """Step and disturbance of one run; settled: its motion dies out."""
+    """Metrics of the step and the disturbance of one run.
+
+    Attributes
+    ----------
+    disturbance_peak : float
+        Largest error in the half of the disturbance, in units of the output.
+    disturbance_left : float
+        Error that stays at its end.
+    settled : bool
+        The motion dies out.
+    """
 
     disturbance_peak: float
     disturbance_left: float
@@ -559,18 +698,22 @@ class MeasuredPeak:
     std: RealArray
 
     def beyond(self, limit: RealArray) -> int | None:
-        """The line at which |S| exceeds a limit (F,) by the largest factor, by more than `SIGNIFICANT`
-        standard deviations; None where it does nowhere."""
-        factor = np.where(self.magnitude - SIGNIFICANT * self.std > limit, self.magnitude / limit, 0.0)
+        """The line at which |S| exceeds a limit (F,) by the largest factor; None where it does nowhere.
+
+        Only where it does so by more than `SIGNIFICANT` standard deviations.
+        """
+        is_significant = self.magnitude - SIGNIFICANT * self.std > limit
+        factor = np.where(is_significant, self.magnitude / limit, 0.0)
         line = int(np.argmax(factor))
         return line if factor[line] > 0 else None
 
     def beyond_bandwidth(self, bandwidth_rad_s: float) -> int | None:
-        """The line up to a bandwidth at which |S| exceeds -3 dB by the largest factor, as `beyond`."""
+        """The line up to a bandwidth at which |S| exceeds -3 dB by the largest factor, see `beyond`."""
         return self.beyond(np.where(self.omega_rad_s <= bandwidth_rad_s, np.sqrt(0.5), np.inf))
 
 
-# Standard deviations: of some hundred lines the largest lies two of them too high by chance.
+# Standard deviations by which a measured |S| is beyond a limit: of some hundred lines the largest lies two of
+# them too high by chance.
 SIGNIFICANT = 3.0
 
 
@@ -587,11 +730,22 @@ class SensitivityCheck:
 
 @dataclass(frozen=True, eq=False)
 class SlowSine:
-    """Errors (T,) of the loop on a slow sine, without and with friction feed-forward.
+    """Errors of the loop on a slow sine, without and with friction feed-forward.
 
-    linear_rms: of the loop on the arm without friction. The errors are those measured on the machine, or
-    those of the identified arm with its friction where there is no machine. moves_from: amplitude from which
-    on a sine of this frequency moves the arm against its friction.
+    They are those measured on the machine, or those of the identified arm with its friction where there is no
+    machine.
+
+    Attributes
+    ----------
+    amplitude : float
+        Of the sine, in units of the output.
+    omega_rad_s : float
+    linear_rms : float
+        Of the error on the arm without friction.
+    without, given : (T,) arrays
+        Errors without feed-forward and with it.
+    moves_from : float
+        Amplitude from which on a sine of this frequency moves the arm against its friction.
     """
 
     amplitude: float
@@ -608,7 +762,7 @@ class SlowSine:
 
     @property
     def rms(self) -> tuple[float, float]:
-        """Of the error, without and with feed-forward."""
+        """Root mean square of the error, without and with feed-forward."""
         return float(np.sqrt(np.mean(self.without**2))), float(np.sqrt(np.mean(self.given**2)))
 
 
@@ -647,6 +801,7 @@ class SettlingRange:
     def median_s(self) -> float:
         """The time within which half of the steps settle, even over the logarithm of the size; infinite where
         fewer do. Choices are made by it, as the ends of the range are chance themselves."""
+        # Each size stands for the sizes up to half-way to its neighbours.
         places = np.log(np.abs(self.sizes))
         edges = np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
         shares = np.diff(edges) / (places[-1] - places[0])
@@ -660,19 +815,46 @@ class SettlingRange:
 class FrictionCheck:
     """The loop on the identified arm with its dry friction.
 
-    level: at standstill, in units of the command, with its interval; presliding: the deflection before
-    slipping, as identified. sizes (N,): rms of the reference, falling; low, high (N,): 95 % interval of the
-    peak of |S| as it would be measured, measured (N,): the peak on the machine, None without one.
-    certified_from: size from which on, up to the largest, `high` exceeds the certified peak by at most
-    tolerance_percent; linear_from: from which on the middle of the interval is that near to the peak of the
-    linear prediction; None where not even at the largest. sticking_step: largest step after which the arm
-    does not leave its pre-sliding; error_at_rest: largest error with which it may rest, 0 with integral
-    action. step: of the reference step on the arm as it was fitted, without noise, watched for `watched_s`
-    after the step (its settling time is chance: `settling` holds those of half to twice its size); left: the
-    largest error in the last half of that time; output (N,): as long as the trial's step, or until this step
-    has settled. recorded,
-    recorded_settling, recorded_output: the same of the loop that made the logs, None where they do not tell
-    it.
+    Attributes
+    ----------
+    level, level_interval : float, (low, high)
+        Friction at standstill, in units of the command, with its 95 % interval.
+    presliding : float
+        Deflection before slipping, as identified.
+    sizes : (N,) array
+        Rms of the reference, falling.
+    low, high : (N,) arrays
+        95 % interval of the peak of |S| as it would be measured at each size.
+    measured : (N,) array or None
+        The peak on the machine, None without one.
+    nominal_peak, certified_peak : float
+        Of |S|, linear.
+    tolerance_percent : float
+        By which a peak may exceed those.
+    certified_from : float or None
+        Size from which on, up to the largest, `high` exceeds the certified peak by no more than the
+        tolerance; None: not even at the largest.
+    linear_from : float or None
+        Size from which on the middle of the interval is as near to the nominal peak.
+    sticking_step, sticking_interval : float, (low, high)
+        Largest step after which the arm does not leave its pre-sliding.
+    error_at_rest, error_interval : float, (low, high)
+        Largest error with which it may rest, 0 with integral action.
+    step : StepMetrics
+        Of the reference step on the arm as it was fitted, without noise. Its settling time is chance.
+    settling : SettlingRange
+        Settling times of steps of half to twice its size.
+    watched_s : float
+        For which the step was watched.
+    left : float
+        Largest error in the last half of that time.
+    output : (T,) array
+        As long as the trial's step, or until this step has settled.
+    tracking : SlowSine
+    recorded, recorded_settling, recorded_output
+        Step, settling range and output of the loop that made the logs; None where they do not tell it.
+    errors : tuple of three float
+        See `workflow.tasks.friction_loop.beside_recorded`; empty where the logs do not tell that loop.
     """
 
     level: float
@@ -704,8 +886,10 @@ class FrictionCheck:
 
     @property
     def times_slower(self) -> float:
-        """Median settling time over the sizes beside the recorded loop's, infinite where only that one
-        settles."""
+        """Median settling time over the sizes, over that of the recorded loop.
+
+        Infinite where only that one settles, 0 where it is not known or does not settle.
+        """
         if self.recorded_settling is None or self.recorded_settling.median_s == np.inf:
             return 0.0
         # A step within its band from the start has settled in no time: one sample would do, too.
@@ -720,8 +904,10 @@ class FrictionCheck:
 
 @dataclass(frozen=True, eq=False)
 class ConditionRun:
-    """The loop under one other condition beside its prediction, (T,) each; percentages are of `size`, the
-    move or the predicted swing."""
+    """The loop under one other condition beside its prediction.
+
+    Percentages are of `size`, the move or the predicted swing; signals are (T,).
+    """
 
     name: str
     words: str
@@ -744,8 +930,31 @@ class ConditionRun:
 class LoopCheck:
     """The loop on the identified model (predicted, on the posterior mean) and on the machine (achieved).
 
-    reference and disturbance (T,): the latter adds to the plant's input from T // 2 on; model_answer (T,): of
-    the model that the reference filter follows; tracking: whether the reference is to be followed.
+    Attributes
+    ----------
+    machine : {"simulated", "identified"}
+        What ran as the machine.
+    tracking : bool
+        Whether the reference is to be followed.
+    reference_step, disturbance_step : float
+        Sizes, in units of output and input.
+    quantisation, measurement_step : float
+        Steps of the converters of command and measurement, 0 for none.
+    input_limit : float or None
+        Of the command.
+    filtered : bool
+        The loop has a reference filter.
+    predicted : LoopMetrics
+    achieved : tuple of LoopMetrics
+        One for each run.
+    time_s, reference, disturbance : (T,) arrays
+        The disturbance adds to the plant's input from T // 2 on.
+    model_answer : (T,) array or None
+        Of the model that the reference filter follows.
+    predicted_runs, achieved_runs : LoopRuns
+    sensitivity : SensitivityCheck or None
+    conditions : tuple of ConditionRun
+    friction : FrictionCheck or None
     """
 
     machine: Literal["simulated", "identified"]
@@ -770,15 +979,22 @@ class LoopCheck:
 
     @property
     def with_friction(self) -> tuple[RealArray, ...]:
-        """Outputs of the reference step with the identified friction, where the runs are of linear plants: of
-        the loop, and of the recorded one where the logs tell it."""
-        known = () if self.machine == "simulated" or self.friction is None else (self.friction,)
-        return tuple(y for each in known for y in (each.output, each.recorded_output) if y is not None)
+        """Outputs of the reference step with the identified friction, where the runs are of linear plants.
+
+        That of the loop, and that of the recorded one where the logs tell it.
+        """
+        if self.machine == "simulated" or self.friction is None:
+            return ()
+        if self.friction.recorded_output is None:
+            return (self.friction.output,)
+        return self.friction.output, self.friction.recorded_output
 
     @property
     def longest_settling_s(self) -> float:
-        """The longest stated settling time of a drawn reference step: predicted, in the runs, and with
-        friction where that is drawn (`with_friction`); 0 where none settles."""
+        """The longest settling time of the reference steps that a picture draws; 0 where none settles.
+
+        Those that are predicted, of the runs, and with friction where that is drawn (`with_friction`).
+        """
         rows: list[StepMetrics | None] = [self.predicted, *self.achieved]
         if self.with_friction and self.friction is not None:
             rows += [self.friction.step, self.friction.recorded]
@@ -815,15 +1031,17 @@ class LoopCheck:
 
 @dataclass(frozen=True, eq=False)
 class ClosedLoopResult:
-    """check: None where there was nothing to run, and `skipped` says why."""
+    """The closed-loop check; None where there was nothing to run, and `skipped` says why."""
 
     skipped: str | None = None
     check: LoopCheck | None = None
 
 
 class StageResult(Generic[T]):
-    """The result of the stage that the attribute is named after, read when it is first asked for. several:
-    its type in a run for several joints, where that is another one."""
+    """The result of the stage that the attribute is named after, read when it is first asked for.
+
+    several: its type in a run for several joints, where that is another one.
+    """
 
     def __init__(self, kind: type[T], several: type | None = None) -> None:
         self._kind: Any = kind if several is None else kind | several
@@ -834,8 +1052,8 @@ class StageResult(Generic[T]):
     def __get__(self, results: RunResults, owner: type) -> T:
         if self._name not in results.read:
             results.read[self._name] = results.run.load_stage(self._name, self._kind)
-        found: T = results.read[self._name]
-        return found
+        result: T = results.read[self._name]
+        return result
 
 
 class RunResults:

@@ -89,14 +89,19 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
     return result
 
 
+# Stages of the uncertain plant behind its records.
 _PLANT = ("identify", "uncertainty")
 # Stages up to the uncertain plant, which several designs may share.
 PLANT = ("records", *_PLANT)
+# Which channel is fed back and which one must not swing.
 _PURPOSES = {"channels": {"__all__": {"purpose"}}}
+# Columns that records are read for.
 _COLUMNS = {"__all__": {"input", "output"}}
 # Of several joints the uncertainty of gains is part of the identification's settings.
 _JOINTS = {"joints": True, "design": True, "identification": True}
 
+# Stages in order. What a stage does not use it does not depend on: another value of it leaves its result as
+# it is.
 STAGES: tuple[Stage, ...] = (
     Stage(
         "records",

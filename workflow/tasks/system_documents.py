@@ -21,9 +21,13 @@ from workflow.engine import codec, documents, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 
+# Endings of files with named values.
 DOCUMENTS = (".json", ".mat", ".npz")
+# Names of the sampling time, the first one ours.
 _SAMPLING_TIME = ("dt_s", "dt", "Ts")
+# Names of both polynomials in z, ours and those of python-control and MATLAB.
 _POLYNOMIALS = (("numerator", "denominator"), ("num", "den"))
+# Names of zeros, poles and gain.
 _ROOTS = ("zeros", "poles", "gain")
 # Of an entry of a state space in any units: products of some of them are still numbers.
 _LARGEST = 1e50
