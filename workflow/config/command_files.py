@@ -9,6 +9,7 @@ from pydantic import Field
 from workflow.config.settings import Section
 from workflow.engine.errors import InputError
 
+# Formats of a model file, by its ending.
 MODEL_SUFFIXES = (".json", ".mat")
 
 

@@ -12,8 +12,10 @@ from control_design.convex.convex_options import ReferenceFilterOptions, YoulaOp
 from control_design.specification import RationalWeight
 from workflow.config.settings import Section
 
-FEWEST_DRAWS = 100  # a share of 0.95 is then known to 0.02, sqrt(0.95 * 0.05 / 100)
-_LASTING = 100.0  # how much more than a passing error one weighs that lasts
+# Draws at least: a share of 0.95 is then known to 0.02, sqrt(0.95 * 0.05 / 100).
+FEWEST_DRAWS = 100
+# Weight of an error that lasts over that of a passing one.
+_LASTING = 100.0
 
 
 class CertificateOptions(Section):

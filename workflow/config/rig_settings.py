@@ -20,6 +20,7 @@ from workflow.config.settings import Section, resolve
 from workflow.engine import documents
 from workflow.engine.errors import naming, shortened
 
+# Rigs by the names that a configuration may use in place of a file.
 PRESETS: dict[str, Callable[[], Rig]] = {"paper_link": paper_link}
 
 

@@ -83,6 +83,7 @@ class SimulatedSource(Section):
     @model_validator(mode="after")
     def _with_planned_records(self) -> Self:
         if self.plan is not None:
+            # One record for each amplitude and realisation, in front of those that are listed.
             shared = self.plan.model_dump(exclude={"rms_V", "realisations"})
             planned = (
                 SimulatedRecord(

@@ -17,6 +17,7 @@ from workflow.engine.errors import InputError
 ModelT = TypeVar("ModelT", bound=BaseModel)
 T = TypeVar("T")
 
+# A variable of the environment in a path: ${NAME}.
 _VARIABLE = re.compile(r"\$\{([A-Za-z_][A-Za-z0-9_]*)\}")
 
 

@@ -6,6 +6,7 @@ import hashlib
 from functools import cache
 from pathlib import Path
 
+# Packages that the numbers of a run come from.
 _ROOMS = ("plant", "ident", "control_design", "workflow")
 # They draw what is stored; numbers do not pass through them.
 _ONLY_DRAWING = ("workflow/figures", "workflow/report", "workflow/text")

@@ -12,9 +12,12 @@ from typing import Any
 from ident.data.json_text import MOST_LEVELS, json_value
 from workflow.engine.errors import InputError, cannot, shortened
 
-MOST_BYTES = 32 * 2**20  # far above any document that flexlink writes
-MOST_TOML_BYTES = 2**20  # far above what a person writes
-LARGEST_INTEGER = 2**63 - 1  # what numpy holds
+# Largest document that is read: far above any that flexlink writes.
+MOST_BYTES = 32 * 2**20
+# Largest TOML file that is read: far above what a person writes.
+MOST_TOML_BYTES = 2**20
+# Largest integer that is read: what numpy holds.
+LARGEST_INTEGER = 2**63 - 1
 # The parser's time grows with the square of a dotted key's length.
 _LONGEST_TOML_LINE = 20_000
 # Endings of logs that a configuration or a document may have as well.

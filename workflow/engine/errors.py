@@ -7,16 +7,25 @@ from contextlib import contextmanager
 from errno import ENXIO
 from pathlib import Path
 
-EXIT_OK = 0  # all done
-EXIT_INTERNAL = 1  # as Python leaves after an exception
-EXIT_CHECK_FAILED = EXIT_INTERNAL  # as pytest, diff and grep leave where a check fails
-EXIT_BAD_INPUT = 2  # as shells and click leave for wrong usage
-EXIT_NOT_CERTIFIED = 3  # the first that means nothing elsewhere
-EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
+# Exit code: all done.
+EXIT_OK = 0
+# Exit code of an error of our own, as Python leaves after an exception.
+EXIT_INTERNAL = 1
+# Exit code of a check that fails, as pytest, diff and grep leave.
+EXIT_CHECK_FAILED = EXIT_INTERNAL
+# Exit code for wrong usage, as of shells and click.
+EXIT_BAD_INPUT = 2
+# Exit code of a result that is not certified: the first that means nothing elsewhere.
+EXIT_NOT_CERTIFIED = 3
+# Exit code after an interrupt: 128 + SIGINT, as shells expect.
+EXIT_INTERRUPTED = 130
 
-LONGEST_LINE = 300  # two to four lines of a terminal
-_LEAST_BEFORE_COMMAND = 120  # characters of a complaint that say what is wrong and where
-_WORDS_BEFORE_COMMAND = 30  # characters between a comma and the command, as in '; type: flexlink ...'
+# Characters of a complaint: two to four lines of a terminal.
+LONGEST_LINE = 300
+# Characters of a complaint, at least, that say what is wrong and where.
+_LEAST_BEFORE_COMMAND = 120
+# Characters between a comma and the command, as in '; type: flexlink ...'.
+_WORDS_BEFORE_COMMAND = 30
 
 
 def one_line(text: object) -> str:

@@ -7,6 +7,7 @@ import signal
 import sys
 from types import FrameType
 
+# What ends a command from outside.
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _came: int | None = None

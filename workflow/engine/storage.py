@@ -23,6 +23,7 @@ from ident.data.foreign_files import Unread, content_of, npz_arrays, shown
 from workflow.engine import codec, documents
 from workflow.engine.errors import InputError, cannot, naming
 
+# Ending of a file that is not whole yet.
 TEMPORARY_SUFFIX = ".part"
 # Earliest date a zip entry can carry; a constant makes the bytes reproducible.
 _EPOCH = (1980, 1, 1, 0, 0, 0)

@@ -10,6 +10,7 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Variables by which numerical libraries read their number of threads.
 _VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 # A process of ours takes no random.py in the current folder for Python's own; any value does, this is ours.
 SAFE_PATH = {"PYTHONSAFEPATH": "flexlink"}

@@ -66,6 +66,7 @@ _ALL = (
     StudyColumn("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
     StudyColumn("nominal_delay_margin_ms", "delay margin, nominal", "ms", "larger"),
 )
+# Columns by name, in the order of the table.
 COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in _ALL}
 
 

@@ -194,6 +194,7 @@ class PointMaker:
     def make(self, values: Mapping[str, Any]) -> Point | PointRow:
         """The point of these values, one per axis. That they contradict one another is a result too."""
         self._made += 1
+        # Values that contradict one another are a row of the table, not an error.
         try:
             config = self._base.changed(values, "the configuration contradicts itself")
         except InputError as error:

@@ -20,8 +20,10 @@ from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 from workflow.study.columns import COLUMNS
 
-MOST_POINTS = 10_000  # a day and a half at 12 s a point
-_DIGITS = 6  # of a number in a range: enough for any tuning, and short in names and tables
+# Points of a study: a day and a half at 12 s a point.
+MOST_POINTS = 10_000
+# Digits of a number in a range: enough for any tuning, and short in names and tables.
+_DIGITS = 6
 
 
 def _judged(name: str) -> str:
@@ -115,6 +117,7 @@ class ParetoPlot(Section):
         return self
 
 
+# Pictures of a study of one loop, where none are stated.
 _DEFAULT_PLOTS = (
     ParetoPlot(x="bandwidth_rad_s", y="modulus_margin"),
     ParetoPlot(x="peak_command", y="rise_time_s"),
@@ -199,6 +202,7 @@ def load_study(path: Path) -> StudyFile:
     return StudyFile(path, config, text, base)
 
 
+# A part of a dotted key, with its places in lists.
 _NAME = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)((?:\[\d+\])*)")
 
 

@@ -101,6 +101,8 @@ def run_study(
                 raise
             with progress.stage("page"):
                 summary = _write_up(directory, file, base, rows)
+
+    # Failed points are told at the end: table and page of the others are there.
     broken = [row for row in rows if row.state == "failed"]
     if broken:
         raise StageError(
@@ -233,6 +235,7 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
     study = file.config
     if "pareto" not in study.model_fields_set and isinstance(base.config, JointsConfig):
         study = study.model_copy(update={"pareto": JOINTS_PLOTS})
+    # What the page is called and where it comes from.
     title = study.study.title or base.config.run.title or base.config.run.name
     where = str(base.run.path) if base.run is not None else study.study.base or "the built-in arm"
     view = StudyView(
