@@ -36,6 +36,7 @@ _TOLERANCES = {
     "bandwidth_rad_s": 0.02,
     "least_mode_damping": 0.02,
 }
+# Head of a baseline that is written for the first time.
 _HEADER = """\
 # Worst cases and margins over the uncertainty set, by plant. No certificate may be worse by more than its
 # tolerance (relative). Made by: flexlink certify ... --write-baseline FILE
@@ -152,6 +153,7 @@ def certify_controller(
     from workflow.tasks.design import certify_asked
     from workflow.tasks.system_files import read_law
 
+    # The plants, and the law in units of their quantities.
     progress = progress or Progress()
     progress.plan([("plants", 5.0), ("certify", 5.0)])
     with progress.stage("plants"):
@@ -175,6 +177,8 @@ def certify_controller(
             between_own_points=asked.plant.between_points,
         )
     assert done.certificate is not None
+
+    # Worst cases beside the baseline; a new one is written only where all is certified.
     found = worst_cases(done.certificate, specification)
     held = {} if baseline is None else {name: against(found[name], baseline, name) for name in found}
     if written is not None and done.certified:

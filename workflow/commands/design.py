@@ -181,6 +181,8 @@ def design_controller(
     progress.plan([("plants", 5.0), ("design", 30.0)])
     with progress.stage("plants"):
         sources_found, asked, specification = load_asked(paths, file)
+
+    # A page is of the design for one run; refused before anything is designed.
     if page is not None:
         refuse_page(asked, list(paths), sources_found[0].config)
     elif out is not None and out.is_dir() and len(paths) == 1 and "level" not in file.plant.model_fields_set:
@@ -188,13 +190,16 @@ def design_controller(
     plants = [source.plant for source in sources_found]
     logged = [source.logged for source in sources_found if source.logged is not None]
     check_filter(asked.reference_filter, plants[0].dt_s, name)
+
+    # Design, certificate, bound and filter.
     with progress.stage("design") as update:
         design, certify, achievable, prefilter = _design(plants, specification, asked, seed, update)
     controller = design.controller
     gamma = design.gamma
     order = (design.specification or specification).controller_order
+
+    # Files: the controller for the columns of the logs, where a run knows them.
     files: list[Path] = []
-    # As the files have it.
     law = controller
     if controller is not None and logged:
         law = logged[0].law(controller)
@@ -215,10 +220,11 @@ def design_controller(
                 page,
                 progress,
             )
-    missed = gamma is not None and gamma > 1
-    advice = (
-        (said("order_advice", achievable, gamma, order, specification.structure) or None) if missed else None
-    )
+
+    # What is said of it.
+    advice = None
+    if gamma is not None and gamma > 1:
+        advice = said("order_advice", achievable, gamma, order, specification.structure) or None
     given_way = gave_way(specification, design.specification)
     reason = said("design_verdict", design, certify.certificate, advice, specification, given_way)
     shares = joint_numbers(certify.sampled)

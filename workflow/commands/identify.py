@@ -92,6 +92,8 @@ def identify_logs(
     if report:
         steps.append(("report", 4.0))
     progress.plan(steps)
+
+    # The records on one clock, with the command that acted between their rows.
     true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
     in_loop = loop is not None and loop.stated
     common = with_common_sampling_time(records)
@@ -116,6 +118,8 @@ def identify_logs(
             progress=progress,
         )
     result = replace(result, true_modes=beside(result.about, true_modes), input_limit=logs.input_limit)
+
+    # Files are written together at the end, so that a refusal leaves none.
     written: dict[Path, bytes] = {}
     if report is not None:
         from workflow.report.pages import identify_page  # only a page needs what draws

@@ -80,6 +80,8 @@ def identify_response(
                 "stated uncertainty, [uncertainty] multiplicative = 0.1 in the file of flexlink design --spec"
             )
         fit = identify_frf(response, options)
+
+    # Files are written together at the end, so that a refusal leaves none.
     written: dict[Path, bytes] = {}
     if out is not None or export is not None:
         ends = response.omega_rad_s[response.omega_rad_s > 0]

@@ -409,6 +409,7 @@ def read_channel(
             if roles.time
         ]
         period = max(wraps_at(table.columns([roles.output])[roles.output]) for table in tables)
+    # Uneven stamps that only resampling can read: its step takes the place of a repair.
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
     how = stated.model_copy(
         update={
@@ -423,6 +424,8 @@ def read_channel(
             "unwrap": stated.unwrap or ({roles.output: float(period)} if period else {}),
         }
     )
+
+    # A logger that is faster than the controller repeats its rows: one of each is taken.
     records = how.records(tables)
     repeats = min(_repeats(record) for record in records)
     if repeats > 1 and not steps:

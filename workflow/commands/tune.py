@@ -29,6 +29,7 @@ from workflow.engine.progress import Progress
 from workflow.tasks.pipeline import identify_only
 from workflow.text.templates import environment
 
+# Loopback address: nobody outside this machine reaches it.
 HOST = "127.0.0.1"
 # Of a request, bytes: its settings are a page of text. Large enough for all of them, small enough to be read
 # into memory by anybody who knows the token.

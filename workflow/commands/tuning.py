@@ -82,6 +82,7 @@ Handler = Callable[[Mapping[str, Any]], dict[str, Any]]
 
 
 _Structure = Literal["p", "pi", "pd", "pid"]
+# Structures of a controller with a fixed order.
 _STRUCTURES: tuple[_Structure, ...] = get_args(_Structure)
 # Settings that follow from one of these structures.
 _SET_BY_STRUCTURE = ("controller_order", "integrator")
