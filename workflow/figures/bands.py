@@ -25,8 +25,11 @@ _SEEN_STEP = 0.02
 _SEEN_LOG_STEP = 0.05
 # Gains that are in a picture: what is below -30 dB, or far from the origin, is in neither.
 _SEEN_GAINS = (0.03, 10.0)
-_REFINEMENTS = 12  # each halves the steps: of a grid of 81 points for a mode one is enough, as a rule
-_SEEN = 0.1  # half a band's height over the gain: two pixels of two hundred on an axis of six decades
+# Refinements of a grid at most. Each halves the steps: of a grid of 81 points for a mode one is enough, as
+# a rule.
+_REFINEMENTS = 12
+# Half a band's height over the gain that is seen: two pixels of two hundred on an axis of six decades.
+_SEEN = 0.1
 
 
 @dataclass(frozen=True, eq=False)

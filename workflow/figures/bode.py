@@ -26,6 +26,7 @@ from workflow.figures.subjects import ChannelView, RunView
 from workflow.tasks.results import UncertainMember
 from workflow.text.formats import margin, share
 
+# A response without a model.
 _DOTS: dict[str, Any] = {
     "color": style.MEASURED,
     "ls": "none",
@@ -36,6 +37,7 @@ _DOTS: dict[str, Any] = {
 }
 # Ends of parts of the frequency axis whose smallest and largest dot are drawn: a part is two dots wide.
 _PARTS = 151
+# The nominal model, thin and dashed over the ellipses.
 _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2))}
 
 
@@ -43,14 +45,19 @@ _NOMINAL: dict[str, Any] = {"color": style.REFERENCE, "lw": 1.0, "ls": (0, (2, 2
 def draw_channel(channel: ChannelView, name: str, part: UncertainMember | None = None) -> Picture:
     """Identified response of a channel, its nominal model, and what the records say without one.
 
-    part: the further part of its set that is shown.
+    Parameters
+    ----------
+    channel : ChannelView
+    name : str
+        Of the channel, for the title.
+    part : UncertainMember, optional
+        A further part of its set, in place of the first.
     """
-    found = channel.found
     spread = channel.spread
     if part is not None:
         frequency = part.posterior.at(spread.frequency.omega_rad_s, spread.level)
         spread = replace(spread, nominal=part.nominal, frequency=frequency)
-    signals = f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}"
+    signals = f"{style.plain(channel.found.input, 26)} to {style.plain(channel.found.output, 26)}"
     return draw_bode(
         spread.frequency,
         f"{style.plain(name, 26)}: {signals}",
@@ -66,7 +73,7 @@ def draw_response(channel: ChannelView) -> Picture:
 
     The bands are drawn enlarged where that of the gain is too narrow to be seen.
     """
-    found = channel.found
+    identified = channel.found
     spread = channel.spread
     picture, (gain, phase) = new_picture(4.4, 1, 2, width_in=12.0)
     for panel, quantity in ((gain, "gain{}"), (phase, "phase{}_deg")):
@@ -78,20 +85,32 @@ def draw_response(channel: ChannelView) -> Picture:
     gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(_gain_floor(band.gain), 3 * band.gain.max()))
     phase.set(ylabel="phase [deg]")
     phase.set(ylim=pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
-    gain.set_title(f"{style.plain(found.input, 26)} to {style.plain(found.output, 26)}")
+    gain.set_title(f"{style.plain(identified.input, 26)} to {style.plain(identified.output, 26)}")
     return picture
 
 
 def draw_enlarged(panel: Panel, response: FrequencyUncertainty, quantity: str = "gain{}") -> ResponseBand:
     """Gain or phase over rad/s with its band, enlarged where that of the gain is too narrow to be seen.
 
-    quantity: names of fields of the band, with a place for _low and _high.
+    Parameters
+    ----------
+    panel : Panel
+        That is drawn on.
+    response : FrequencyUncertainty
+    quantity : str
+        Names of fields of `ResponseBand`, with a place for _low and _high.
+
+    Returns
+    -------
+    ResponseBand
+        What was drawn, not enlarged.
     """
     band = response_band(response)
     factor = enlargement(band)
     centre, *ends = (getattr(band, quantity.format(end)) for end in ("", "_low", "_high"))
     low, high = (centre + factor * (end - centre) for end in ends)
-    if quantity == "gain{}":  # where the ellipse holds the origin its lower end is 0
+    # Where the ellipse holds the origin the lower end of its gain is 0, which a log axis cannot show.
+    if quantity == "gain{}":
         low = np.maximum(low, 1e-3 * centre)
     label = f"{share(response.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
     panel.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
@@ -110,13 +129,27 @@ def draw_bode(
     dB: bool = False,
     Hz: bool = False,
 ) -> Picture:
-    """Gain [unit], phase and relative size of the ellipses over frequency; `empirical` as dots.
+    """Gain, phase and relative size of the ellipses over frequency.
 
-    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly. dB,
-    Hz: as of `draw_comparison`.
+    The band is the range of gain and phase over each frequency's ellipse, not over all of them jointly.
+
+    Parameters
+    ----------
+    uncertainty : FrequencyUncertainty
+        Ellipses of the response.
+    title, unit : str
+        Of the picture, and of the gain.
+    model : GobfModel, optional
+        Drawn as a line.
+    empirical : FrequencyUncertainty, optional
+        A response without a model, drawn as dots.
+    dB, Hz : bool
+        One scale in dB or Hz; without, absolute gain and rad/s with dB and Hz on the far sides.
     """
     picture, (gain, phase, size) = new_picture(7.0, 3, 1, sharex=True, height_ratios=[1.5, 1.1, 0.8])
     x, y = _units(dB, Hz)
+
+    # Gain and phase with their bands.
     label = f"{share(uncertainty.level)} ellipses"
     look = style.MODEL_LINE | {"label": "identified response (centre)"}
     measured = np.abs(empirical.centre) if empirical else None
@@ -140,6 +173,8 @@ def draw_bode(
         phase.plot(x(omega), degrees_near(response, band.phase_deg), **_NOMINAL)
     _frame(gain, phase, style.plain(unit, 24), band, measured=measured, dB=dB, Hz=Hz)
     gain.set_title(title)
+
+    # Below: how large each ellipse is beside the response.
     above_zero = uncertainty.omega_rad_s > 0
     relative = 100 * uncertainty.ellipse().semi_major[above_zero] / band.gain
     size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
@@ -161,9 +196,14 @@ def draw_comparison(
     dB: bool = False,
     Hz: bool = False,
 ) -> Picture:
-    """Gain and phase of several responses by name, with bands where they have ellipses.
+    """Gain and phase of several responses, with bands where they have ellipses.
 
-    dB, Hz: one scale, in place of absolute gain and rad/s with dB and Hz on the far sides.
+    Parameters
+    ----------
+    responses : mapping of str to FrequencyUncertainty
+        By the name in the legend; all with gains of one unit.
+    dB, Hz : bool
+        One scale in dB or Hz; without, absolute gain and rad/s with dB and Hz on the far sides.
     """
     picture, (gain, phase) = new_picture(6.0, 2, 1, sharex=True, height_ratios=[1.4, 1.0])
     colours = (style.MODEL, style.ACHIEVED, style.PREDICTED, style.LIMIT, style.HIGHLIGHT, style.MEASURED)
@@ -205,7 +245,10 @@ def draw_loop(run: RunView) -> Picture:
 
 
 def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
-    """Crossovers of a nominal loop, with its gain and phase margin as python-control finds them."""
+    """Mark the crossovers of a nominal loop with its gain and phase margin.
+
+    The margins are those that python-control finds; one that does not exist is left out.
+    """
     import control  # here, because it brings a plotting library with it
 
     margins = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
@@ -226,8 +269,12 @@ def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
 
 
 def _units(dB: bool, Hz: bool) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """What a frequency [rad/s] and an absolute gain become on the axes."""
-    return (lambda w: w / (2 * np.pi) if Hz else w), (style.decibels if dB else np.asarray)
+    """Functions of a frequency [rad/s] and of an absolute gain to their values on the axes."""
+
+    def frequency(omega: Any) -> Any:
+        return omega / (2 * np.pi) if Hz else omega
+
+    return frequency, style.decibels if dB else np.asarray
 
 
 def _draw(
@@ -241,7 +288,10 @@ def _draw(
     dB: bool = False,
     Hz: bool = False,
 ) -> ResponseBand:
-    """Line and, of an uncertain response, band of gain and phase. measured: gains that are in view too."""
+    """Draw a response as a line, and where it has ellipses as a band of gain and phase.
+
+    look, filled: looks of line and band; measured: gains (F,) that are in view, too. Returns the band.
+    """
     band = response_band(response)
     x, y = _units(dB, Hz)
     at = x(band.omega_rad_s)
@@ -265,22 +315,24 @@ def _frame(
 ) -> None:
     """Scales and labels of gain and phase: absolute and rad/s, dB and Hz on the far sides, or one alone."""
     x, y = _units(dB, Hz)
-    every = np.concatenate([band.phase_deg for band in bands])
+    phases = np.concatenate([band.phase_deg for band in bands])
     ends = [float(x(end)) for band in bands for end in (band.omega_rad_s[0], band.omega_rad_s[-1])]
     gain.set(xscale="log", yscale="lin" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
     phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{'Hz' if Hz else 'rad/s'}]")
     for panel in (gain, phase):
         panel.set(xlim=(min(ends), max(ends)))
     gain.set(ylim=(float(y(min(_gain_floor(band.gain, measured) for band in bands))), None))
-    span = np.ptp(every)
+
     # A number of the phase axis every quarter, half or whole turn, as many as fit.
+    span = np.ptp(phases)
     if span < 400:
         phase.y.every = 90.0
     elif span < 1000:
         phase.y.every = 180.0
     else:
         phase.y.every = 360.0
-    phase.set(ylim=pad_limits(float(every.min()), float(every.max()), 0.15))
+    phase.set(ylim=pad_limits(float(phases.min()), float(phases.max()), 0.15))
+    # The other unit on the far side.
     if not Hz:
         gain.hertz = True
     if not dB:
@@ -302,8 +354,22 @@ def _gain_floor(gain: Real, empirical: Real | None = None) -> float:
 
 @style.drawing("distortion")
 def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Picture | None:
-    """Best linear approximation, and what scatters around it at every line, as measured: points above the
-    line of the noise are distortion. units: of input and output. Nothing where no record is periodic."""
+    """Best linear approximation, and what scatters around it at every line, as measured.
+
+    Points above the line of the noise are distortion.
+
+    Parameters
+    ----------
+    found : sequence of Distortion
+        Levels by amplitude.
+    units : tuple of two str
+        Of input and output.
+
+    Returns
+    -------
+    Picture or None
+        None where no record is periodic.
+    """
     if not found:
         return None
     columns = min(len(found), 3)

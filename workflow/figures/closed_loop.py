@@ -15,7 +15,9 @@ from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.tasks.results import LoopRuns
 from workflow.text.formats import si
 
+# The loop on the identified model.
 _PREDICTED: dict[str, Any] = style.PREDICTED_LINE | {"label": "predicted, nominal model"}
+# What is asked for.
 _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
 
 
@@ -59,16 +61,32 @@ def draw_closed_loop(
     settled_s: float | None = None,
     onto: tuple[Picture, Panel] | None = None,
 ) -> Picture:
-    """Rows: what `labels` names of output, performance and command. Left: the reference step. Right: the
-    disturbance.
+    """The loop in time. Left: the reference step. Right: the disturbance.
 
-    time_s, reference, disturbance and model (the answer of the model that a reference filter makes the loop
-    follow) are (T,). labels: (name, unit) of each row. others: runs on `machine`, in words; without one, of
-    plants drawn from the uncertainty. with_friction: outputs of the lines `FRICTION`, as far as they go, the
-    step's panel as far as the longest. settled_s: the panels are cut where nothing moves any more, not before
-    this time after the step; None: all is shown. The first run is drawn as a line, all of them as the band
-    between their extremes. onto: a picture and the panel of it to draw on, in
-    place of a new picture; of one row and column.
+    The first run is drawn as a line, all of them as the band between their extremes.
+
+    Parameters
+    ----------
+    time_s, reference : (T,) arrays
+    predicted : LoopRuns
+        On the identified model, one run.
+    labels : mapping of str to (str, str)
+        Rows of the picture, of "output", "performance" and "command": name and unit of each.
+    others : LoopRuns, optional
+        On the machine.
+    machine : str
+        That machine in words; "": plants drawn from the uncertainty.
+    disturbance : (T,) array, optional
+    command_limit : float, optional
+    model : (T,) array, optional
+        Output of the model that a reference filter makes the loop follow.
+    with_friction : sequence of arrays
+        Outputs of the lines `FRICTION`, as far as they go; the step's panel goes as far as the longest.
+    settled_s : float, optional
+        The panels are cut where nothing moves any more, not before this time after the step; None: all is
+        shown.
+    onto : tuple of Picture and Panel, optional
+        Drawn on in place of a new picture; of one row and column.
     """
     all_runs = (predicted,) if others is None else (predicted, others)
     dt_s = float(time_s[1] - time_s[0])
@@ -82,7 +100,10 @@ def draw_closed_loop(
         picture, grid = new_picture(
             2.1 * len(labels) + 0.9, len(labels), len(windows), squeeze=False, sharex="col", sharey="row"
         )
+
+    # A row for output, performance and command each, a column for step and disturbance.
     for (kind, label), row in zip(labels.items(), grid, strict=True):
+        # A command is held from sample to sample.
         hold = {"drawstyle": "steps-post"} if kind == "command" else {}
         line: Real = getattr(predicted, kind)[0]
         for panel, window in zip(row, windows, strict=True):
@@ -96,9 +117,10 @@ def draw_closed_loop(
                 panel.plot(np.append(wanted_s, window.stop), np.append(wanted, wanted[-1]), **_REFERENCE)
                 if window is windows[0]:
                     for output, look in zip(with_friction, FRICTION, strict=False):
-                        own_time = time_s[0] + dt_s * np.arange(output.size)
-                        seen = own_time <= window.stop
-                        panel.plot(*outline(own_time[seen], output[seen]), **look)
+                        # It may go on beyond the other runs.
+                        friction_time_s = time_s[0] + dt_s * np.arange(output.size)
+                        seen = friction_time_s <= window.stop
+                        panel.plot(*outline(friction_time_s[seen], output[seen]), **look)
                 if model is not None:
                     looks = style.MODEL_LINE | {"ls": ":", "label": "model to follow"}
                     panel.plot(*outline(time, model[part]), **looks)
@@ -106,11 +128,23 @@ def draw_closed_loop(
             if onset is not None and window.start <= onset <= window.runs_until:
                 panel.axvline(onset, color="#888888", lw=0.8, ls=":")
         row[0].set(ylabel=style.two_lines(*label))
-        runs = *(with_friction if kind == "output" else ()), *([getattr(others, kind)] if others else ())
-        low, high = height(np.append(line, reference) if kind == "output" else line, runs, 3.0)
-        limits = () if kind != "command" or command_limit is None else (-command_limit, command_limit)
+
+        # Height of the row: the prediction, and other runs as far as they do not flatten it.
+        wanted_range = line
+        runs = list[Real]()
+        if kind == "output":
+            wanted_range = np.append(line, reference)
+            runs += with_friction
+        if others is not None:
+            runs.append(getattr(others, kind))
+        low, high = height(wanted_range, runs, 3.0)
+
+        # The command's limits, where it comes near enough for them to matter.
+        limits: tuple[float, ...] = ()
+        if kind == "command" and command_limit is not None:
+            limits = (-command_limit, command_limit)
         for limit in limits:
-            if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):  # near enough to matter
+            if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):
                 low = min(low, limit)
                 high = max(high, limit)
                 for panel in row:
@@ -164,13 +198,16 @@ def _windows(
     reference: Real,
     disturbance: Real | None,
     labels: Mapping[str, tuple[str, str]],
-    both: tuple[LoopRuns, ...],
+    all_runs: tuple[LoopRuns, ...],
     settled_s: float | None,
     friction_s: float,
 ) -> tuple[float | None, list[_Window]]:
-    """When the disturbance begins, and the panels: step and disturbance apart, each as long as something
-    moves, the step at least until `settled_s` after it (None: the step is not cut). Lines with friction go on
-    to `friction_s`, where they settle later than the others, and the step's panel with them."""
+    """When the disturbance begins, and the panels: step and disturbance apart.
+
+    Each is as long as something moves, the step at least until `settled_s` after it (None: the step is not
+    cut). Lines with friction go on to `friction_s`, where they settle later than the others, and the step's
+    panel with them.
+    """
     start = float(time_s[0])
     stop = float(time_s[-1])
     stepped = np.flatnonzero(reference != reference[0])
@@ -181,12 +218,13 @@ def _windows(
         # Predicted runs may leave 2 % of their range, the others (noisy) 15 %.
         quiet = max(
             _quiet_from(time_s[part], getattr(runs, kind)[:, part], tolerance)
-            for runs, tolerance in zip(both, (0.02, 0.15), strict=False)
+            for runs, tolerance in zip(all_runs, (0.02, 0.15), strict=False)
             for kind in labels
         )
         # Cut only where much is saved; some rest after the motion shows that it is over.
         end = max(first + max(1.5 * (quiet - first), 0.2 * (last - first)), least)
-        uncut = last if last == stop else last - 1e-9  # the disturbance is not of the step's panel
+        # The first sample of the disturbance is not of the step's panel.
+        uncut = last if last == stop else last - 1e-9
         if least > uncut:
             return _Window(first, max(uncut, min(least, friction_s)), uncut, title)
         return _Window(first, end if end < first + 0.75 * (last - first) else uncut, uncut, title)
@@ -216,16 +254,30 @@ def _quiet_from(time_s: Real, runs: Real, tolerance: float) -> float:
 
 
 def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float]:
-    """Range of a row: all runs, but a run that leaves the scene by more than `most` times the range asked for
-    does not flatten the others."""
+    """Range of a row of panels.
+
+    Parameters
+    ----------
+    asked : (N,) array
+        Values that are shown whole.
+    runs : sequence of arrays
+        Further values; one that leaves the range of `asked` by more than `most` times it does not flatten the
+        others.
+    most : float
+
+    Returns
+    -------
+    low, high : float
+    """
     low = float(asked.min())
     high = float(asked.max())
     span = high - low if high > low else max(abs(high), 1e-12)
-    every = np.nan_to_num(np.concatenate([asked, *(np.ravel(run) for run in runs)]), nan=low)
-    shown = np.clip(every, low - most * span, high + most * span)
+    together = np.nan_to_num(np.concatenate([asked, *(np.ravel(run) for run in runs)]), nan=low)
+    shown = np.clip(together, low - most * span, high + most * span)
     return float(shown.min()), float(shown.max())
 
 
+# Arms on which |S| was measured, in their order.
 _MARKERS = (
     {"color": style.ACHIEVED, "marker": "o", "ms": 3.0},
     {"color": style.HIGHLIGHT, "marker": "^", "ms": 3.0},
@@ -235,8 +287,10 @@ _MARKERS = (
 
 @style.drawing("measured-sensitivity")
 def draw_measured_sensitivity(run: RunView) -> Picture | None:
-    """|S| as measured on the arm with two standard deviations, beside nominal and worst case; nothing where
-    it was not measured."""
+    """|S| as measured on the arm with two standard deviations, beside nominal and worst case.
+
+    None where it was not measured.
+    """
     loop = run.results.closed_loop.check
     if loop is None or loop.sensitivity is None:
         return None
@@ -247,11 +301,13 @@ def draw_measured_sensitivity(run: RunView) -> Picture | None:
     curve = curves_of(run, np.union1d(np.geomspace(0.9 * low, high, 900), fine))[0]
     picture, panel = new_picture(4.4)
     draw_curve(panel, curve, run.level)
-    for m, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
-        half = np.minimum(2 * m.std, 0.9 * m.magnitude)
+    for measured, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
+        size = measured.magnitude
+        # A bar that would reach zero has no lower end on a log axis.
+        half = np.minimum(2 * measured.std, 0.9 * size)
         bars = {"color": look["color"], "lw": 0.6, "solid_capstyle": "butt"}
-        panel.uprights(m.omega_rad_s, m.magnitude - half, m.magnitude + half, **bars)
-        panel.plot(m.omega_rad_s, m.magnitude, **look, ls="none", label=m.name)
+        panel.uprights(measured.omega_rad_s, size - half, size + half, **bars)
+        panel.plot(measured.omega_rad_s, size, **look, ls="none", label=measured.name)
     panel.set(title="Sensitivity, reference to error (bars: two standard deviations)")
     panel.set(xlabel="frequency [rad/s]")
     return picture
@@ -287,8 +343,11 @@ def draw_conditions(run: RunView) -> Picture | None:
 
 @style.drawing("friction-in-the-loop")
 def draw_friction(run: RunView) -> Picture | None:
-    """Left: peak of |S| over the rms of the reference, predicted with friction, measured, certified. Right:
-    error on the sine. Nothing where friction was not identified."""
+    """What dry friction does to the loop. Left: peak of |S| by size of the reference. Right: error on a sine.
+
+    The peak is predicted with friction, measured where there is a machine, and certified without friction.
+    None where friction was not identified.
+    """
     if run.results.closed_loop.check is None or run.results.closed_loop.check.friction is None:
         return None
     loop = run.results.closed_loop.check
@@ -297,6 +356,8 @@ def draw_friction(run: RunView) -> Picture | None:
     name = run.config.control_channel.output
     sine = friction.tracking
     picture, (peaks, errors) = new_picture(3.9, 1, 2)
+
+    # Peaks of |S|.
     bars = {"color": style.UNCERTAIN, "lw": 5.0, "alpha": 0.7, "solid_capstyle": "butt"}
     peaks.uprights(
         friction.sizes, friction.low, friction.high, **bars, label="identified arm with friction, 95 %"
@@ -313,6 +374,8 @@ def draw_friction(run: RunView) -> Picture | None:
         )
     peaks.set(xscale="log", title="Peak of |S| by size of the reference", ylabel="|S| [1]")
     peaks.set(xlabel=f"rms of the reference [{style.plain(unit, 12)}]")
+
+    # Errors on the slow sine.
     time_s = np.asarray(np.arange(sine.without.size) * run.plant.dt_s, dtype=np.float64)
     for error, look, words in (
         (sine.without, style.ACHIEVED_LINE, "without feed-forward"),

@@ -344,7 +344,7 @@ class Panel:
         return self.y if which else self.x
 
     def data(self, which: int) -> Real:
-        """All values (N,) along one axis that are drawn, by which it is scaled."""
+        """Values (N,) along one axis that are drawn, by which it is scaled."""
         values = [np.zeros(0)]
         for mark in self.marks:
             if isinstance(mark, Curve):

@@ -16,7 +16,9 @@ from workflow.figures.bands import Real, outline
 from workflow.figures.description import Picture, new_picture
 from workflow.text.formats import listing
 
-_MOST_BARS = 8  # more names are too small to read at the width of a page
+# Bars at most: more names are too small to read at the width of a page.
+_MOST_BARS = 8
+# Marker of a model, and how far it stands from the middle of its row.
 _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 
 

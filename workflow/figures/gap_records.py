@@ -14,8 +14,10 @@ from workflow.figures import gap_style, style
 from workflow.figures.bands import Real, outline
 from workflow.figures.description import Picture, Y, new_picture, small_multiples
 
-_SEGMENT = 512  # samples: 257 lines, more than a panel shows; short records still hold several
-_MODES = 3  # marks of higher ones stand too close
+# Samples of a segment: 257 lines, more than a panel shows; short records still hold several.
+_SEGMENT = 512
+# Modes that are marked: marks of higher ones stand too close.
+_MODES = 3
 
 
 @style.drawing("gap_measured")

@@ -15,16 +15,23 @@ MODELS: Mapping[str, Mapping[str, Any]] = {
     "refit": {"color": "#8C6D31", "ls": (0, (5, 1.5, 1, 1.5)), "lw": 1.3},
     "repaired": {"color": style.MODEL, "ls": "-", "lw": 1.3},
 }
+# Level of the sensors' noise.
 FLOOR: dict[str, Any] = {"color": style.REFERENCE, "ls": (0, (1, 1.5)), "lw": 1.1, "label": "sensor noise"}
+# Models by what the legend calls them.
 WORDS: Mapping[str, str] = {
     "stated": "nominal parameters",
     "refit": "nominal parameters, re-estimated",
     "repaired": "effects added",
 }
+# Label of an axis of residuals.
 RESIDUAL_AXIS = "residual over noise, RMS [1]"
+# Label where residuals are a share of the motion.
 SHARE_AXIS = "residual, RMS [% of the motion]"
-LEAST = 0.05  # of the noise, or what a good model may miss: on a log axis less is drawn there
+# Share of the noise, or of what a good model may miss, below which nothing is drawn on a log axis.
+LEAST = 0.05
+# The level below which a model error does not matter.
 UNINTERESTING = "significance threshold"
+# Band of the noise in time.
 NOISE_BAND = {"color": "#e6e6e6", "lw": 0, "label": "2 standard deviations of the sensor noise"}
 # What is measured: words, unit, colour.
 OUTPUTS: Mapping[Output, tuple[str, str, str]] = {
@@ -34,6 +41,7 @@ OUTPUTS: Mapping[Output, tuple[str, str, str]] = {
     "hub_speed_rad_s": ("hub speed", "rad/s", style.PREDICTED),
     "tip_deflection_m": ("tip deflection", "m", style.HIGHLIGHT),
 }
+# Colours of further sensors.
 _OTHERS = (style.UNCERTAIN, style.HIGHLIGHT, style.PREDICTED)
 
 

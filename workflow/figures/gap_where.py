@@ -12,10 +12,15 @@ from workflow.figures.description import Picture, X, new_picture, small_multiple
 from workflow.text.dependence import missing_words, variable_words
 from workflow.text.formats import portion
 
+# Words and colour of sensors that a rig always has.
 _LOOKS = {SENSORS[output][0]: (words, colour) for output, (words, _, colour) in gap_style.OUTPUTS.items()}
-_MOST_REGIMES = 6  # two rows of panels
-_FEW_BINS = 2  # labels of three in words overlap
+# Panels at most: two rows.
+_MOST_REGIMES = 6
+# Bins whose labels are words: those of three overlap.
+_FEW_BINS = 2
+# Intervals.
 _WHISKER = {"color": "#444444", "lw": 1.0}
+# What regimes are told by, in words.
 _REGIMES = {
     "speed_sign": "sign of the hub speed",
     "speed_size": "size of the hub speed",

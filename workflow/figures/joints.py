@@ -14,9 +14,11 @@ from workflow.figures.description import Picture, new_picture, small_multiples
 from workflow.figures.subjects import AnyRunView
 from workflow.figures.validation import draw_free_run
 
-_LOW = 1e-3  # smallest frequency of the singular values, of the Nyquist frequency
+# Smallest frequency of the singular values, over the Nyquist frequency.
+_LOW = 1e-3
 
 
+# Weights by what the legend calls them.
 _MEANING = {
     "tracking": "tracking: weighted S",
     "effort": "effort: weighted K S",

@@ -51,6 +51,7 @@ _LETTER_IN = 0.08
 # Inches for the sample of an entry and the gaps beside it.
 _SAMPLE_IN = 0.75
 
+# Settings of matplotlib that make its figures look like those of a page.
 _RC: Any = {
     "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine
     "font.size": 9.5,

@@ -15,11 +15,14 @@ from workflow.figures.description import Panel, Picture, new_picture
 from workflow.figures.subjects import RunView
 from workflow.text.formats import at_least, share
 
-_MOST_ELLIPSES = 220  # more fill the panel, and the file
+# Ellipses at most: more fill the panel, and the file.
+_MOST_ELLIPSES = 220
 # Closed-loop gains and phases whose lines a Nichols chart has: those of `control.nichols_grid`.
 _GRID_GAINS_DB = np.array([-40.0, -20.0, -12.0, -6.0, -3.0, -1.0, -0.5, 0.0, 0.25, 0.5, 1.0, 3.0, 6.0, 12.0])
+# Closed-loop phases of its lines.
 _GRID_PHASES_DEG = np.array([-359.75, -315.0, -270.0, -225.0, -180.0, -135.0, -90.0, -45.0, -0.25])
-_LOWEST_DB = -30.0  # below it a loop does nothing, and its phase takes all the width
+# Gain where the Nichols chart ends: below it a loop does nothing, and its phase takes all the width.
+_LOWEST_DB = -30.0
 
 
 def loop_of(run: RunView) -> FrequencyUncertainty:
@@ -51,8 +54,18 @@ def draw_alone(draw: Callable[..., None], loop: FrequencyUncertainty) -> Picture
 def draw_nyquist(
     panel: Panel, loop: FrequencyUncertainty, modulus_margin: float = 0.0, *, near: bool = False
 ) -> None:
-    """Ellipses of a loop as far as they fit, or near -1; the disc to keep out of and the nearest point where
-    a modulus margin is asked for."""
+    """Draw the Nyquist curve of a loop with its ellipses.
+
+    Parameters
+    ----------
+    panel : Panel
+    loop : FrequencyUncertainty
+        Ellipses of K G.
+    modulus_margin : float
+        Radius of the disc around -1 to keep out of, drawn with the nearest point; 0: none is asked for.
+    near : bool
+        Around -1; else as far as the curve fits.
+    """
     centre = loop.centre
     ellipse = loop.ellipse()
     edges = centre[:, None] + ellipse.boundary(40)
@@ -61,7 +74,8 @@ def draw_nyquist(
         (-1.0 - centre) * np.conj(ellipse.direction), ellipse.semi_major, ellipse.semi_minor
     )
     nearest = int(np.argmin(distance))
-    # Of the whole view: all that the loop does after it first falls below 1, no integrator.
+
+    # The whole view holds all that the loop does after it first falls below 1, but no integrator.
     below = np.flatnonzero(size < 1)
     reach = float(np.clip(1.25 * (size[below[0] :] if below.size else size).max(), 1.8, 6.0))
     real = imag = (-reach, reach)
@@ -69,12 +83,14 @@ def draw_nyquist(
         side = float(np.clip(1.35 * max(distance[nearest], modulus_margin, 0.35), 0.5, 1.3))
         real = (-1 - side, -1 + 1.25 * side)
         imag = (-1.12 * side, 1.12 * side)
+
+    # Ellipses that are in view at least in part.
     low, high = np.array([real, imag]).T
     corners = np.stack([edges.real, edges.imag], axis=-1)
     inside = np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1)
     panel.set(xlim=real, ylim=imag, equal=True)
     panel.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
-    # The last one is always drawn.
+    # The one nearest to -1 is always drawn, on top.
     _fill(panel, corners[np.append(np.flatnonzero(inside), nearest)], loop.level)
     panel.plot(centre.real, centre.imag, **style.PREDICTED_LINE, label="loop at the centres")
     _arrow(panel, centre, real, imag)
@@ -115,9 +131,9 @@ def draw_nichols(panel: Panel, loop: FrequencyUncertainty) -> None:
 
 
 def _closed_loop_grid(panel: Panel) -> None:
-    """Lines of constant closed-loop gain and phase, as of `control.nichols_grid`, in every turn that is seen.
+    """Draw lines of constant closed-loop gain and phase in every turn that is seen.
 
-    Of a closed loop T = L / (1 + L) the open loop is L = T / (1 - T).
+    They are those of `control.nichols_grid`: the closed loop is T = L / (1 + L), so L = T / (1 - T).
     """
     left, right = panel.x.limits()
     low, high = panel.y.limits()
@@ -141,8 +157,10 @@ def _closed_loop_grid(panel: Panel) -> None:
 
 
 def _fill(panel: Panel, polygons: Real, level: float) -> None:
-    """Outlines (F, P, 2) of ellipses, as many as fill a panel; those too thin to be seen stay unnamed.
-    Enlarged they might seem to reach into the disc."""
+    """Draw outlines (F, P, 2) of ellipses, as many as fill a panel.
+
+    Those too thin to be seen stay unnamed in the legend; enlarged they might seem to reach into the disc.
+    """
     if not len(polygons):
         return
     polygons = polygons[
@@ -155,10 +173,12 @@ def _fill(panel: Panel, polygons: Real, level: float) -> None:
 
 
 def _arrow(panel: Panel, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
-    """Direction of rising frequency, half-way along the longest visible run."""
+    """Draw an arrow in the direction of rising frequency, a third along the visible part of the curve."""
     x = centre.real
     y = centre.imag
-    seen = (x > real[0]) & (x < real[1]) & (y > imag[0]) & (y < imag[1])
+    in_width = (x > real[0]) & (x < real[1])
+    in_height = (y > imag[0]) & (y < imag[1])
+    seen = in_width & in_height
     length = np.cumsum(np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0))
     if length.size and length[-1] > 0:
         k = min(int(np.searchsorted(length, 0.35 * length[-1])), centre.size - 2)

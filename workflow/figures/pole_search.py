@@ -19,6 +19,7 @@ from workflow.figures.bands import Real
 from workflow.figures.description import Panel, Picture, new_picture
 from workflow.figures.subjects import ChannelView
 
+# Points that a search tried.
 _DOTS: dict[str, Any] = {"ls": "none", "marker": ".", "ms": 5, "color": "white", "mec": "black", "mew": 0.3}
 # Colours of the error surface from its floor upwards: cividis of matplotlib, reversed, at nine even steps
 # (Nunez, Anderton and Renslow, PLoS ONE 13(7), 2018: even in lightness for every colour vision).
@@ -26,7 +27,9 @@ _CIVIDIS = np.array([
     (254, 232, 56), (221, 200, 88), (187, 173, 109), (154, 147, 118), (124, 123, 120), (96, 100, 111),
     (66, 78, 108), (24, 55, 111), (0, 34, 78),
 ])  # fmt: skip
+# Label of the axis of both pictures.
 _PAIR_AXIS = "frequency of the pair [rad/s]"
+# Minima beside the model's.
 _HOLLOW: dict[str, Any] = {
     "ls": "none",
     "marker": "v",
@@ -50,12 +53,21 @@ def draw_error_surface(channel: ChannelView) -> Picture | None:
 def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str = "") -> Picture:
     """Residual RMS over that of the smallest grid point: contours, and the floor along the first coordinate.
 
-    searched: points (E, 2) that a search tried.
+    Parameters
+    ----------
+    surface : ErrorSurface
+        Over two coordinates of a pole pair.
+    searched : (E, 2) array, optional
+        Points that a search tried; those inside the picture are drawn.
+    name : str
+        Of the channel, for the title.
     """
     first = surface.first
     second = surface.second
     ratio = np.sqrt(surface.mean_square.T / surface.mean_square.min())
     picture, (left, bar, right) = new_picture(4.9, 1, 3, width_ratios=[1.75, 0.06, 1.0])
+
+    # Contours, up to what all but a hundredth of the grid stays below.
     top = max(float(np.percentile(ratio, 99)), 1.0001)
     levels = np.geomspace(1.0, top, 22)
     shades = np.clip(ratio, 1.0, top)
@@ -63,6 +75,8 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
     fill_levels(left, first, second, np.log(shades), np.log(levels))
     bar.set(yscale="log")
     colour_bar(bar, levels)
+
+    # Points of the search, further minima, and the pair of the model.
     low = [first[0], second[0]]
     high = [first[-1], second[-1]]
     if searched is not None:
@@ -70,31 +84,38 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
         seen = searched[is_inside]
         if seen.size:
             left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
-    # Inside the picture, and not the pair's own (which is no grid point).
-    further_minima = [
-        (i, j)
-        for i, j in surface.local_minima()
-        if 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
-        if abs(np.log(surface.first[i] / surface.pole[0])) > 0.2
-    ]
+    further_minima = []
+    for i, j in surface.local_minima():
+        is_inside_grid = 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
+        # The pair's own minimum is no grid point.
+        is_another = abs(np.log(surface.first[i] / surface.pole[0])) > 0.2
+        if is_inside_grid and is_another:
+            further_minima.append((i, j))
     if further_minima:
         i, j = np.array(further_minima[:8]).T
         left.plot(first[i], second[j], **_HOLLOW, label="other local minima")
     polar = surface.names == ("omega_rad_s", "zeta")
-    words = ("{:.4g} rad/s, damping {:.3g}" if polar else "beta {:.6g}, gamma {:.6g}").format(*surface.pole)
+    if polar:
+        words = "{:.4g} rad/s, damping {:.3g}".format(*surface.pole)
+        scale: Any = "log"
+        labels = (_PAIR_AXIS, "damping ratio of the pair [1]")
+        title = "Along frequency, best damping"
+    else:
+        words = "beta {:.6g}, gamma {:.6g}".format(*surface.pole)
+        scale = "lin"
+        labels = surface.names
+        title = "Along beta, best gamma"
     star = style.STAR | {"ms": 15, "mew": 0.8}
     left.plot(surface.pole[:1], surface.pole[1:], **star, label=f"found: {words}")
-    scale, labels = (
-        ("log", (_PAIR_AXIS, "damping ratio of the pair [1]")) if polar else ("lin", surface.names)
-    )
     left.set(xscale=scale, yscale=scale, xlim=(first[0], first[-1]), ylim=(second[0], second[-1]))
     left.set(xlabel=labels[0], ylabel=labels[1])
     left.set_title(f"Error surface: {name}" if name else "Error surface")
     bar.y.named = [(level, f"{level:.3g}") for level in levels[::7]]
+
+    # Right: the lowest point over the second coordinate.
     right.plot(first, ratio.min(axis=0), **style.MODEL_LINE)
     right.axvline(surface.pole[0], color=style.HIGHLIGHT, lw=1.4)
     right.set(xscale=scale, yscale="log", xlim=(first[0], first[-1]))
-    title = "Along frequency, best damping" if polar else "Along beta, best gamma"
     right.set(xlabel=labels[0], ylabel="residual RMS / smallest [1]", title=title)
     return picture
 
@@ -103,7 +124,8 @@ def fill_levels(panel: Panel, x: Real, y: Real, values: Real, levels: Real) -> N
     """Areas between neighbouring levels (L,) of values (Y, X) over a grid x (X,), y (Y,), in the colours of
     their numbers."""
     contours: Any = contour_generator(x, y, values, fill_type="ChunkCombinedOffset")
-    least = 1e-9 * (levels[-1] - levels[0])  # so that a value at the end of all levels is in one
+    # A value at the end of all levels is in one of them.
+    least = 1e-9 * (levels[-1] - levels[0])
     for number, (low, high) in enumerate(pairwise(levels)):
         (points,), (ends,) = contours.filled(low - least, high + least)
         if points is not None:
@@ -129,6 +151,10 @@ def _shade(share: float) -> str:
 
 
 def _surface(channel: ChannelView, pair: int) -> ErrorSurface:
+    """The error over frequency and damping of a pole pair, the others as they are, three octaves around it.
+
+    As far as the records tell such a frequency: a period in the longest one, and below Nyquist.
+    """
     identification = channel.found.identification
     poles = identification.model.poles
     dt_s = identification.model.dt_s
@@ -189,6 +215,10 @@ def draw_order(channel: ChannelView) -> Picture | None:
 
 
 def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]) -> None:
+    """Draw the criterion of every structure above the best one.
+
+    chosen: real poles and pairs of the model, whose mark is a star.
+    """
     order = np.array([step.order for step in steps])
     above = np.array([step.criterion for step in steps])
     above -= above.min()
@@ -210,6 +240,7 @@ def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]
 
 
 def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncertainty | None) -> None:
+    """Draw the pole pairs of fits with 0, 1, 2 ... pairs by whether they stay from one fit to the next."""
     omega = plot.omega_rad_s
     count = plot.n_pairs
     stable = plot.stable

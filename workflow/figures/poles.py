@@ -22,6 +22,7 @@ _DECAYED = 7.0
 _NAMED_AT = {"0.02": 0.85, "0.1": 0.7, "0.3": 0.6}
 # The same of all other lines: in their middle.
 _ELSE_AT = 0.5
+# Poles and zeros, so that one is seen within the other.
 _HOLLOW: dict[str, Any] = {"ls": "none", "mfc": "none"}
 
 
@@ -32,10 +33,17 @@ def draw_poles(
     closed_loop: Complex | None = None,
     intervals: Intervals | None = None,
 ) -> Picture:
-    """Poles and zeros of a model, its known poles at z = 1: whole circle and near z = 1.
+    """Poles and zeros of a model, and its known poles at z = 1: whole circle, and near z = 1.
 
-    closed_loop (n,): poles of a loop around it. intervals: of the poles; the area that frequency and damping
-    of a mode leave is filled.
+    Parameters
+    ----------
+    model : GobfModel
+    name : str
+        For the title.
+    closed_loop : (n,) complex array, optional
+        Poles of a loop around it.
+    intervals : Intervals, optional
+        Of its poles: the area that frequency and damping of a mode leave is filled.
     """
     poles = np.concatenate([model.stable_poles.values, model.unstable_poles])
     zeros = model.zeros()
@@ -79,6 +87,7 @@ def _areas(intervals: Intervals, dt_s: float) -> list[Complex]:
         if mode.told:
             (w0, w1) = mode.omega_rad_s
             (d0, d1) = mode.damping
+            # Round the rectangle of frequency and damping, side by side.
             omega = np.concatenate([w0 + along * (w1 - w0), w1 * ones, w1 - along * (w1 - w0), w0 * ones])
             zeta = np.concatenate([d0 * ones, d0 + along * (d1 - d0), d1 * ones, d1 - along * (d1 - d0)])
             upper = np.exp((-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0.0))) * omega * dt_s)
@@ -118,6 +127,8 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
     reach = min(fastest, float(np.max(np.abs(np.log(inside + 1e-12)))) / dt_s)
     rounds = linear_ticks(0.0, reach, 5, (1.0, 2.0, 5.0, 10.0)).places[1:4]
     look: dict[str, Any] = {"color": "#b5b5b5", "lw": 0.7}
+
+    # Upper halves of all lines in z, with their dashes and their values.
     lines = []
     for damping in _DAMPINGS:
         turned = np.sqrt(1 - damping**2)

@@ -14,7 +14,9 @@ from workflow.tasks.experiment import PlannedExperiment
 from workflow.tasks.log_look import LogLook
 from workflow.tasks.results import RunRecord
 
-_ZOOM_SAMPLES = 400  # as many as a panel has pixels across
+# Samples of the close-up: as many as a panel has pixels across.
+_ZOOM_SAMPLES = 400
+# Roles of a record in the legend.
 _WORDS = {
     "estimation": "used to estimate",
     "validation": "kept for validation",
@@ -24,10 +26,19 @@ _WORDS = {
 
 @style.drawing("records")
 def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Sequence[str]) -> Picture:
-    """Rows: the named inputs and outputs. Left: all records one after another, shaded by what each is used
-    for. Right: the liveliest part of the first.
+    """Records one after another, shaded by what each is used for, and the liveliest part of the first.
 
-    Raises ValueError when there is no record or a name is not in one of them.
+    Parameters
+    ----------
+    shown : sequence of RunRecord
+        One or more.
+    inputs, outputs : sequences of str
+        Columns, a row of the picture each.
+
+    Raises
+    ------
+    ValueError
+        There is no record, or a name is not in one of them.
     """
     if not shown:
         raise ValueError("there is no record to draw")
@@ -106,13 +117,16 @@ def draw_log(found: LogLook) -> Picture | None:
     return picture
 
 
-_TIME_S = 10.0  # a panel of more shows a band and no signal
+# Seconds of a voltage that are shown: a panel of more shows a band and no signal.
+_TIME_S = 10.0
 
 
 @style.drawing("excitation")
 def draw_excitation(found: PlannedExperiment) -> Picture:
-    """Left: first record at the highest amplitude, and its lines. Right: expected radius, and gain where
-    known."""
+    """A planned experiment: first record at the highest amplitude, lines of all, and what to expect.
+
+    Right: the expected radius of the response, and its gain where it is known.
+    """
     rms = np.array(found.plan.rms_V)
     loudest = int(np.argmax(rms))
     picture, (signal, lines, response) = new_picture(3.6, 1, 3)

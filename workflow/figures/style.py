@@ -14,25 +14,44 @@ import numpy as np
 
 from workflow.figures.description import Panel, Picture, Real
 
-MEASURED = "#6b6b6b"  # what sensors said
-MODEL = "#0072B2"  # identified model, open loop
-UNCERTAIN = "#56B4E9"  # ellipses and the bands made of them
-PREDICTED = "#009E73"  # controller, and the loop as computed from the model
-ACHIEVED = "#D55E00"  # the loop as it ran on the machine
-REFERENCE = "#111111"  # what was asked for
-LIMIT = "#8B2E7F"  # specification and hard limits
-HIGHLIGHT = "#E69F00"  # the one point the sentence below the picture speaks of
+# What sensors said.
+MEASURED = "#6b6b6b"
+# Identified model, open loop.
+MODEL = "#0072B2"
+# Ellipses and the bands made of them.
+UNCERTAIN = "#56B4E9"
+# Controller, and the loop as computed from the model.
+PREDICTED = "#009E73"
+# The loop as it ran on the machine.
+ACHIEVED = "#D55E00"
+# What was asked for.
+REFERENCE = "#111111"
+# Specification and hard limits.
+LIMIT = "#8B2E7F"
+# The one point the sentence below the picture speaks of.
+HIGHLIGHT = "#E69F00"
+# Records by their role.
 SHADE = {"estimation": "#0072B2", "validation": "#E69F00", "repeat": "#6b6b6b"}
 
+# A measured signal.
 MEASURED_LINE: dict[str, Any] = {"color": MEASURED, "lw": 0.9}
+# The identified model.
 MODEL_LINE: dict[str, Any] = {"color": MODEL, "lw": 1.4}
+# The computed loop.
 PREDICTED_LINE: dict[str, Any] = {"color": PREDICTED, "lw": 1.5}
+# The loop that ran.
 ACHIEVED_LINE: dict[str, Any] = {"color": ACHIEVED, "lw": 1.1}
+# A reference, or a level.
 REFERENCE_LINE: dict[str, Any] = {"color": REFERENCE, "lw": 1.0, "ls": (0, (4, 2))}
+# A limit.
 LIMIT_LINE: dict[str, Any] = {"color": LIMIT, "lw": 1.3, "ls": (0, (6, 2, 1.5, 2))}
+# A reference that is held from sample to sample.
 REFERENCE_STEPS: dict[str, Any] = REFERENCE_LINE | {"drawstyle": "steps-post"}
+# A band of the uncertainty.
 BAND: dict[str, Any] = {"color": UNCERTAIN, "alpha": 0.42, "lw": 0}
+# All runs on a machine.
 ACHIEVED_BAND: dict[str, Any] = {"color": ACHIEVED, "alpha": 0.22, "lw": 0}
+# A single point that matters.
 STAR: dict[str, Any] = {"ls": "none", "marker": "*", "mfc": HIGHLIGHT, "mec": "black"}
 
 Drawing = Callable[..., Picture | None]
@@ -81,7 +100,9 @@ DRAWINGS_OF: dict[str, tuple[str, ...]] = {
     "sensitivity": ("sensitivities",),
     "validation": ("validation", "residuals", "repeats"),
 }
+# Which of these modules a drawing is in.
 _MODULE_OF = {name: module for module, names in DRAWINGS_OF.items() for name in names}
+# Functions that draw, by the names that pages call them by; those of modules that were loaded.
 _LOADED: dict[str, Drawing] = {}
 
 

@@ -47,7 +47,9 @@ from workflow.tasks.results import (
     UncertainChannel,
 )
 
+# What ran as the machine, in words.
 MACHINE = {"simulated": "simulated arm", "identified": "plants drawn from the identified uncertainty"}
+# Looks and words of the loop with friction, of the new controller and of the recorded one.
 FRICTION = (
     style.MODEL_LINE | {"label": "identified arm with friction"},
     style.MEASURED_LINE | {"label": "the same arm in the recorded loop"},
@@ -56,11 +58,26 @@ FRICTION = (
 
 @dataclass(frozen=True, eq=False)
 class ChannelView:
-    """One channel: model, ellipses, options of the fit, and the records behind the free runs `found.fresh`.
+    """One channel as pages and pictures look at it.
 
-    measured: records of the fit, as measured. units: of input and output, empty where nobody stated them.
-    file: what tells its pictures from those of another channel. closed_loop: poles (n,) of the loop around
-    it, where there is one.
+    Attributes
+    ----------
+    found : IdentifiedChannel
+        Model and free runs.
+    spread : UncertainChannel
+        Ellipses.
+    options : IdentOptions
+        Of the fit.
+    fresh_records : tuple of Record
+        Behind the free runs `found.fresh`.
+    measured : tuple of Record
+        Of the fit, as measured.
+    units : tuple of two str
+        Of input and output, "" where nobody stated them.
+    file : str
+        What tells its pictures from those of another channel.
+    closed_loop : (n,) complex array or None
+        Poles of the loop around it, where there is one.
     """
 
     found: IdentifiedChannel
@@ -177,11 +194,20 @@ def log_channel(result: LogIdentification) -> ChannelView:
 class MeasuredBeyond:
     """A measurement of |S| beyond what is certified.
 
-    cause: what sets its arm apart: "effects" (the arm of the closed-loop check), "size" (the arm as
-    identified with a small reference, where friction weighs more), or "model" (nothing but friction and what
-    else is not linear). limit (F,): the specification at the lines, infinite where nothing is asked for.
-    line: where |S| exceeds it most, bandwidth_line: where it exceeds -3 dB most up to the certified
-    bandwidth; None: nowhere.
+    Attributes
+    ----------
+    measured : MeasuredPeak
+    cause : {"effects", "size", "model"}
+        What sets its arm apart: the effects of the closed-loop check; a small reference, where friction
+        weighs more; nothing but friction and what else is not linear.
+    limit : (F,) array
+        The specification at the lines, infinite where nothing is asked for.
+    line : int or None
+        Where |S| exceeds that limit most; None: nowhere.
+    bandwidth_line : int or None
+        Where it exceeds -3 dB most up to the certified bandwidth; None: nowhere.
+    bandwidth_rad_s : float
+        Certified.
     """
 
     measured: MeasuredPeak
@@ -236,23 +262,27 @@ class RunView(AnyRunView):
 
     def _channel(self, index: int) -> ChannelView:
         channel = self.config.channels[index]
-        found = self.results.identify.channels[index]
-        by_name = {item.name: item.record for item in self.results.records.records}
+        identified = self.results.identify.channels[index]
+        records = self.results.records
+        by_name = {item.name: item.record for item in records.records}
         friction = self.results.identify.friction if channel.uncertainty.friction_identified else None
-        slug = re.sub(r"[^A-Za-z0-9]+", "-", found.name).strip("-").lower()[:24]
-        with_loop = index == self.config.control_index and self.results.design.controller is not None
+        # A name that files can have.
+        slug = re.sub(r"[^A-Za-z0-9]+", "-", identified.name).strip("-").lower()[:24]
+        closed_loop = None
+        if index == self.config.control_index and self.results.design.controller is not None:
+            closed_loop = closed_loop_poles(self.controller, self.plant)
         return ChannelView(
-            found,
-            self.results.uncertainty.channels[index],
-            channel.identification,
-            tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in found.fresh),
-            tuple(self.results.records.fitted(channel)),
-            (
-                self.results.records.unit(found.model.input_name),
-                self.results.records.unit(found.model.output_name),
+            found=identified,
+            spread=self.results.uncertainty.channels[index],
+            options=channel.identification,
+            fresh_records=tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in identified.fresh),
+            measured=tuple(records.fitted(channel)),
+            units=(
+                records.unit(identified.model.input_name),
+                records.unit(identified.model.output_name),
             ),
-            f"{index + 1}-{slug}".strip("-"),
-            closed_loop_poles(self.controller, self.plant) if with_loop else None,
+            file=f"{index + 1}-{slug}".strip("-"),
+            closed_loop=closed_loop,
         )
 
     @property
@@ -274,7 +304,7 @@ class RunView(AnyRunView):
 
     @property
     def controller(self) -> Controller:
-        """Raises ValueError where there is none."""
+        """The designed controller. Raises ValueError where there is none."""
         if self.results.design.synthesis is None:
             raise ValueError("the run has no design")
         return self.results.design.synthesis.controller
@@ -291,8 +321,10 @@ class RunView(AnyRunView):
 
     @property
     def loop_factor(self) -> float:
-        """What `model.json` times the K of `controller.json` lacks of the loop gain: the controller's files
-        take and give the columns as logged, the model is in quantities."""
+        """Factor from `model.json` times the K of `controller.json` to the loop gain.
+
+        The controller's files take and give the columns as logged, the model is in quantities.
+        """
         logged = Logged.of(self.config, self.results.records)
         return logged.command[0] / logged.error[0]
 
@@ -445,6 +477,7 @@ class RunView(AnyRunView):
         )
 
 
+# Units by the ending of a key.
 _ENDINGS = (("_rad_s", "rad/s"), ("_s", "s"))
 
 

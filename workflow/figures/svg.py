@@ -131,9 +131,23 @@ COMMON_STYLE = (
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A picture in a page: the groups of its SVG without a legend; sample (groups around the middle of a box
-    from (0, -4.5) to (18, 4.5)) and words of each entry of the legend; what the script reads of it; and its
-    parts laid out anew for a narrow screen, none where the parts of this one can be read there."""
+    """A picture as it stands in a page.
+
+    Attributes
+    ----------
+    picture : Picture
+        What it was drawn from.
+    label : str
+        Words for those who do not see it.
+    body : str
+        Groups of its SVG, without a legend.
+    legend : list of tuples of two str
+        Sample (groups around the middle of a box from (0, -4.5) to (18, 4.5)) and words of each entry.
+    plot : dict
+        What the script reads of it.
+    narrow : list of Drawn
+        Its parts laid out again for a narrow screen; empty where the parts of this one can be read there.
+    """
 
     picture: Picture
     label: str
@@ -176,8 +190,24 @@ def _letter(letter: str) -> float:
 
 @dataclass(eq=False)
 class _Frame:
-    """A panel in its place: box (left, top, right, bottom) [pt], numbers of its axes and of its second axes,
-    and how far its words reach around it (left, top, right, bottom)."""
+    """A panel in its place.
+
+    Attributes
+    ----------
+    panel : Panel
+    box : (4,) array
+        Left, top, right, bottom [pt].
+    x, y : Ticks
+        Numbers of its axes.
+    hertz, decibel : Ticks or None
+        Numbers of its second axes.
+    numbered : tuple of two bool
+        Whether numbers stand at x and at y.
+    title, x_label : str
+        In as many lines as fit into the picture.
+    coarser : float
+        How much more of its lines is left out than on a wide screen.
+    """
 
     panel: Panel
     box: Real
@@ -186,9 +216,9 @@ class _Frame:
     hertz: Ticks | None = None
     decibel: Ticks | None = None
     numbered: tuple[bool, bool] = (True, True)
-    title: str = ""  # as it fits into the picture, in several lines where it is longer
-    x_label: str = ""  # likewise
-    coarser: float = 1.0  # how much more of its lines is left out than on a wide screen
+    title: str = ""
+    x_label: str = ""
+    coarser: float = 1.0
 
     @property
     def width(self) -> float:
@@ -253,6 +283,7 @@ class _Frame:
         if self.decibel is not None:
             words = max((text_width(word, _SECOND_SIZE) for word in self.decibel.words), default=0.0)
             right = _TO_NUMBERS + words + _TO_LABEL + _SECOND_SIZE * _LINE
+        # The first and the last number of x reach beyond the panel by half of their width.
         if self.numbered[X] and self.x.words:
             places = self.place(X, self.x.places)
             half = np.array([text_width(word, panel.tick_size[X]) / 2 for word in self.x.words])
@@ -263,9 +294,8 @@ class _Frame:
                 x, y = self.anchor(mark)
                 if not self.box[0] <= x <= self.box[2]:
                     continue
-                right = max(right, x + text_width(mark.text, mark.size) - self.box[2]) if (
-                    mark.horizontal == "left"
-                ) else right  # fmt: skip
+                if mark.horizontal == "left":
+                    right = max(right, x + text_width(mark.text, mark.size) - self.box[2])
                 top = max(top, self.box[1] - y + mark.size)
         return np.array([left, top, right, bottom])
 
@@ -310,7 +340,8 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
     rows, columns = picture.grid.shape
     before = np.zeros((2, max(rows, columns)))
     after = np.zeros((2, max(rows, columns)))
-    pad = np.zeros((2, max(rows, columns)))  # a column that holds no panel takes no width
+    # A column that holds no panel takes no width.
+    pad = np.zeros((2, max(rows, columns)))
     for panel in picture.panels:
         row, column = panel.place
         before[X, column] = 55.0
@@ -319,6 +350,8 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
         after[Y, row] = 25.0
         pad[X, column] = _PAD
         pad[Y, row] = _PAD
+
+    # The room that words need depends on the size of the panels, and that on the room; begun with usual ones.
     frames: list[_Frame] = []
     for _ in range(_MOST_LAYOUTS):
         room_x = pad[X, :columns]
@@ -331,7 +364,8 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
         known = np.concatenate([before, after])
         before[:] = 0.0
         after[:] = 0.0
-        labels = np.zeros(columns)  # under each other, beside the widest numbers of the column
+        # Labels stand under each other, beside the widest numbers of the column.
+        labels = np.zeros(columns)
         for frame in frames:
             row, column = frame.panel.place
             left, top, right, bottom = frame.around()
@@ -493,7 +527,8 @@ def _four_a_pixel(points: Real) -> Real:
     pixel = np.floor(x / _PIXEL).astype(np.int64)
     firsts = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
     lasts = np.append(firsts[1:], x.size) - 1
-    order = np.lexsort((y, pixel))  # sorted by pixel, then by value
+    # Sorted by pixel, then by value.
+    order = np.lexsort((y, pixel))
     chosen = np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))
     return np.asarray(points[chosen])
 
@@ -520,8 +555,18 @@ def _held(points: Real) -> Real:
 
 
 class _Writer:
-    """Writes a picture; number: of the picture in the page, unlike that of all others; classes: looks of the
-    page by what they say, added to; entries: what the legend names, of all panels that it stands for."""
+    """Writes a picture as SVG.
+
+    Parameters
+    ----------
+    picture : Picture
+    number : str
+        Of the picture in the page, unlike that of all others.
+    classes : dict
+        Looks of the page by what they say; new ones are added.
+    entries : dict
+        What the legend names, of all panels that it stands for.
+    """
 
     def __init__(
         self, picture: Picture, number: str, classes: dict[str, str], entries: dict[str, Mark]

@@ -14,12 +14,15 @@ from workflow.figures.description import Picture, new_picture
 from workflow.figures.subjects import ChannelView
 from workflow.text.formats import share
 
+# Roles of a record in the title.
 _WORDS = {
     "validation": "validation record",
     "repeat": "repeat of a fitted record",
     "estimation": "record of the fit",
 }
+# The measured output, under the simulated one.
 _THICK = style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}
+# The simulated output.
 _THIN = style.MODEL_LINE | {"lw": 0.9}
 
 
@@ -29,20 +32,22 @@ def draw_validation(channel: ChannelView) -> Picture:
 
     Above: both outputs, whole and close up. Below: the residual, with +-2 standard deviations of the noise.
     """
-    found = channel.found
+    identified = channel.found
+    identification = identified.identification
     shown = channel.shown_fresh
     if shown is None:
-        record = found.used[0]
+        record = identified.used[0]
         role = "estimation"
-        residual = found.identification.residuals[0]
+        residual = identification.residuals[0]
         simulated = record.output[record.n_samples - residual.size :, 0] - residual
-        fit = FreshFit(record.name, float(found.identification.fit_percent[0]), simulated, residual)
+        fit = FreshFit(record.name, float(identification.fit_percent[0]), simulated, residual)
     else:
         record = channel.fresh_records[shown]
-        role = found.fresh_roles[shown]
-        fit = found.fresh[shown]
-    time_s = record.time_s[record.n_samples - fit.residual.size :]  # a delayed answer begins later
-    noise = 2 * found.identification.noise_std
+        role = identified.fresh_roles[shown]
+        fit = identified.fresh[shown]
+    # A delayed answer begins later than the record.
+    time_s = record.time_s[record.n_samples - fit.residual.size :]
+    noise = 2 * identification.noise_std
     picture, grid = new_picture(4.7, 2, 2, sharex="col", height_ratios=[1.5, 1.0], width_ratios=[1.7, 1.0])
     length = min(400, max(time_s.size // 4, min(100, time_s.size)))
     close = liveliest(fit.simulated + fit.residual, length)
@@ -57,8 +62,10 @@ def draw_validation(channel: ChannelView) -> Picture:
 
 
 def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: slice = slice(None)) -> None:
-    """Into two panels, at the times of the fit (T,) or a part of them: measured and simulated; the residual,
-    with +-noise."""
+    """Draw a free run into two panels: measured and simulated output above, the residual below.
+
+    time_s (T,): of the fit; noise: half width of the band around the residual; part: of the samples.
+    """
     upper, lower = panels
     time = time_s[part]
     simulated = fit.simulated[part]
@@ -73,9 +80,9 @@ def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: 
 
 @style.drawing("residuals")
 def draw_residual_tests(channel: ChannelView) -> Picture | None:
-    """Both correlations with the band of each lag taken alone, lags outside it marked.
+    """Correlations of the residual, with itself and with the input; lags outside their band are marked.
 
-    Nothing where the records allow no test.
+    The band is that of each lag taken alone. None where the records allow no test.
     """
     tests = {test.name: test for test in channel.spread.tests}
     if not {"whiteness", "independence"} <= tests.keys():
@@ -113,9 +120,9 @@ def draw_residual_tests(channel: ChannelView) -> Picture | None:
 
 @style.drawing("repeats")
 def draw_repeat_scatter(rows: Sequence[ScatterRow], name: str) -> Picture:
-    """Relative scatter per band, predicted and measured, and their ratio.
+    """Scatter of repeats over the gain in each band, predicted and measured, and their ratio.
 
-    Raises ValueError without a band.
+    rows: of the bands, one or more (ValueError without); name: of the channel, for the title.
     """
     if not rows:
         raise ValueError("there is no band of repeat scatter to draw")
