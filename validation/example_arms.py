@@ -12,7 +12,8 @@ from plant.rig import Hub, Link
 
 Real = npt.NDArray[np.float64]
 
-_EXAMPLE_ZEROS_RAD_S = (10.8, -10.5)  # the paper, below its eq. (32)
+# The paper, below its eq. (32).
+_EXAMPLE_ZEROS_RAD_S = (10.8, -10.5)
 # The example's flexible pole is not printed; this is where the identification benchmark puts it.
 _EXAMPLE_POLE_RAD_S = 15.0
 # Length over inertia of an arm with such zeros: 1 m long and as wide as the paper's, but 0.77 mm thick.

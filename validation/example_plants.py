@@ -24,6 +24,7 @@ from control_design.specification import Specification
 
 Scenario = Literal["A", "B", "C"]
 
+# Sampling period.
 _DT_S = 0.005
 # Nominal value, and relative standard deviation in scenario A.
 _PARAMETERS = {
@@ -35,13 +36,17 @@ _PARAMETERS = {
     "zero_right": (10.8, 0.04),
     "zero_left": (11.5, 0.05),
 }
+# Nominal value of each parameter.
 _NOMINAL = {name: nominal for name, (nominal, _) in _PARAMETERS.items()}
+# Relative standard deviations of scenario A.
 _SPREAD_A = {name: spread for name, (_, spread) in _PARAMETERS.items()}
+# Relative standard deviations of each scenario.
 _SPREAD: dict[Scenario, dict[str, float]] = {
     "A": _SPREAD_A,
     "B": _SPREAD_A | {"gain": 0.15, "mode": 0.015},
     "C": _SPREAD_A | {"gain": 0.25},
 }
+# Share of the response by which a disc widens it, in each scenario.
 _ISOTROPIC: dict[Scenario, float] = {"A": 0.01, "B": 0.002, "C": 0.002}
 
 

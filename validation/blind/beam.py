@@ -18,7 +18,9 @@ from scipy.linalg import eigh
 
 Real = npt.NDArray[np.float64]
 
+# Polynomials of the Ritz basis, of degree 1 to 10.
 _POLYNOMIALS = 10
+# Gauss points: products of two polynomials are integrated exactly.
 _POINTS = 13
 
 

@@ -15,6 +15,7 @@ from validation.blind.truth import LISTED, UNLISTED, Clean, OutOfBoundsError, Re
 
 S = TypeVar("S", bound=str)
 Sort = Literal["none", "faint", "clear", "pair", "unlisted"]
+# Sorts of cases.
 SORTS: tuple[Sort, ...] = ("none", "faint", "clear", "pair", "unlisted")
 # Shares of a set of cases. The sets this resembles say nothing about the next one's mix; nor does this.
 SHARES: dict[Sort, float] = {"none": 0.25, "clear": 0.25, "faint": 0.17, "pair": 0.17, "unlisted": 0.16}

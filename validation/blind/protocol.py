@@ -42,6 +42,7 @@ from workflow.engine.storage import read_json, sha256_of_file, write_bytes, writ
 from workflow.engine.store import Store
 from workflow.text.templates import RunSummary
 
+# Format of a run; one of another format is not resumed.
 _FORMAT = "flexlink-blind-1"
 # Expected seconds to make a case: they shape the progress bar only.
 _CASE_S = 8.0

@@ -16,7 +16,9 @@ from validation.blind.truth import LISTED
 from workflow.figures.matplotlib_figure import house_style, new_figure
 from workflow.text.templates import Row, RunSummary, TableSection, environment
 
+# Columns of the table: cases by what is known of the nominal machine.
 _SLICES = ("all", "exact", "uncertain")
+# A row that is shown once.
 _CPU = "CPU per case [s]"
 
 

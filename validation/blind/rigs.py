@@ -26,7 +26,9 @@ TOLERANCES = {
 _LARGEST_DRAW = 2.0
 # (density, Young's modulus): aluminium, steel, brass, glass fibre.
 _MATERIALS = ((2700.0, 69e9), (7850.0, 205e9), (8500.0, 105e9), (1900.0, 40e9))
+# How often each material is drawn.
 _SHARES = (0.4, 0.4, 0.1, 0.1)
+# First root of cos x cosh x = -1: the lowest mode of a clamped beam.
 _FIRST_CLAMPED = 1.8751
 
 

@@ -23,6 +23,7 @@ from plant.effects import EFFECTS
 
 Document = Mapping[str, Any]
 
+# Family of each effect.
 GROUPS: Mapping[str, str] = MappingProxyType({name: effect.group for name, effect in EFFECTS.items()})
 
 # Gap over noise from which on a case counts as clear.

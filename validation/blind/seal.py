@@ -22,9 +22,13 @@ from typing import Any
 from workflow.engine.errors import InputError
 from workflow.engine.storage import read_json, write_json, write_text
 
+# Where the labels are.
 SEAL_DIRECTORY = "seal"
+# Their file.
 LABELS = "labels.json"
+# File of the published hash.
 COMMITMENT = "commitment.json"
+# How anybody may check it.
 _ALGORITHM = "SHA-256 over salt (hex) and labels (JSON, keys sorted, no blanks)"
 
 

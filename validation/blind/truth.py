@@ -20,6 +20,7 @@ Real = npt.NDArray[np.float64]
 RigTable = Mapping[str, Mapping[str, float]]
 Effects = Sequence[Mapping[str, Any]]
 
+# Causes of the list that a diagnosis knows.
 LISTED = (
     "coulomb_friction",
     "stribeck_friction",

@@ -56,6 +56,7 @@ class PaperDirectory(Store):
     )
 
 
+# Function that draws each figure.
 DRAWERS: Mapping[int, Callable[[PaperResults], Picture]] = {
     1: lambda results: draw_surface(results.surface),
     2: draw_simulation,

@@ -29,6 +29,7 @@ from workflow.engine.randomness import stage_rng
 
 # Stages with the seconds they take on one core, compilation of the kernels not counted.
 STAGES = (("surface", 10.0), ("simulation", 6.0), ("experiment", 6.0), ("bounds", 12.0), ("page", 6.0))
+# Frequencies of a curve.
 _N_FREQUENCIES = 400
 # The paper does not print how long it searched; ten times our budget, and a hundred times changes nothing.
 RECIPE_BUDGET = 10

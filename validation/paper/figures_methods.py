@@ -21,17 +21,23 @@ from workflow.figures import style
 from workflow.figures.bands import response_band, unwrapped_degrees
 from workflow.figures.description import Panel, Picture, new_picture
 
+# Colour of what follows the paper's own way.
 PAPER_WAY = style.ACHIEVED
+# Colour of what follows ours.
 OUR_WAY = style.MODEL
 
+# Looks of the methods.
 METHOD_LINES: dict[str, dict[str, Any]] = {
     "GOBF": {"color": style.MODEL, "lw": 1.6},
     "ARX": {"color": style.HIGHLIGHT, "lw": 1.2, "ls": (0, (3, 2))},
     "ARMAX": {"color": style.LIMIT, "lw": 2.0, "ls": (0, (6, 3))},
     "OE": {"color": style.PREDICTED, "lw": 1.6, "ls": (0, (6, 2, 1.5, 2))},
 }
+# The true response, under all others.
 TRUTH_LINE: dict[str, Any] = {"color": style.REFERENCE, "lw": 3.0, "alpha": 0.35}
+# GOBF by the paper's own search.
 RECIPE_LINE: dict[str, Any] = {"color": PAPER_WAY, "lw": 1.2, "ls": (0, (2, 2))}
+# The measured output.
 _MEASURED = style.MEASURED_LINE | {"lw": 2.4, "alpha": 0.6}
 
 # Where the phases of two curves are brought to the same turn.

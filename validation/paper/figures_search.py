@@ -13,6 +13,7 @@ from workflow.figures.pole_search import colour_bar, fill_levels
 
 # Cuts of the surface: the border of the paper's window, and close to the circle.
 CUTS = (0.9988, 0.9998)
+# Looks of cuts through the surface.
 _CUT_LINES: tuple[dict[str, Any], ...] = (
     {"color": style.MODEL, "lw": 1.4},
     {"color": style.LIMIT, "lw": 1.4, "ls": (0, (4, 2))},

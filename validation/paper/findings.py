@@ -13,7 +13,9 @@ from validation.paper.surface import minima_along, slices
 
 # A response is matched where its RMS error stays below this; a fit is good within these points of the best.
 _MATCHED = 0.1
+# Points of fit by which a model may be worse than the best and still count as adequate.
 CLOSE_TO_BEST = 10.0
+# Methods that GOBF is compared with.
 PEERS = METHODS[1:]
 
 

@@ -27,11 +27,17 @@ from validation.paper.settings import DT_S
 
 # p. 104: noise variance 0.004^2 and 30 dB, so the output has a standard deviation of 0.1265.
 NOISE_STD = 0.004
+# Signal over noise of the simulation example.
 SNR_DB = 30.0
+# Samples of its records.
 EXAMPLE_SAMPLES = 1000
-EXPERIMENT_SAMPLES = 1200  # 6 s, the length of Figs. 5 and 6
+# Samples of the experiment: 6 s, the length of Figs. 5 and 6.
+EXPERIMENT_SAMPLES = 1200
+# Voltage of the experiment.
 EXPERIMENT_AMPLITUDE_V = 1.5
+# Dry friction of its arm.
 COULOMB_NM = 0.02
+# Length of the shift register behind the random binary signals.
 _REGISTER = 11
 
 

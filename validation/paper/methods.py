@@ -18,6 +18,7 @@ from validation.paper.machines import PaperMachine, Trial
 from validation.paper.settings import N_PAIRS, N_REAL, ORDER
 from validation.paper.usual_starts import usual_oe
 
+# Methods that the paper compares.
 METHODS = ("GOBF", "ARX", "ARMAX", "OE")
 # Not the paper's: how the two iterative methods do from a Steiglitz-McBride start as well.
 BETTER_STARTS = ("ARMAX (better start)", "OE (better start)")

@@ -21,8 +21,11 @@ class Reported:
     says: str
 
 
+# What the paper says, figure by figure.
 _QUOTES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+# The paper.
 SOURCE = " ".join(_QUOTES["source"].split())
+# Its figures.
 REPORTED = tuple(Reported(**item | {"says": " ".join(item["says"].split())}) for item in _QUOTES["figures"])
 # (what the paper does not print, what we chose)
 OPEN_CHOICES = tuple((item["missing"], " ".join(item["chosen"].split())) for item in _QUOTES["choices"])

@@ -33,7 +33,9 @@ from validation.paper.machines import EXAMPLE_SAMPLES, SNR_DB, SimulationExample
 from validation.paper.settings import DT_S, N_PAIRS, N_REAL, PaperSettings
 from workflow.engine.randomness import stage_rng
 
+# Variants of DIRECT that are compared.
 VARIANTS: tuple[Algorithm, ...] = tuple(name for name in typing.get_args(Algorithm) if "DIRECT" in name)
+# Coordinates of the search that are compared.
 COORDINATES: tuple[typing.Literal["raw", "log"], ...] = ("raw", "log")
 
 # The window of the paper's Fig. 1. Its axis says gamma_1 from -1 to -0.9988: that is Wahlberg's -gamma.

@@ -19,6 +19,7 @@ from validation.comparators.polynomial_model import PolynomialModel
 from validation.comparators.prediction_error import arx_polynomials, best_end, monic, shifted
 from validation.comparators.stable_sections import stabilised
 
+# The polynomial 1.
 _ONE = np.ones(1)
 
 

@@ -13,6 +13,7 @@ from validation.blind.workshop.plans import Controller
 from validation.blind.workshop.sizes import tolerances_away
 
 Sort = Literal["none", "single", "pair", "unlisted"]
+# Share of the motion that does not matter, as every case states it.
 MODEL_ERROR = 0.05
 
 
@@ -26,7 +27,25 @@ def answer_of(
     sizes: dict[str, Any],
     left: Real,
 ) -> dict[str, Any]:
-    """As the answer files of the labelled cases."""
+    """The label of a workshop case, as the answer files of labelled cases have it.
+
+    Parameters
+    ----------
+    sort : {"none", "single", "pair", "unlisted"}
+    machine : Workshop
+    closed : bool
+        Whether all records were made in closed loop.
+    controller : str
+        Which one.
+    effects : list of tables
+        That are hidden, with their sizes.
+    designed : dict
+        By effect: its gap over that of the background, as its size was chosen.
+    sizes : dict
+        Gaps as they came out (`bench.measured_sizes`).
+    left : array
+        Predicted rms of the background in held-out records, by output.
+    """
     hidden = sort == "unlisted"
     noise = machine.noise
     background = asdict(machine.background)

@@ -16,7 +16,9 @@ from validation.blind.workshop.nominal import Log, Nominal
 from validation.blind.workshop.plans import Run
 from validation.blind.workshop.sizes import tolerances_away
 
-_WIDEST_RAD = 2.6  # hub angle from the start of a record
+# Largest hub angle from the start of a record.
+_WIDEST_RAD = 2.6
+# Substeps of a sample at most: a stiffer machine takes too long, and another one is drawn.
 _MOST_SUBSTEPS = 160
 
 

@@ -26,12 +26,19 @@ from validation.blind.workshop.sizes import (
     unlisted,
 )
 
+# Shares of a set of cases.
 SHARES: dict[Sort, float] = {"none": 0.25, "single": 0.4, "pair": 0.2, "unlisted": 0.15}
-_BACKGROUND = (0.02, 0.035)  # of the motion, root mean square, held out, after a refit
-_MAJOR = (3.5, 8.0)  # over the background
+# Rms of what the background leaves after a refit, held out, over the motion.
+_BACKGROUND = (0.02, 0.035)
+# Gap of an effect over that of the background, as its size is chosen.
+_MAJOR = (3.5, 8.0)
+# And as it comes out.
 _REALISED = (2.0, 16.0)
-_CLOSE_ENOUGH = 0.12  # in the logarithm of a wanted size
+# Distance from a wanted size, in its logarithm, that is close enough.
+_CLOSE_ENOUGH = 0.12
+# Draws until a case is given up.
 _TRIES = 40
+# How often a record lacks some rows.
 _SHARE_WITH_LOST_ROWS = 0.12
 
 

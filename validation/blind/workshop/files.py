@@ -15,7 +15,9 @@ from validation.blind.workshop.answer import MODEL_ERROR
 from validation.blind.workshop.cases import WorkshopCase
 from workflow.engine.storage import write_text
 
+# One degree in radians.
 _DEGREE = float(np.pi / 180)
+# Standard gravity, m/s^2.
 _G = 9.80665
 # Quantity -> (column, scale) that users write.
 _COLUMNS: Mapping[str, tuple[tuple[str, float], ...]] = {
@@ -32,7 +34,9 @@ _COLUMNS: Mapping[str, tuple[tuple[str, float], ...]] = {
     "tip_acceleration_m_s2": (("acc_mg", _G / 1e3), ("acc_g", _G), ("a_tip", 1.0), ("acc_mg", -_G / 1e3)),
     "reference_rad": (("ref_deg", _DEGREE), ("soll [deg]", _DEGREE), ("w", 1.0), ("setpoint_rad", 1.0)),
 }
-_SHIFTED = ("laser [mm]", "camera_cm")  # their zero is somewhere
+# Columns whose zero is somewhere.
+_SHIFTED = ("laser [mm]", "camera_cm")
+# Digits of a value in a file.
 _SIGNIFICANT = 7
 
 

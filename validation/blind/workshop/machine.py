@@ -12,6 +12,7 @@ from validation.blind.rigs import Rig, draw_rig, log_uniform, off, rounded
 from validation.blind.truth import Background, Real
 
 Sensor = Literal["none", "tip", "acc"]
+# Second sensors: none, the tip position, its acceleration.
 SENSORS: tuple[Sensor, ...] = ("none", "tip", "acc")
 
 # Relative standard deviations are drawn between these.

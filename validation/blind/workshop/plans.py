@@ -15,7 +15,9 @@ from validation.blind.truth import Before, Feedback, OutOfBoundsError, Real, Tru
 Controller = Literal["none", "P", "PD"]
 # Effects that pull towards a hub angle of zero: an arm in open loop is started near it.
 _TURNING_BACK = ("gravity", "hardening_spring", "ground_spring")
-_LARGEST_BEND = 0.08  # deflection over length
+# Largest deflection over the length.
+_LARGEST_BEND = 0.08
+# Seconds that a machine runs before its record begins.
 _BEFORE_S = 1.2
 
 

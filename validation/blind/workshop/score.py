@@ -37,6 +37,7 @@ _FAMILIES = {
     "link": ("link_stiffness", "structural_damping", "tip_payload", "hub_inertia"),
     "sensor": ("sensor_lag", "sensor_gain", "sensor_drift", "quantisation"),
 }
+# Family of each effect.
 FAMILIES: Mapping[str, str] = MappingProxyType(
     {name: family for family, names in _FAMILIES.items() for name in names}
 )

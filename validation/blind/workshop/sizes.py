@@ -15,6 +15,7 @@ from validation.blind.sizes import NOT_TOGETHER, PARAMETRIC, Sizable, Table, siz
 from validation.blind.truth import LISTED, UNLISTED, WORKSHOP_UNLISTED, RigTable
 from validation.blind.workshop.machine import Sensor
 
+# Effects of a tip sensor.
 TIP_ONLY = frozenset({"sensor_lag", "sensor_gain", "sensor_drift", "quantisation", "sensor_clipping"})
 # Effects whose size has an end of its own; the others may grow beyond what the noise-sized cases need.
 _BOUNDED = frozenset(
@@ -30,8 +31,11 @@ _BOUNDED = frozenset(
         "asymmetric_dead_zone",
     }
 )
+# Largest sizes here, over those of the noise-sized cases.
 _LARGER = 8.0
+# Tolerances by which a parametric effect is off at least.
 LEAST_TOLERANCES = 5.0
+# Pairs that no record of a workshop could tell from one of them.
 _NEVER = (*NOT_TOGETHER, {"joint_compliance", "base_compliance"}, {"sensor_gain", "sensor_lag"})
 
 
