@@ -38,7 +38,7 @@ from workflow.tasks.results import RunResults
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, encoded_arm
 from workflow.tasks.stage import StageInput
 from workflow.tasks.stages import STAGES
-from workflow.text.templates import said
+from workflow.text.sentences.certificate import requirement
 
 REACH_PERCENT = 5.0
 BAND_RAD_S = (0.5, 120.0)
@@ -157,7 +157,7 @@ def several_payloads(out: Print, config: RunConfig, folder: Path) -> None:
     controller, certificate = designed(plants, config.model_copy(update={"specification": free}))
     bounds = {verdict.plant: verdict.worst_peak_sensitivity for verdict in certificate.plants}
     out("2. One controller for payloads 0, 20, 40 g (arms identified one by one), measured there and between")
-    missed = "; ".join(said("requirement", item) for item in certificate.items if not item.met)
+    missed = "; ".join(requirement(item) for item in certificate.items if not item.met)
     verdict = "yes" if certificate.certified else f"NO ({missed or 'not proved between grid points'})"
     out(f"   certified: {verdict}, gamma {certificate.gamma:.4f}")
     out("   payload  certified  measured, 0.2 rad rms     off %")

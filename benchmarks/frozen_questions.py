@@ -151,16 +151,23 @@ def of_run(summary: Any) -> Answer:
     return answer.answer
 
 
+def summary_of_run(config: Any, folder: Path) -> Any:
+    """The `RunSummary` of a whole run into a folder."""
+    from workflow.describe.run import summarise
+    from workflow.tasks.pipeline import run_pipeline
+
+    return summarise(run_pipeline(config, folder), config)
+
+
 def example(name: str, golden: bool = True) -> Answer:
     """A whole run of an example: its numbers, and which of its margins are off `margins.toml`."""
     from tests.golden import margins
     from workflow.config.run_config import load_config
-    from workflow.tasks.pipeline import run_pipeline
 
     os.environ["FLEXLINK_DATA"] = str(DATA)
     config, _ = load_config(ROOT / "examples" / f"{name}.toml")
     with scratch() as folder:
-        answer = of_run(run_pipeline(config, folder / "run"))
+        answer = of_run(summary_of_run(config, folder / "run"))
         off = margins.moved(name, margins.of_run(folder / "run"))
     answer["said"]["off tests/golden/margins.toml"] = sorted(off)
     return answer
@@ -203,7 +210,7 @@ def resumed() -> Answer:
     config = load_config(FAST_ARM)[0]
     answer = Kept()
     with scratch() as folder:
-        answer.answer |= of_run(run_pipeline(config, folder / "whole"))
+        answer.answer |= of_run(summary_of_run(config, folder / "whole"))
         call = [sys.executable, "-c", _KILLED, FAST_ARM, folder / "stopped"]
         answer("said", killed=subprocess.run(call, cwd=ROOT, check=False).returncode)
         answer("said", stages_before=sorted(path.name for path in (folder / "stopped" / "stages").iterdir()))
@@ -278,11 +285,10 @@ def joints_run() -> Answer:
     """A whole run for two simulated joints, as small as tests have it."""
     from tests.workflow.test_joints import _JOINTS, _REST, _SOURCE
     from workflow.config.joints_config import load_any
-    from workflow.tasks.pipeline import run_pipeline
 
     with scratch() as folder:
         (folder / "two.toml").write_text(_SOURCE + _JOINTS + _REST)
-        summary = run_pipeline(load_any(folder / "two.toml")[0], folder / "run")
+        summary = summary_of_run(load_any(folder / "two.toml")[0], folder / "run")
     answer = Kept()
     answer("said", certified=summary.certified)
     answer("lines", verdict=summary.verdict)
@@ -415,7 +421,6 @@ def loop_run(folder_of_logs: Path, rows: int | None = None) -> Answer:
 
     from workflow.config.run_config import load_config
     from workflow.engine.errors import InputError, StageError
-    from workflow.tasks.pipeline import run_pipeline
 
     with scratch() as folder:
         (folder / "logs").mkdir()
@@ -431,7 +436,7 @@ def loop_run(folder_of_logs: Path, rows: int | None = None) -> Answer:
             document.setdefault(section, tomlkit.table()).update(values)
         (folder / "my.toml").write_text(tomlkit.dumps(document), "utf-8")
         try:
-            of_the_run = of_run(run_pipeline(load_config(folder / "my.toml")[0], folder / "run"))
+            of_the_run = of_run(summary_of_run(load_config(folder / "my.toml")[0], folder / "run"))
         except (InputError, StageError) as error:
             of_the_run = {"lines": {"refused": str(error).replace(f"{folder}/", "")}}
     return {kind: answer.get(kind, {}) | of_the_run.get(kind, {}) for kind in {**answer, **of_the_run}}

@@ -33,7 +33,7 @@ from control_design.specification.requirement import LoopFunction
 from ident import Poles
 from ident.basis.functions import basis_response, basis_state_space
 from ident.uncertainty import ResponsePosterior
-from workflow.text.templates import said
+from workflow.text.sentences.design import outcome
 
 DT_S = 0.005
 LOW_EFFORT = SynthesisOptions(
@@ -276,13 +276,13 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
         if result.outcome is Outcome.NOT_CONVERGED:
             counts["full effort"] += 1
             out(f"{head}no stable design with low effort; with the default options:")
-            out(f"       {said('outcome', result)}")
+            out(f"       {outcome(result)}")
             result = synthesise([plant], specification, rng=np.random.default_rng(seed))
         if result.outcome is Outcome.NOT_CONVERGED:
             counts["not converged"] += 1
             counts["silent"] += not result.blocking
             out(f"{head}no stable design found")
-            out(f"       {said('outcome', result)}")
+            out(f"       {outcome(result)}")
             continue
         counts["designs"] += 1
         certificate, spent = timed(partial(certify, result.controller, [plant], specification))
@@ -306,7 +306,7 @@ def run(out: Print, *, first_seed: int = 0, seeds: int = 200) -> None:
             out(f"       {proof.obstacle.value}")
         if result.outcome is Outcome.NOT_MET:
             counts["silent"] += not result.blocking
-            out(f"       {said('outcome', result)}")
+            out(f"       {outcome(result)}")
     out()
     out(", ".join(f"{key} {value}" for key, value in counts.items()))
     out(MEANING)

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from workflow.commands.logs import Reading
     from workflow.config.settings import ModelT
     from workflow.console import TerminalProgress
-    from workflow.text.templates import RunSummary
+    from workflow.describe.summary import RunSummary
 
 _READING = (
     *("input_name", "output_name", "reference", "time", "time_unit", "dt_s"),

@@ -21,7 +21,7 @@ from workflow.engine import interrupts, progress
 from workflow.engine.errors import printable
 
 if TYPE_CHECKING:
-    from workflow.text.templates import RunSummary
+    from workflow.describe.summary import RunSummary
 
 
 FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0
@@ -158,7 +158,7 @@ class TerminalProgress(progress.Progress):
 
 def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
     """The table of numbers on standard output, and the verdict where it is no complaint on standard error.
-    verbose: every row."""
+    verbose: rows of parts, too."""
     from workflow.text.formats import BARS  # numpy, which a command that only says its version can do without
 
     # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
@@ -169,13 +169,15 @@ def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
     # Names of columns are folded, not cut: what tells two of them apart may stand at the end.
     table.add_column("quantity", overflow="fold")
     table.add_column("value", overflow="fold")
-    for section in (not verbose and summary.brief) or summary.sections:
-        for index, row in enumerate(section.rows):
-            label = _text(section.title) if index == 0 else ""
-            value: str | Text = _text(row.value)
-            if row.value and not set(row.value) - set(BARS):
-                value = Text(row.value, overflow="ellipsis", no_wrap=True)  # a curve is no use in two lines
-            table.add_row(label, _text(row.label), value, end_section=index == len(section.rows) - 1)
+    for section in summary.sections:
+        for part in section.whole() if verbose else (section,):
+            for index, row in enumerate(part.rows):
+                title = _text(part.title) if index == 0 else ""
+                value: str | Text = _text(row.text)
+                if row.text and not set(row.text) - set(BARS):
+                    # A curve is no use in two lines.
+                    value = Text(row.text, overflow="ellipsis", no_wrap=True)
+                table.add_row(title, _text(row.name), value, end_section=index == len(part.rows) - 1)
     console.print(table)
     if summary.certified is not False:
         console.print(_text(summary.verdict), highlight=False, soft_wrap=True)

@@ -6,12 +6,14 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.workflow.command import FAST_ARM, build_nothing, draw_nothing
 from tests.workflow.study_examples import write_study
-from workflow.text.templates import Row, RunSummary, TableSection
+from workflow.describe.facts import Quantity, Row, Section
+from workflow.describe.summary import RunSummary
 
 MakeOnce = Callable[[str, Callable[[Path], RunSummary | None]], tuple[Path, RunSummary | None]]
 
@@ -29,16 +31,26 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> MakeOnce:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not (kept / "value").exists():
                 value = make(kept / "out")
-                (kept / "value").write_text(json.dumps(None if value is None else vars(value)))
+                (kept / "value").write_text(json.dumps(None if value is None else _plain(value)))
         out = tmp_path_factory.mktemp(name) / "out"
         shutil.copytree(kept / "out", out, symlinks=True)
         value = json.loads((kept / "value").read_text())
         if value is None:
             return out, None
-        tables = [TableSection(title, [Row(*row) for row in rows]) for title, rows in value.pop("sections")]
+        tables = [
+            Section(title, tuple(Row("", name, Quantity.words(text)) for name, text in rows))
+            for title, rows in value.pop("sections")
+        ]
         return out, RunSummary(sections=tables, **value)
 
     return once
+
+
+def _plain(summary: RunSummary) -> dict[str, Any]:
+    """A summary as JSON; its rows without their keys."""
+    parts = [part for section in summary.sections for part in section.whole()]
+    sections = [(part.title, [(row.name, row.text) for row in part.rows]) for part in parts]
+    return {**vars(summary), "sections": sections}
 
 
 @pytest.fixture(scope="session")

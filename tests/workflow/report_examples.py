@@ -31,7 +31,8 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.tasks import closed_loop as closed_loop_stage, results as kept, uncertainty as uncertainty_stage
 from workflow.tasks.identification import as_fitted
 from workflow.tasks.loop_conditions import condition_run
-from workflow.text.templates import said
+from workflow.text.sentences.certificate import requirement
+from workflow.text.sentences.design import outcome
 
 DT_S = 0.01
 INPUT = "voltage_V"
@@ -269,10 +270,10 @@ def _save_design(run: RunDirectory, settings: RunConfig, gain: float, impossible
         gamma_history=(certificate.gamma,),
         grid_points=200,
     )
-    run.save_stage("design", kept.DesignResult(result, met, said("outcome", result)), "00")
+    run.save_stage("design", kept.DesignResult(result, met, outcome(result)), "00")
     run.save_stage("achievable_performance", achievable(), "00")
     run.save_stage("reference_filter", kept.ReferenceFilterResult(), "00")
-    reason = "; ".join(said("requirement", item) for item in certificate.items if not item.met) or "met"
+    reason = "; ".join(requirement(item) for item in certificate.items if not item.met) or "met"
     sampled = sampled_responses(certificate.gamma)
     run.save_stage("certify", kept.CertifyResult(certificate, certificate.certified, reason, sampled), "00")
     run.save_stage("closed_loop", kept.ClosedLoopResult(check=loop_check(settings, settled)), "00")

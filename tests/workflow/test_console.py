@@ -13,7 +13,8 @@ import pytest
 
 from tests.workflow.command import ROOT
 from workflow import console
-from workflow.text.templates import Row, RunSummary, TableSection
+from workflow.describe.facts import Quantity, Row, Section
+from workflow.describe.summary import RunSummary
 
 
 @pytest.fixture
@@ -119,7 +120,8 @@ def test_tables_in_a_pipe_are_as_wide_as_asked(asked, width, capsys, monkeypatch
     monkeypatch.delenv("COLUMNS", raising=False)
     if asked is not None:
         monkeypatch.setenv("COLUMNS", asked)
-    console.print_summary(RunSummary("arm", [TableSection("model", [Row("modes", "7.6 Hz " * 40)])]))
+    modes = Row("", "modes", Quantity.words("7.6 Hz " * 40))
+    console.print_summary(RunSummary("arm", [Section("model", (modes,))]))
     assert max(map(len, capsys.readouterr().out.splitlines())) == width
 
 

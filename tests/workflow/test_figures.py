@@ -20,6 +20,7 @@ from ident.data.record import Record
 from ident.uncertainty import FrequencyUncertainty
 from plant import paper_link
 from tests.workflow import report_examples as example
+from workflow.describe.run import summarise
 from workflow.figures import style
 from workflow.figures.bands import (
     degrees_near,
@@ -44,7 +45,6 @@ from workflow.figures.validation import draw_repeat_scatter
 from workflow.report import rendering
 from workflow.tasks.experiment import ExperimentLimits, plan_experiment
 from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
-from workflow.tasks.summary import summarise
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))
 HOSTILE = "a_$very$_<b>long</b> name & 漢 of a column that goes on and on and on"

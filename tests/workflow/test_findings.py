@@ -12,7 +12,8 @@ from ident.data.finding import FindingKind, finding
 from workflow.cli import app
 from workflow.config.uncertainty_options import UncertaintyOptions
 from workflow.text.options import OPTIONS, speaking
-from workflow.text.templates import said, words
+from workflow.text.sentences.records import unexplained_logs
+from workflow.text.templates import words
 
 STORED = Path(__file__).parent / "data" / "findings.txt"
 # One value for every name that any sentence asks for.
@@ -144,10 +145,10 @@ def test_hints_of_a_configuration_name_its_keys():
 def test_a_loop_that_no_model_explains_is_told_about_dry_friction():
     """Where nobody looked for friction: with the option of the command that refuses."""
     with speaking("identify"):
-        refused = said("unexplained_logs", "enc", "its best fit to one is 49 %", False)
+        refused = unexplained_logs("enc", "its best fit to one is 49 %", friction_known=False)
     assert "dry friction is a common cause: if 'enc' is the position" in refused
     assert '(--response "without friction")' in refused
     assert "as recorded" not in refused
-    looked = said("unexplained_logs", "enc", "its best fit to one is 49 %", True)
+    looked = unexplained_logs("enc", "its best fit to one is 49 %", friction_known=True)
     assert "common cause" not in looked
     assert "as recorded" not in looked  # it would have a wrong damping

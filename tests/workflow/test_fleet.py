@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workflow.describe.summary import RunSummary
 from workflow.diagnose import command, fleet
 from workflow.engine import codec
 from workflow.engine.executor import Failure
-from workflow.text.templates import RunSummary
 
 
 def machine(name: str, level: float | None = None, value: float = 1.0, **more) -> fleet.FleetMachine:

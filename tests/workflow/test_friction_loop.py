@@ -17,6 +17,7 @@ from ident.friction.arm import SteppedArm
 from ident.friction.spring import Spring
 from plant import SampledArm, paper_link, parse_effect
 from workflow.config.run_config import built_in_config
+from workflow.describe.friction import settle, settling_range, stands_still
 from workflow.tasks.friction_loop import (
     FrictionLoop,
     beside_recorded,
@@ -27,7 +28,6 @@ from workflow.tasks.friction_loop import (
     soonest,
 )
 from workflow.tasks.results import SettlingRange, SlowSine
-from workflow.text.templates import said
 
 DT_S = 0.005
 POLES = Poles(np.array([0.97]), np.array([0.93 + 0.24j]))
@@ -128,7 +128,7 @@ def test_a_sine_moves_the_arm_from_where_its_command_meets_the_friction():
         for share, y in zip((0.9, 2.0), runs, strict=True)
     ]
     assert [sine.stands_still for sine in sines] == [True, False]
-    told = [said("stands_still", sine, "rad", False) for sine in sines]
+    told = [stands_still(sine, "rad", feedforward=False) for sine in sines]
     assert "the arm stands still on a sine of 0.00" in told[0]
     assert "friction_feedforward = true in [closed_loop] takes the rms error" in told[0]
     assert told[1] == ""
@@ -350,15 +350,12 @@ def test_range_and_median_over_sizes():
     assert (some.worst_s, some.median_s) == (None, 2.0)
     none = SettlingRange((0.5, 1.0, 2.0), (None, None, 1.0), 30.0)
     assert none.median_s == np.inf
-    told = [
-        said("settling_range", each)
-        for each in (crowded, some, SettlingRange((1.0, 2.0), (2.71, 2.71), 30.0))
-    ]
+    told = [settling_range(each) for each in (crowded, some, SettlingRange((1.0, 2.0), (2.71, 2.71), 30.0))]
     assert told == ["1 to 9 s", "0.2 to over 30 s", "2.7 to 2.8 s"]
-    assert said("settling_range", SettlingRange((1.0, 2.0), (None, None), 30.0)) == "over 30 s"
-    assert said("settle", none) == "settle to 2 % in 1 to over 30 s"
+    assert settling_range(SettlingRange((1.0, 2.0), (None, None), 30.0)) == "over 30 s"
+    assert settle(none) == "settle to 2 % in 1 to over 30 s"
     never = SettlingRange((1.0, 2.0), (None, None), 30.0)
-    assert said("settle", never) == "do not settle to 2 % in 30 s"
+    assert settle(never) == "do not settle to 2 % in 30 s"
 
 
 def test_predicted_response_is_that_of_the_nonlinear_arm():

@@ -2,8 +2,8 @@
 
 from control_design import Specification
 from control_design.specification.specification import Effort, ModePeak, Tracking
+from workflow.describe.design import gave_way_beside, gave_way_text
 from workflow.tasks.giving_way import gave_way
-from workflow.text.templates import said
 
 _ASKED = Specification(
     bandwidth_rad_s=10.0,
@@ -23,13 +23,13 @@ def test_what_gave_way_is_told_with_both_values_beside_its_line():
         ("effort_limit", 2.2, 2.31, 8.8),
     ]
     # The bandwidth has words of its own (`lowered`).
-    assert said("gave_way", found) == "effort_limit = 2.31 in place of 2.2"
-    beside = {name: said("gave_way_beside", name, found) for name in (Tracking.caption, ModePeak.caption)}
+    assert gave_way_text(found) == "effort_limit = 2.31 in place of 2.2"
+    beside = {name: gave_way_beside(name, found) for name in (Tracking.caption, ModePeak.caption)}
     assert beside == {
         Tracking.caption: "(bandwidth_rad_s gave way: 1 in place of 10)",
         ModePeak.caption: "",
     }
-    assert "2.31 in place of 2.2" in said("gave_way_beside", Effort.caption, found)
+    assert "2.31 in place of 2.2" in gave_way_beside(Effort.caption, found)
 
 
 def test_what_is_as_asked_or_hard_gave_no_way():
@@ -38,4 +38,4 @@ def test_what_is_as_asked_or_hard_gave_no_way():
     assert gave_way(_ASKED, None) == ()
     other = Specification(bandwidth_rad_s=5.0, effort_limit=9.0)
     assert gave_way(Specification(bandwidth_rad_s=10.0, effort_limit=2.2), other) == ()
-    assert said("gave_way", ()) == ""
+    assert gave_way_text(()) == ""

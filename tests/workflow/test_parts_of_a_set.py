@@ -11,11 +11,11 @@ from benchmarks.closed_loop_machines.judge import worst_of
 from ident.friction import RateMember
 from tests.workflow import report_examples as example
 from workflow.config.design_file import DesignFile
+from workflow.describe.run import uncertainty_numbers
 from workflow.engine.run_directory import RunDirectory
 from workflow.report.pages import write_report
 from workflow.tasks.design_source import load_sources
 from workflow.tasks.results import RunResults, UncertainChannel, UncertaintyResult
-from workflow.tasks.summary import uncertainty_numbers
 from workflow.tasks.uncertainty import uncertain_channel
 
 

@@ -16,15 +16,20 @@ from control_design.convex.reference_filter import ReferenceFilter
 from control_design.plants.plant_set import Mode
 from ident.data.finding import FindingKind, finding
 from tests.workflow import report_examples as example
+from workflow.describe.closed_loop import not_the_arm
+from workflow.describe.design import design_verdict
+from workflow.describe.friction import friction_range
+from workflow.describe.run import summarise
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.style import drawings
 from workflow.report.pages import write_report
 from workflow.tasks import pipeline
 from workflow.tasks.exports import Logged
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
-from workflow.tasks.summary import summarise
 from workflow.text.formats import at_least, at_most, bound
-from workflow.text.templates import environment, said, words
+from workflow.text.sentences.certificate import not_checked
+from workflow.text.sentences.design import lowered
+from workflow.text.templates import environment, words
 
 ATTACK = "<script>alert(1)</script>"
 
@@ -145,8 +150,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(drawn):
     for item in certificate.items:
         assert bound(item.achieved, item.at_least) in text
     # Responses were sampled in a stage of their own, and the page says that instead.
-    standing = environment().get_template("certificate.j2").module
-    opened = standing.not_checked(certificate, True, True).splitlines()
+    opened = not_checked(certificate, sampled=True, friction=True)
     assert "all frequencies together: checked on models drawn from the posterior, not certified" in opened
     for line in opened:
         assert line[1:] in text
@@ -183,8 +187,7 @@ def test_an_unstable_loop_has_no_margins_and_a_line_of_its_own_for_what_is_not_p
     text = text_of(run, example.config())
     assert "gain may rise by" not in text
     assert re.search(r"the nominal loop is unstable \(largest pole radius [1-9][\d.]*\)", text)
-    standing = environment().get_template("certificate.j2").module
-    opened = standing.not_checked(RunResults(run).certify.certificate).splitlines()
+    opened = not_checked(RunResults(run).certify.certificate, sampled=False)
     assert opened[0].endswith("not proved: the loop is not robustly stable on the dense grid")
 
 
@@ -277,7 +280,7 @@ def test_a_design_that_takes_damping_from_a_mode_says_so(unbuilt, tmp_path):
         assert (lost in summary.verdict) == told
         changes = summary.numbers["certificate"]["plants"][0]["mode_changes"]
         assert changes[1]["closed_loop"]["zeta"] == after
-        design = said("design_verdict", results.design, changed.certificate, "")
+        design = design_verdict(results.design, changed.certificate, "")
         # A design from a plant alone has no identified modes to compare with.
         assert (lost in design) == (after == 0.011)
     doubt, spread = finding(FindingKind.UNTRIED_FRICTION, output="enc"), results.uncertainty
@@ -301,7 +304,7 @@ def test_a_mode_of_several_plants_is_named_once_where_it_loses_most(tmp_path):
         replace(certificate.plants[0], plant=f"load {k}", mode_changes=(change, change))
         for k, change in enumerate(changes)
     ]
-    said_of = said("design_verdict", results.design, replace(certificate, plants=tuple(plants)), "")
+    said_of = design_verdict(results.design, replace(certificate, plants=tuple(plants)), "")
     assert said_of.count("the mode at 12.6 Hz loses damping") == 1
     assert "load 1: the mode at 12.6 Hz loses damping: 0.02 in open loop, 0.004 in closed loop" in said_of
 
@@ -397,20 +400,20 @@ def test_friction_range_says_which_bound_holds_and_which_way_friction_moves_the_
         tolerance_percent=5.0, certified_peak=1.676, nominal_peak=1.51, certified_from=0.001,
         linear_from=None, sizes=np.array([0.1, 0.01]), low=np.array([1.2, 1.0]), high=np.array([1.3, 1.1]),
     )  # fmt: skip
-    told = said("friction_range", check, "rad")
+    told = friction_range(check, "rad")
     assert "predicted to be at most 5 % above the certified 1.676 for references from 0.001 rad" in told
     assert "1.51, is lowered by friction by more than 5 %, even at the largest size" in told
     check.nominal_peak = 1.1
-    assert "1.1, is raised by friction" in said("friction_range", check, "rad")
+    assert "1.1, is raised by friction" in friction_range(check, "rad")
 
 
 def test_a_lowered_bandwidth_says_which_of_the_three_is_which():
     asked = SimpleNamespace(bandwidth_rad_s=19.0, lowest_bandwidth_rad_s=3.0)
     found = SimpleNamespace(bandwidth_rad_s=8.82)
-    told = said("lowered", asked, found, [], 12.2)
+    told = lowered(asked, found, [], 12.2)
     assert told.startswith("bandwidth_rad_s = 19 was not met; ")
     assert told.endswith("designed for 8.82 rad/s; reaches at least 12.2 rad/s")
-    assert said("lowered", asked, asked, [], 12.2) == ""
+    assert lowered(asked, asked, [], 12.2) == ""
 
 
 @pytest.mark.parametrize(("delay", "scales"), [(0, (1.0, 1.0)), (1, (57.3, -2.0))])
@@ -505,7 +508,6 @@ def test_what_is_measured_counts_beyond_its_noise():
     assert row.beyond_bandwidth(1.9) is None
     assert row.beyond_bandwidth(2.1) == 1
     rows = SimpleNamespace(sensitivity=SimpleNamespace(measured=(row, row, replace(row, name="other"))))
-    macro = environment().get_template("numbers.j2").module.not_the_arm
     effects = [{"name": "tip_payload"}]
-    assert macro(None, 5.0, effects).strip() == macro(rows, 1.9, effects).strip() == ""
-    assert macro(rows, 2.1, effects).strip().endswith("and with tip_payload")
+    assert not_the_arm(None, 5.0, effects) == not_the_arm(rows, 1.9, effects) == ""
+    assert not_the_arm(rows, 2.1, effects).endswith("and with tip_payload")

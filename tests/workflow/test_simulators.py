@@ -691,7 +691,7 @@ def test_a_symbol_with_an_index_states_no_unit(tmp_path):
         loaded = swivel_case(tmp_path, name)
         summary = check.of_case(loaded, telling(loaded.case))
         (sizes,) = [section for section in summary.sections if section.title == "smallest size that shows"]
-        assert {row.label: row.value for row in sizes.rows}[name].endswith(said)
+        assert {row.name: row.text for row in sizes.rows}[name].endswith(said)
 
 
 def test_advice_stays_a_sentence_and_names_are_those_of_the_model():

@@ -8,11 +8,11 @@ import pytest
 
 from plant import linear_arm
 from workflow.config.run_config import built_in_config
+from workflow.describe.identification import pair_kind, true_mode
 from workflow.engine.errors import InputError
 from workflow.tasks import simulated_rig as truth
 from workflow.tasks.results import IdentifiedChannel, ModelMode
 from workflow.tasks.simulated_rig import rig_of
-from workflow.text.templates import said
 
 
 def found_in(pairs, longest_s=8.0):
@@ -42,9 +42,9 @@ def test_a_pair_that_is_no_mode_says_so_and_has_no_truth():
     matched = truth.beside(found, true)
     assert matched == (None, true[0], None, None)
     none = "slow or overdamped pair"
-    assert [said("pair_kind", found, mode) for mode in found.modes] == [none, "mode", "mode", none]
-    assert said("true_mode", matched, 1) == "true (linear arm): 7.6 Hz, damping 0.01"
-    assert said("true_mode", matched, 2) == said("true_mode", (), 0) == ""
+    assert [pair_kind(found, mode) for mode in found.modes] == [none, "mode", "mode", none]
+    assert true_mode(matched[1]) == "7.6 Hz, damping 0.01"
+    assert true_mode(matched[2]) == ""
 
 
 def test_truth_is_read_beside_the_logs_of_one_folder_only(tmp_path):

@@ -34,13 +34,13 @@ from validation.blind.seal import (
 from validation.blind.worker import BlindCase, diagnose_folder, failed
 from validation.blind.workshop.cases import SHARES
 from validation.blind.workshop.score import FAMILIES
+from workflow.describe.summary import RunSummary
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.executor import Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.storage import read_json, sha256_of_file, write_bytes, write_json, write_text
 from workflow.engine.store import Store
-from workflow.text.templates import RunSummary
 
 # Format of a run; one of another format is not resumed.
 _FORMAT = "flexlink-blind-1"

@@ -13,8 +13,10 @@ import pandas as pd
 from markupsafe import Markup
 
 from validation.blind.truth import LISTED
+from workflow.describe.facts import Quantity, Row, Section
+from workflow.describe.summary import RunSummary
 from workflow.figures.matplotlib_figure import house_style, new_figure
-from workflow.text.templates import Row, RunSummary, TableSection, environment
+from workflow.text.templates import environment
 
 # Columns of the table: cases by what is known of the nominal machine.
 _SLICES = ("all", "exact", "uncertain")
@@ -67,12 +69,12 @@ def summary(document: Mapping[str, Any], out: Path) -> RunSummary:
     sections = []
     for part in _SLICES:
         rows = tuple(
-            Row(name, cell(numbers))
+            Row("", name, Quantity.words(cell(numbers)))
             for name, numbers in scored["table"][part].items()
             if numbers["count"] and (part == "all" or name != _CPU)
         )
         if rows:
-            sections.append(TableSection(part if part == "all" else f"{part} nominal", rows))
+            sections.append(Section(part if part == "all" else f"{part} nominal", tuple(rows)))
     right = scored["table"]["all"]["verdict and set right, every case"]
     return RunSummary(
         title="Blind protocol",
@@ -102,7 +104,7 @@ def confusion_figure(scored: Mapping[str, Any]) -> bytes:
                 colour = "white" if share[i, j] > 0.6 else "black"
                 axes.text(j, i, f"{n:.0f}", ha="center", va="center", color=colour)
         axes.set_xticks(range(len(columns)), [c.replace("_", " ") for c in columns], rotation=90)
-        axes.set_yticks(range(len(rows)), [r.replace("_", " ") for r in rows])
+        axes.set_yticks(range(len(tuple(rows))), [r.replace("_", " ") for r in rows])
         axes.set_xlabel("first answer")
         axes.set_ylabel("truth")
         axes.set_title("Blind cases with one cause or none: truth against answer")

@@ -26,6 +26,8 @@ from validation.paper.findings import CLOSE_TO_BEST, PEERS, Findings, findings_o
 from validation.paper.methods import BETTER_STARTS, JUDGED_BAND_RAD_S, METHODS
 from validation.paper.quotes import OPEN_CHOICES, REPORTED, SOURCE
 from validation.paper.settings import PaperSettings
+from workflow.describe.facts import Quantity, Row, Section
+from workflow.describe.summary import RunSummary
 from workflow.engine.codec import plain_text
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
@@ -34,7 +36,7 @@ from workflow.engine.store import Store
 from workflow.figures.description import Picture
 from workflow.figures.svg import COMMON_STYLE, alone, drawn, style_of
 from workflow.report.rendering import embedded
-from workflow.text.templates import Row, RunSummary, TableSection, environment
+from workflow.text.templates import environment
 
 # The page.
 PAGE = "paper.html"
@@ -178,7 +180,9 @@ def _summary(out: Path, document: Mapping[str, Any]) -> RunSummary:
     return RunSummary(
         title="Ziaei & Wang 2006, redrawn",
         sections=tuple(
-            TableSection(f"Fig. {item['figure']}", (Row(verdicts[item["agrees"]], item["found"]),))
+            Section(
+                f"Fig. {item['figure']}", (Row("", verdicts[item["agrees"]], Quantity.words(item["found"])),)
+            )
             for item in figures
         ),
         numbers=document,

@@ -14,13 +14,14 @@ from control_design.specification import Specification
 from ident.data.settings import meant
 from workflow.config.command_files import CommandFiles
 from workflow.config.design_file import DesignFile
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.system_documents import refuse_broken_files
-from workflow.text.templates import RunSummary, rows_of, said, words
+from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from control_design.analysis.certificate import Certificate
@@ -150,6 +151,8 @@ def certify_controller(
     # What is refused does not wait for what certifies: that takes seconds to load.
     from control_design.controllers.engineers_numbers import engineers_numbers
     from workflow.commands.design import at_one_bandwidth, load_asked, of_run
+    from workflow.describe.certify import certify_sections
+    from workflow.describe.design import guard_verdict
     from workflow.tasks.design import certify_asked
     from workflow.tasks.system_files import read_law
 
@@ -186,25 +189,11 @@ def certify_controller(
     worse = [
         (name, key, *told) for name, of in held.items() for key, told in of.items() if told[2] == "worse"
     ]
-    worst = {
-        name: (max if name == "gamma" else min)(found, key=lambda plant: found[plant][name])
-        for name in _TOLERANCES
-    }
     doubts = [words(doubt) for doubt in done.certificate.warnings]
     numbers = engineers_numbers(law)
-    shown: dict[str, Any] = {
-        "sources": sources,
-        "law": law,
-        "numbers": numbers,
-        "worst": worst,
-        "found": found,
-        "held": held,
-        "certificate": done.certificate,
-    }
     return RunSummary(
         title=f"certificate of {controller}",
-        sections=rows_of("summary/certify.j2", whole=True, **shown),
-        brief=rows_of("summary/certify.j2", whole=False, **shown),
+        sections=certify_sections(sources, law, done.certificate, found, held),
         numbers={
             "plants": [{"plant": source.plant.name, "origin": source.origin} for source in sources],
             "controller": str(controller),
@@ -222,5 +211,5 @@ def certify_controller(
             },
         },
         certified=done.certified and not worse,
-        verdict=said("guard_verdict", done, worse, baseline, written, ". Also, ".join(doubts)),
+        verdict=guard_verdict(done, worse, baseline, written, ". Also, ".join(doubts)),
     )

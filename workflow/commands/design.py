@@ -12,6 +12,11 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import GIVES_WAY, Specification
 from workflow.commands.design_page import refuse_page, write_design_page
 from workflow.config.design_file import DesignFile
+from workflow.describe.certificate import certificate_section, not_checked_section
+from workflow.describe.controller import controller_section
+from workflow.describe.design import design_section, design_verdict, filter_section, plants_section
+from workflow.describe.facts import Section, said, worded
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -36,7 +41,7 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     RunResults,
 )
-from workflow.text.templates import RunSummary, rows_of, said
+from workflow.text.sentences.design import order_advice
 
 
 def _design(
@@ -220,14 +225,14 @@ def design_controller(
                 page,
                 progress,
             )
-
-    # What is said of it.
     advice = None
     if gamma is not None and gamma > 1:
-        advice = said("order_advice", achievable, gamma, order, specification.structure) or None
+        advice = order_advice(achievable.bracket, gamma, order, specification.structure) or None
     given_way = gave_way(specification, design.specification)
-    reason = said("design_verdict", design, certify.certificate, advice, specification, given_way)
+    reason = design_verdict(design, certify.certificate, advice, specification, given_way)
     shares = joint_numbers(certify.sampled)
+    signals = logged[0].signals if logged else ""
+    scaled = signals if "as logged" in signals else ""
     names = [plant.name for plant in plants]
     about = [
         {
@@ -240,19 +245,18 @@ def design_controller(
     ]
     return RunSummary(
         title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
-        sections=rows_of(
-            "summary/design.j2",
-            sources=sources_found,
-            done={"design": design, "achievable": achievable, "reference_filter": prefilter},
-            order=order,
-            numbers=numbers,
-            delay=specification.computational_delay_samples,
-            advice=advice,
-            verdict=certify,
-            shares=shares,
-            files=files,
-            signals=logged[0].signals if logged else "",
-        ),
+        sections=[
+            plants_section(sources_found),
+            design_section(design, achievable, order, advice=advice or ""),
+            controller_section(numbers, specification.computational_delay_samples, scaled),
+            certificate_section(certify, shares),
+            not_checked_section(certify),
+            filter_section(prefilter),
+            Section(
+                "written",
+                said(worded("signals", scaled if files else ""), *(worded("", str(path)) for path in files)),
+            ),
+        ],
         numbers={
             "plants": about,
             "design": {

@@ -10,6 +10,7 @@ from typing import Any
 from control_design.specification import Specification
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import RunConfig
+from workflow.describe.run import title_of
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
@@ -24,7 +25,6 @@ from workflow.tasks.results import (
     RunResults,
 )
 from workflow.tasks.stages import PLANT, STAGES
-from workflow.tasks.summary import title_of
 
 # Sections of a run's configuration that a design file states in their place.
 _OF_DESIGN_FILE = ("synthesis", "certificate", "achievable_performance", "reference_filter")

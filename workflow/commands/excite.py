@@ -11,9 +11,9 @@ import numpy as np
 from ident.data.roles import is_position
 from workflow.commands.init import read_channel
 from workflow.commands.logs import Reading
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
-from workflow.text.templates import RunSummary, rows_of
 
 if TYPE_CHECKING:
     from workflow.tasks.experiment import ExperimentLimits
@@ -84,7 +84,9 @@ def write_reference(
     """
     RunDirectory(out).refuse_unless_free()
     read = read_channel("excite --closed-loop", logs, stated)
-    from workflow.tasks.reference_plan import plan_reference  # takes seconds to load
+    # Takes seconds to load.
+    from workflow.describe.reference import reference_sections
+    from workflow.tasks.reference_plan import plan_reference
 
     roles = read.roles
     position = is_position(roles.output, read.unit_of[roles.output])
@@ -103,7 +105,7 @@ def write_reference(
     storage.write_new_directory(out, texts)
     return RunSummary(
         title=str(out),
-        sections=rows_of("summary/reference.j2", found=plan, roles=roles, unit_of=read.unit_of),
+        sections=reference_sections(plan, read.unit_of[roles.input], read.unit_of[roles.output]),
         numbers=codec.plain(numbers),
         verdict=f"play {column} of each file; log {column}, {roles.input} and {roles.output} from its start",
     )

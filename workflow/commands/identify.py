@@ -10,6 +10,7 @@ from workflow.commands.logs import Logs
 from workflow.config.command_files import refuse_model_ending
 from workflow.config.run_config import ClosedLoopData
 from workflow.config.uncertainty_options import UncertaintyOptions
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import naming
 from workflow.engine.progress import Progress
@@ -22,7 +23,7 @@ from workflow.tasks.early_refusals import (
 )
 from workflow.text.formats import count
 from workflow.text.options import speaking
-from workflow.text.templates import RunSummary, rows_of, words
+from workflow.text.templates import words
 
 
 def identify_logs(
@@ -80,13 +81,15 @@ def identify_logs(
     # What is refused does not wait for what identifies: that takes seconds to load.
     from ident.basis.model_files import ModelFile
     from ident.command_timing import timing_of, with_equivalent_command
+    from workflow.describe.identification import model_numbers
+    from workflow.describe.identify import identify_sections
+    from workflow.describe.uncertainty import uncertainty_numbers
     from workflow.tasks.exports import model_bytes
     from workflow.tasks.identification import made_in_loop
     from workflow.tasks.log_identification import identify_records
     from workflow.tasks.records import with_common_sampling_time
     from workflow.tasks.results import IdentifiedPlant
     from workflow.tasks.simulated_rig import beside, truth_beside
-    from workflow.tasks.summary import model_numbers, uncertainty_numbers
 
     steps = [("identify", 2.0), ("uncertainty", 1.0)]
     if report:
@@ -140,7 +143,7 @@ def identify_logs(
         spread = result.spread
         return RunSummary(
             title=f"{about.input} to {about.output}",
-            sections=rows_of("summary/identification.j2", result=result),
+            sections=identify_sections(result),
             numbers={
                 **model_numbers(about),
                 "warnings": [words(item) for item in result.careful],

@@ -14,13 +14,15 @@ from ident.data.frf_records import FrfRepeats, measured_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty.nominal import nominal_near
 from workflow.config.command_files import refuse_model_ending
+from workflow.describe.identification import response_sections
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.tasks.exports import model_bytes
 from workflow.tasks.results import IdentifiedPlant
 from workflow.text.formats import count
-from workflow.text.templates import RunSummary, rows_of, words
+from workflow.text.templates import words
 
 
 def identify_response(
@@ -97,7 +99,7 @@ def identify_response(
     dt_s = fit.model.dt_s
     return RunSummary(
         title=f"frequency response {paths[0].name}",
-        sections=rows_of("summary/response.j2", found=fit, response=response),
+        sections=response_sections(fit, response),
         numbers={
             "order": fit.model.order,
             "dt_s": dt_s,

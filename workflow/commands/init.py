@@ -25,6 +25,8 @@ from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
 from workflow.commands.logs import Reading, to_type
+from workflow.describe.from_template import rows_of
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -37,7 +39,7 @@ from workflow.tasks.early_refusals import (
     refuse_hopeless_logs,
 )
 from workflow.tasks.records import with_common_sampling_time
-from workflow.text.templates import RunSummary, environment, rows_of
+from workflow.text.templates import environment
 
 if TYPE_CHECKING:
     from workflow.config.run_config import RunConfig

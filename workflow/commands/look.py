@@ -7,9 +7,11 @@ from pathlib import Path
 
 from ident.data.finding import FindingKind
 from ident.data.foreign_files import as_typed, path_as_typed
+from workflow.describe.from_template import rows_of
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at, options_typed
-from workflow.text.templates import RunSummary, rows_of, said
+from workflow.text.templates import said
 
 
 def look(

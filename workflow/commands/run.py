@@ -27,7 +27,7 @@ from workflow.tasks.records import read_records
 
 if TYPE_CHECKING:
     from workflow.commands.logs import Reading
-    from workflow.text.templates import RunSummary
+    from workflow.describe.summary import RunSummary
 
 
 def run_from_files(
@@ -96,10 +96,11 @@ def run_from_files(
             note = ""
             if found.refused and not found.remote:
                 note = f"described as recorded, its friction not identified: {found.refused}"
+            from workflow.describe.run import summarise
             from workflow.report.pages import page_of
             from workflow.tasks.pipeline import run_pipeline
 
-            return run_pipeline(
+            results = run_pipeline(
                 drafted,
                 place,
                 config_text=with_absolute_paths(text, drafted),
@@ -113,6 +114,7 @@ def run_from_files(
                 earlier=earlier,
                 progress=progress,
             )
+            return summarise(results, drafted)
 
     config: AnyConfig
     note = ""
@@ -148,10 +150,11 @@ def run_from_files(
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
         read = read_records(config.source, config.columns)
         refuse_hopeless_source(config, read, progress)
+    from workflow.describe.run import summarise
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 
-    return run_pipeline(
+    results = run_pipeline(
         config,
         place,
         config_text=text,
@@ -165,6 +168,7 @@ def run_from_files(
         earlier=earlier,
         progress=progress,
     )
+    return summarise(results, config)
 
 
 def _earlier(path: Path, out: Path | None, logs: Sequence[Path]) -> RunDirectory:
@@ -199,10 +203,12 @@ def rebuild_report(
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """
+    from workflow.describe.run import summarise
     from workflow.report.pages import page_of
     from workflow.tasks.pipeline import any_config_of, rebuild_page
 
-    return rebuild_page(run, page_of(any_config_of(run), also), progress)
+    config = any_config_of(run)
+    return summarise(rebuild_page(run, page_of(config, also), progress), config)
 
 
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:

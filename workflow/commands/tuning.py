@@ -36,6 +36,7 @@ from workflow.commands.tuning_views import FrictionStep, bode, line, roots, shor
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
 from workflow.config.run_config import RunConfig
 from workflow.config.settings import check
+from workflow.describe.tune import tune_rows
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
@@ -50,7 +51,7 @@ from workflow.tasks.results import DesignResult
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import converter_steps
 from workflow.text.formats import bound, si, unit
-from workflow.text.templates import rows_of, said
+from workflow.text.sentences.certificate import LIMITS_NOT_LOOKED_AT, certificate_reason, limited_loops
 
 # A setting beside those of the specification: level of the ellipses.
 CONFIDENCE = "confidence"
@@ -216,7 +217,7 @@ class TuningSession:
                     for plant, worst_case in zip(plants, worst_cases, strict=True)
                 ]
                 numbers = {"gain": gain, "gamma": gamma, "certified": None}
-                at_limits = said("limits_not_looked_at")
+                at_limits = LIMITS_NOT_LOOKED_AT
                 seen = self._seen(law, plants, specification, gamma, margins, at_limits, settles=False)
                 return {**_finite(numbers), **seen}
         raise InputError("no gain keeps the last controller stable with these settings")
@@ -291,7 +292,7 @@ class TuningSession:
             still()
             self._last = law
         margins = [(verdict.worst_margins, verdict.bandwidth_rad_s) for verdict in certificate.plants]
-        at_limits = said("limited_loops", certificate)
+        at_limits = limited_loops(certificate)
         seen = self._seen(law, plants, used, certificate.gamma, margins, at_limits)
         items = [
             {
@@ -303,7 +304,7 @@ class TuningSession:
             for item in certificate.items
         ]
         numbers |= {"certified": certificate.certified, "gamma": certificate.gamma, "items": items}
-        return {**_finite(numbers), **seen, "reason": said("certificate_reason", certificate)}
+        return {**_finite(numbers), **seen, "reason": certificate_reason(certificate)}
 
     def bound(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """What a controller of any order could reach with these settings."""
@@ -361,17 +362,16 @@ class TuningSession:
         numbers = engineers_numbers(law)
         if numbers is not None:
             numbers = replace(numbers, gain_unit=gain_unit_of(*self._units))
-        table = rows_of(
-            "summary/tune.j2",
-            gamma=gamma,
-            margins=reduce(Margins.worse, [worst for worst, _ in margins]),
-            bandwidth_rad_s=min(bandwidth for _, bandwidth in margins),
-            steps=[step_metrics(nominal) for nominal, *_ in runs],
-            unit=self._units[0],
+        rows = tune_rows(
+            gamma,
+            reduce(Margins.worse, [worst for worst, _ in margins]),
+            min(bandwidth for _, bandwidth in margins),
+            [step_metrics(nominal) for nominal, *_ in runs],
+            input_unit=self._units[0],
             order=law.order,
-            limits=at_limits,
-            friction=friction,
             numbers=numbers,
+            friction=friction,
+            limits=at_limits,
         )
         curves = []
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
@@ -400,7 +400,7 @@ class TuningSession:
                     },
                 }
             )
-        return {"numbers": table[0].rows, "plants": curves}
+        return {"numbers": [(row.name, row.text) for row in rows], "plants": curves}
 
     def _reference_step(self, law: Controller, plant: UncertainPlant) -> Real:
         """The reference step (T,) as the loop gets it: through the run's filter, where there is one.

@@ -19,10 +19,10 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import UncertainPlant
 from ident.friction import FrictionFit
 from ident.resampling import resampled_friction
+from workflow.describe.friction import settling_range
 from workflow.figures.bands import outline
 from workflow.figures.style import ratio_unit
 from workflow.tasks.friction_loop import FrictionLoop, friction_feedforward
-from workflow.text.templates import said
 
 # Largest modulus of a root that is drawn: the circle and what is near it; a zero far outside would make the
 # circle a point. Chosen.
@@ -138,7 +138,7 @@ class FrictionStep:
         # From rest, as a run has it.
         step = np.append(0.0, np.full(given.size, self.size))
         loop = FrictionLoop.of(law, friction, **self.steps)
-        return said("settling_range", loop.settling(step, np.append(0.0, given)))
+        return settling_range(loop.settling(step, np.append(0.0, given)))
 
 
 def line(run: ClosedLoopTrajectory, shown: int) -> dict[str, Any]:

@@ -10,11 +10,15 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any
+from typing import Any, ClassVar, Literal, TypeAlias
+
+from markupsafe import Markup
 
 from ident.data.finding import Finding
 from workflow.text.formats import at_least, at_most, interval, number, unit as with_unit
 
+# Rows that a page begins with; those behind them stand in the section of their subject.
+ON_THE_FIRST_SCREEN = 5
 # Digits of a number where its fact asks for no others: what a drawing or a data sheet gives.
 USUAL_DIGITS = 3
 
@@ -110,6 +114,11 @@ class Row:
     remark: str = ""
     verdict: Verdict = Verdict.NONE
 
+    @property
+    def text(self) -> str:
+        """Value and remark in one line: "at least 0.673 (required: 0.5)"."""
+        return f"{self.value.text} ({self.remark})" if self.remark else self.value.text
+
 
 @dataclass(frozen=True)
 class Picture:
@@ -119,6 +128,7 @@ class Picture:
     caption: str
     subjects: tuple[Any, ...] = ()
     file: str = ""  # tells two pictures of one drawing apart
+    kind: ClassVar[str] = "picture"
 
 
 @dataclass(frozen=True)
@@ -139,11 +149,138 @@ class Section:
     notes: tuple[Finding, ...] = ()
     parts: tuple[Section, ...] = ()
 
+    def whole(self) -> Iterator[Section]:
+        """The section and all of its parts, depth first."""
+        yield self
+        for part in self.parts:
+            yield from part.whole()
+
     def all_rows(self) -> Iterator[Row]:
         """Rows of the section and of its parts, depth first."""
-        yield from self.rows
-        for part in self.parts:
-            yield from part.all_rows()
+        for section in self.whole():
+            yield from section.rows
+
+
+@dataclass(frozen=True)
+class Text:
+    """A paragraph of a page."""
+
+    text: str
+    kind: ClassVar[str] = "text"
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A title inside a section of a page; anchor: "" where nothing links to it."""
+
+    text: str
+    anchor: str = ""
+    kind: ClassVar[str] = "heading"
+
+
+@dataclass(frozen=True)
+class Remarks:
+    """Sentences in a box: to heed ("warning"), that reassure ("good"), that inform ("note"), or in a plain
+    list ("plain"). Nothing where there are none."""
+
+    items: tuple[str, ...]
+    tone: Literal["warning", "good", "note", "plain"] = "note"
+    title: str = ""
+    kind: ClassVar[str] = "remarks"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Facts in columns. met: of each row whether it is as required, () where nothing is required."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[object, ...], ...]
+    caption: str = ""
+    met: tuple[bool | None, ...] = ()
+    kind: ClassVar[str] = "table"
+
+
+@dataclass(frozen=True)
+class Copy:
+    """A law to copy. forms: its zeros and poles, polynomials and sections; delay: samples that a controller
+    has beside them, None: of a law without a name."""
+
+    title: str
+    forms: Mapping[str, Any]
+    dt_s: float
+    signal: str = "error"
+    delay: int | None = None
+    kind: ClassVar[str] = "copy"
+
+
+@dataclass(frozen=True)
+class Code:
+    """Text as it is typed (`typed`) or printed."""
+
+    text: str
+    typed: bool = False
+    kind: ClassVar[str] = "code"
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What only some will want to see, folded up."""
+
+    title: str
+    blocks: tuple[Block, ...]
+    kind: ClassVar[str] = "fold"
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """A part of a page, folded at first; short: what the contents call it."""
+
+    anchor: str
+    title: str
+    short: str
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True)
+class FirstScreen:
+    """What a page begins with.
+
+    Attributes:
+        headline: The verdict in one line.
+        state: "certified", "refused" or "plain".
+        rows: At most five are shown.
+        bullets: Sentences, the weightiest first; those behind the fifth fold.
+        picture: Below the numbers.
+        anchor: Where links to it lead.
+        short: What the contents call it.
+    """
+
+    headline: str
+    state: State
+    rows: tuple[Row, ...]
+    bullets: tuple[str, ...]
+    picture: Picture
+    anchor: str = "verdict"
+    short: str = "Verdict"
+
+
+State: TypeAlias = Literal["certified", "refused", "plain"]
+Block: TypeAlias = Text | Heading | Remarks | Table | Picture | Copy | Code | Fold
+
+
+def link(anchor: str, words: str) -> Markup:
+    """A link inside a page."""
+    return Markup('<a href="#{}">{}</a>').format(anchor, words)
+
+
+def worded(name: str, text: str, *, key: str = "", verdict: Verdict = Verdict.NONE) -> Row:
+    """A fact in words, on one line."""
+    return Row(key, name, Quantity.words(" ".join(text.split())), verdict=verdict)
+
+
+def said(*rows: Row | None) -> tuple[Row, ...]:
+    """The rows that say something: None and empty ones are left out."""
+    return tuple(row for row in rows if row is not None and row.value.text)
 
 
 def answer(sections: Sequence[Section]) -> dict[str, Any]:

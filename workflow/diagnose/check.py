@@ -14,6 +14,8 @@ import numpy as np
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.probed import doubtful_columns
 from diagnosis.machine.telling import Telling, telling
+from workflow.describe.from_template import rows_of
+from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_settings import case_document
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
 from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
@@ -21,7 +23,6 @@ from workflow.diagnose.words import FILTERS
 from workflow.engine import codec
 from workflow.engine.errors import InputError
 from workflow.text.formats import listing
-from workflow.text.templates import RunSummary, rows_of
 
 # Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
 _MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6

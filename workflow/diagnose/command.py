@@ -14,6 +14,8 @@ from typing import Any
 from diagnosis.answer import Diagnosis
 from diagnosis.diagnosis import diagnose
 from workflow.config.settings import repeated
+from workflow.describe.from_template import rows_of
+from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import LAYOUT_VERSION, DiagnosisDirectory
@@ -36,7 +38,6 @@ from workflow.engine.errors import (
 from workflow.engine.executor import Executor, Failure, Report, ThisProcess, workers
 from workflow.engine.progress import Progress
 from workflow.report.rendering import render_page
-from workflow.text.templates import RunSummary, rows_of
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S = 30.0  # expected: it shapes the progress bar only

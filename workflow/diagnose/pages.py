@@ -18,10 +18,10 @@ from diagnosis.machine.rounding import rounding_effect
 from diagnosis.where.findings import Where
 from diagnosis.where.where import motion_of, over_levels, where, where_in_records
 from plant.effects import EFFECTS
+from workflow.describe.summary import RunSummary
 from workflow.diagnose.stick_figures import moving_figures
 from workflow.diagnose.words import FILTERS
 from workflow.report.rendering import render_page
-from workflow.text.templates import RunSummary
 
 
 def case_page(found: Diagnosis, progress: Callable[[float, str], None] | None = None, **page: object) -> str:

@@ -21,7 +21,6 @@ from control_design.controllers.law import Law
 from control_design.plants.frequency_grid import checked_grid, frequency_grid
 from control_design.plants.plant_set import Mode, UncertainPlant, frequency_response, modes_of
 from control_design.specification import Specification
-from control_design.specification.requirement import LoopFunction
 from ident.basis.options import IdentOptions
 from ident.checks.distortion_findings import distortion_findings
 from ident.checks.plausible_modes import LIGHT
@@ -41,7 +40,6 @@ from workflow.tasks.identification import as_fitted
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import (
     IdentifiedChannel,
-    MeasuredPeak,
     ModelMode,
     RunResults,
     UncertainChannel,
@@ -188,34 +186,6 @@ def log_channel(result: LogIdentification) -> ChannelView:
     return ChannelView(
         result.about, result.spread, result.options, result.fresh_records, result.measured, units
     )
-
-
-@dataclass(frozen=True, eq=False)
-class MeasuredBeyond:
-    """A measurement of |S| beyond what is certified.
-
-    Attributes
-    ----------
-    measured : MeasuredPeak
-    cause : {"effects", "size", "model"}
-        What sets its arm apart: the effects of the closed-loop check; a small reference, where friction
-        weighs more; nothing but friction and what else is not linear.
-    limit : (F,) array
-        The specification at the lines, infinite where nothing is asked for.
-    line : int or None
-        Where |S| exceeds that limit most; None: nowhere.
-    bandwidth_line : int or None
-        Where it exceeds -3 dB most up to the certified bandwidth; None: nowhere.
-    bandwidth_rad_s : float
-        Certified.
-    """
-
-    measured: MeasuredPeak
-    cause: str
-    limit: Real
-    line: int | None
-    bandwidth_line: int | None
-    bandwidth_rad_s: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -421,28 +391,6 @@ class RunView(AnyRunView):
     def shares(self) -> Mapping[str, Any]:
         """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
         return joint_numbers(self.results.certify.sampled)
-
-    @property
-    def measured_beyond(self) -> list[MeasuredBeyond]:
-        """Measurements of |S| on an arm that contradict the specification or the certified bandwidth, which
-        are about linear plants in the uncertainty set."""
-        check = self.results.closed_loop.check
-        certificate = self.results.certify.certificate
-        if check is None or check.sensitivity is None or certificate is None:
-            return []
-        bandwidth = min(plant.bandwidth_rad_s for plant in certificate.plants)
-        as_identified, small, *with_effects = check.sensitivity.measured
-        causes = [(as_identified, "model"), (small, "size"), *((row, "effects") for row in with_effects)]
-        contradictions = []
-        for row, cause in causes:
-            weight = self.specification.magnitude(self.plant, row.omega_rad_s, LoopFunction.SENSITIVITY)
-            limit = np.divide(1.0, weight, out=np.full_like(weight, np.inf), where=weight > 0)
-            contradiction = MeasuredBeyond(
-                row, cause, limit, row.beyond(limit), row.beyond_bandwidth(bandwidth), bandwidth
-            )
-            if contradiction.line is not None or contradiction.bandwidth_line is not None:
-                contradictions.append(contradiction)
-        return contradictions
 
     @cached_property
     def loop_grid(self) -> Real:

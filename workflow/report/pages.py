@@ -11,6 +11,9 @@ from pathlib import Path
 
 from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
+from workflow.describe.identify import identify_first_screen, identify_page_sections
+from workflow.describe.run import title_of
+from workflow.describe.run_page import page_of_run
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.subjects import AnyRunView, RunView, log_channel
@@ -20,7 +23,6 @@ from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import RunRecord, RunResults
 from workflow.tasks.stage import Stage, StageInput, stages_for
 from workflow.tasks.stages import STAGES
-from workflow.tasks.summary import summarise, title_of
 
 
 def write_report(
@@ -40,14 +42,14 @@ def write_report(
     """
     run = results.run
     view = RunView if isinstance(config, RunConfig) else AnyRunView
+    first, parts = page_of_run(view(config, results, run.manifest()), is_design=is_design)
     page = render_page(
         "report.html.j2",
         progress,
         title=title_of(config, run),
-        run=view(config, results, run.manifest()),
+        first=first,
+        parts=parts,
         study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
-        certified=summarise(results, config).certified,
-        is_design=is_design,
     )
     return _write(run, page, also)
 
@@ -100,22 +102,22 @@ def identify_page(
     """One self-contained HTML page; inputs are the files with their SHA-256. Same results, same page."""
     options, channel = result.options, log_channel(result)
     versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "nlopt")]
+    records = [
+        *(RunRecord(record, "estimation", None, "") for record in result.measured),
+        *(RunRecord(record, "validation", None, "") for record in result.fresh_records),
+    ]
+    changed = [
+        (name, value)
+        for name, field in type(options).model_fields.items()
+        if (value := getattr(options, name)) != field.default
+    ]
+    stated = [*changed, *versions, ("python", sys.version.split()[0])]
     page = render_page(
-        "identification.html.j2",
+        "report.html.j2",
         progress,
         title=f"{channel.found.input} to {channel.found.output}",
-        result=result,
-        channel=channel,
-        records=[
-            *(RunRecord(record, "estimation", None, "") for record in result.measured),
-            *(RunRecord(record, "validation", None, "") for record in result.fresh_records),
-        ],
-        changed=[
-            (name, value)
-            for name, field in type(options).model_fields.items()
-            if (value := getattr(options, name)) != field.default
-        ],
-        versions=[*versions, ("python", sys.version.split()[0])],
-        inputs=inputs,
+        first=identify_first_screen(result, channel),
+        parts=identify_page_sections(result, channel, records, stated, inputs),
+        study=False,
     )
     return page.html

@@ -25,11 +25,15 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.engine.store import Store
 from workflow.study.points import Base, Combination, Point
 from workflow.study.task import Done
-from workflow.tasks.pipeline import controller_stages, plant_stages, stage_input_hash
+from workflow.tasks.pipeline import (
+    controller_stages,
+    is_certified_and_settles,
+    plant_stages,
+    stage_input_hash,
+)
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 from workflow.tasks.stages import PLANT
-from workflow.tasks.summary import summarise
 
 # 2: the base is what was stated, without defaults, as in run directories of layout 10. A study of another
 # layout is not resumed.
@@ -110,7 +114,7 @@ class StudyDirectory(Store):
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
-        certified = summarise(RunResults(run), point.config).certified
+        certified = is_certified_and_settles(RunResults(run))
         run.record_status("complete" if certified else "complete, not certified")
 
     def link_numbers(self, points: Iterable[Combination]) -> None:

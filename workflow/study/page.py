@@ -13,6 +13,10 @@ import numpy.typing as npt
 import pandas as pd
 
 from workflow.config.joints_config import JointsConfig
+from workflow.describe.design import gave_way_text, never_settles, run_verdict
+from workflow.describe.from_template import rows_of
+from workflow.describe.run import summarise
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
@@ -22,8 +26,8 @@ from workflow.study.points import Point, PointRow, State, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import RunResults
-from workflow.tasks.summary import summarise, verdict_of
-from workflow.text.templates import RunSummary, render_text, rows_of, said
+from workflow.text.sentences.design import lowered as lowered_text, order_advice
+from workflow.text.templates import render_text
 
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
@@ -49,17 +53,17 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
         reached, order = results.achievable_performance, specification.controller_order
-        advice = said("order_advice", reached, design.gamma, order, specification.structure)
+        advice = order_advice(reached.bracket, design.gamma, order, specification.structure)
         why = f"{why}; {advice}" if advice else why
     if certify.certified:
         conditions = results.uncertainty.conditions(config)
-        why = verdict_of(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
-    lowered = said("lowered", specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
+        why = run_verdict(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
+    lowered = lowered_text(specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
     if state == "certified" and check and check.tracking and check.spread_of("settling_time_s")[-1] is None:
-        state, why = "does not settle", said("never_settles", check)  # at rest beside the reference
+        state, why = "does not settle", never_settles(check)  # at rest beside the reference
     elif state == "certified" and lowered:
         state = "certified at a lower bandwidth"
-    given_way = said("gave_way", gave_way(specification, design.specification))
+    given_way = gave_way_text(gave_way(specification, design.specification))
     if given_way:
         why = f"designed for {given_way}; {why}"
     if lowered:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import InputError, StageError
@@ -33,7 +34,6 @@ from workflow.study.task import Done, PointTask
 from workflow.tasks.pipeline import controller_stages, plant_stages
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
-from workflow.text.templates import RunSummary
 
 
 def run_study(

@@ -34,7 +34,8 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
-from workflow.text.templates import said
+from workflow.text.sentences import design as sentences
+from workflow.text.sentences.certificate import certificate_reason
 
 # Worst case of a quick design that the whole design then meets, too, as a rule.
 _CLEARLY = 0.97
@@ -103,7 +104,7 @@ def find_design(
                 plants, specification, synthesis, rng=rng, first=first, progress=parts[1]
             )
             result = joint_design.result
-            jointly = said("draws_stable", joint_design)
+            jointly = sentences.draws_stable(joint_design)
         else:
             specification, result = synthesise_giving_way(
                 plants, specification, synthesis, rng=rng, progress=progress
@@ -112,7 +113,7 @@ def find_design(
         return DesignResult(None, met=False, reason=str(impossible), specification=specification)
 
     # How it stands, and what the user could ask for instead.
-    reason = said("outcome", result)
+    reason = sentences.outcome(result)
     if advise and 1.0 < result.gamma < math.inf:
         meets = would_meet(
             plants,
@@ -123,7 +124,7 @@ def find_design(
             rng_at_start,
             between_own_points=between_own_points,
         )
-        reason += said("would_meet", meets)
+        reason += sentences.would_meet(meets)
     return DesignResult(result, result.gamma <= 1.0, reason, jointly, specification)
 
 
@@ -234,7 +235,7 @@ def certify_asked(
     -------
     CertifyResult
     """
-    reason = undrawable(plants) if options.joint_draws else said("not_drawn")
+    reason = undrawable(plants) if options.joint_draws else sentences.NOT_DRAWN
     calibrated = reason is None and options.calibrate
     certificate = certify(
         controller,
@@ -258,7 +259,7 @@ def certify_asked(
     return CertifyResult(
         certificate,
         certificate.certified,
-        said("certificate_reason", certificate),
+        certificate_reason(certificate),
         SampledResponses(joint, calibrated, reason),
     )
 
@@ -272,9 +273,9 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
             if uncertainty is None:
                 continue
             if not isinstance(uncertainty, ResponsePosterior | ResponseDraws):
-                return said("undrawable", plant.name, plant.own_grid is not None)
+                return sentences.undrawable(plant.name, plant.own_grid is not None)
             drawn = True
-    return None if drawn else said("nothing_to_draw")
+    return None if drawn else sentences.NOTHING_TO_DRAW
 
 
 def joint_numbers(found: SampledResponses) -> dict[str, Any]:
@@ -307,13 +308,13 @@ def find_bracket(
     """What a controller of any order could reach on these plants (lower and upper bound of the worst case),
     or the reason why that is not known."""
     if not options.compute:
-        return AchievablePerformance(reason=said("bracket_not_asked"))
+        return AchievablePerformance(reason=sentences.BRACKET_NOT_ASKED)
     try:
         bracket = youla_bracket(plants, specification, options, progress=progress)
     except SpecificationError as impossible:
         return AchievablePerformance(reason=str(impossible))
     except (ValueError, ArithmeticError) as unfit:
-        return AchievablePerformance(reason=said("bracket_unfit", str(unfit)))
+        return AchievablePerformance(reason=sentences.bracket_unfit(str(unfit)))
     return AchievablePerformance(bracket)
 
 
@@ -365,7 +366,7 @@ def find_filter(
             controller, plants, settings.reference_model, settings, weight=settings.error_weight
         )
     except ValueError as unfit:
-        return ReferenceFilterResult(reason=said("no_filter", str(unfit)))
+        return ReferenceFilterResult(reason=sentences.no_filter(str(unfit)))
     return ReferenceFilterResult(reference_filter)
 
 

@@ -37,7 +37,8 @@ from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_documents import DOCUMENTS, read_document
 from workflow.tasks.system_files import read_state_space
-from workflow.text.templates import said, words
+from workflow.text.sentences.design import NOTHING_STATED, nominal_inside
+from workflow.text.templates import words
 
 if TYPE_CHECKING:
     import control
@@ -211,7 +212,7 @@ def _ending(path: Path) -> str:
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
     """A model that brings no ellipses: with the uncertainty of the design file, if it states one."""
     if design.uncertainty is None:
-        return DesignSource(UncertainPlant(name, nominal), origin, (said("nothing_stated"),))
+        return DesignSource(UncertainPlant(name, nominal), origin, (NOTHING_STATED,))
     weight = design.uncertainty.multiplicative or design.uncertainty.additive
     assert weight is not None
     with naming(f"{design.name} [uncertainty]"):
@@ -326,4 +327,4 @@ def _inside(ellipses: FrequencyUncertainty, nominal: control.StateSpace) -> tupl
         covariance=ellipses.covariance[moving],
     )
     agreement = NominalAgreement.of(above_zero, lambda omega: frequency_response(nominal, omega))
-    return (said("nominal_inside", agreement, ellipses.omega_rad_s.size),)
+    return (nominal_inside(agreement, ellipses.omega_rad_s.size),)

@@ -19,7 +19,8 @@ from workflow.engine import documents, storage
 from workflow.engine.errors import naming
 from workflow.engine.run_directory import CONTROLLER_SUFFIXES
 from workflow.tasks.results import RecordsResult
-from workflow.text.templates import render_text, said
+from workflow.text.sentences.records import signals
+from workflow.text.templates import render_text
 
 # Formats of a controller file, by its ending.
 SUFFIXES = (".json", ".mat", ".c")
@@ -94,7 +95,8 @@ class Logged:
         source = config.source
         loops = config.loops
         scale, offset = (source.scale, source.offset) if isinstance(source, FileSource) else ({}, {})
-        columns = [[loop.output for loop in loops], [loop.input for loop in loops]]
+        outputs, inputs = [loop.output for loop in loops], [loop.input for loop in loops]
+        columns = [outputs, inputs]
         error, command = (tuple(scale.get(name, 1.0) for name in names) for names in columns)
         units = {name: records.unit(name) for names in columns for name in names}
         known = [units[names[0]] for names in columns if len(names) == 1 and units[names[0]]]
@@ -103,7 +105,7 @@ class Logged:
         if len(known) == len(columns) and as_logged:
             error_unit, command_unit = known
             gain_unit = gain_unit_of(command_unit, error_unit)
-        return cls(error, command, said("signals", *columns, units, scale, offset), gain_unit)
+        return cls(error, command, signals(outputs, inputs, units, scale, offset), gain_unit)
 
     def law(self, law: Controller) -> Controller:
         """The law for the columns, of one for quantities."""

@@ -39,7 +39,7 @@ from workflow.config.run_config import Channel, ClosedLoopData, FileSource, Role
 from workflow.engine.errors import naming
 from workflow.tasks.results import IdentifiedChannel, IdentifyResult
 from workflow.tasks.stage import StageInput
-from workflow.text.templates import said
+from workflow.text.sentences.records import loop_refused
 
 # Share of the time that the fit takes; the stabilisation plot takes the rest. For the progress bar only.
 _SHARE_OF_FIT = 0.6
@@ -333,7 +333,7 @@ def identify_channel(
             return fitted(opened, finding(kind, **opened.finding.values))
     # "direct" is among the ways of "auto", and a stated way has returned.
     assert remark is not None
-    raise ValueError(said("loop_refused", remark.values, controlled))
+    raise ValueError(loop_refused(remark.values, controlled))
 
 
 def _behind_remote_friction(

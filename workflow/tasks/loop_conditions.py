@@ -27,7 +27,7 @@ from workflow.tasks.loop_sensitivity import SETTLED
 from workflow.tasks.results import ConditionRun
 from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import OUTPUT_NAMES, UNITS, encoded_arm
-from workflow.text.templates import said
+from workflow.text.sentences import conditions
 
 # Share of the voltage limit that the slew is predicted to use. Chosen, so that other conditions have room.
 _SLEW_SHARE = 0.6
@@ -130,7 +130,9 @@ class ConditionBench:
         if self.controller.input_limit is not None:
             peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
-        return self._run("slew", said("smooth_move", length * self.controller.dt_s), np.asarray(size * shape))
+        return self._run(
+            "slew", conditions.smooth_move(length * self.controller.dt_s), np.asarray(size * shape)
+        )
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
@@ -149,7 +151,7 @@ class ConditionBench:
         scale = self.step / float(np.max(np.abs(answer)))
         return self._run(
             "push at the tip",
-            said("half_sine", scale, 1e3 * length * dt),
+            conditions.half_sine(scale, 1e3 * length * dt),
             np.zeros(n),
             output_disturbance=scale * answer,
             tip_force_N=scale * force,
@@ -165,7 +167,7 @@ class ConditionBench:
         return [
             self._run(
                 f"payload {percent} %",
-                said("payload", 1e3 * rated * percent / 100),
+                conditions.payload(1e3 * rated * percent / 100),
                 effects=without,
                 rig=self.rig.perturbed({"payload.mass_kg": rated * percent / 100}),
             )
@@ -176,7 +178,7 @@ class ConditionBench:
         """One sample of delay more."""
         delay_s = float(self.effects.get("input_delay", {}).get("delay_s", 0.0))
         longer = {"input_delay": {"name": "input_delay", "delay_s": delay_s + self.controller.dt_s}}
-        return self._run("late", said("more_delay", 1e3 * self.controller.dt_s), effects=longer)
+        return self._run("late", conditions.more_delay(1e3 * self.controller.dt_s), effects=longer)
 
     def frictions(self) -> list[ConditionRun]:
         """None of the arm's joint friction effects, and twice as much of each."""
@@ -192,8 +194,8 @@ class ConditionBench:
             }
 
         return [
-            self._run("no friction", said("other_friction", list(frictions), 0), effects=scaled(0.0)),
-            self._run("double friction", said("other_friction", list(frictions), 2), effects=scaled(2.0)),
+            self._run("no friction", conditions.other_friction(list(frictions), 0), effects=scaled(0.0)),
+            self._run("double friction", conditions.other_friction(list(frictions), 2), effects=scaled(2.0)),
         ]
 
     def coarse(self) -> ConditionRun:
@@ -203,7 +205,7 @@ class ConditionBench:
         measurement = (
             4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
         )
-        words = said("coarse_steps", command, measurement, UNITS[OUTPUT_NAMES[self.measured]])
+        words = conditions.coarse_steps(command, measurement, UNITS[OUTPUT_NAMES[self.measured]])
         return self._run("coarse", words, steps=(measurement, command))
 
     def overdriven(self) -> list[ConditionRun]:
@@ -214,8 +216,8 @@ class ConditionBench:
         free = self._unlimited
         peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
-        limit_known = said("overdriven", _OVERDRIVEN, True)
-        limit_ignored = said("overdriven", _OVERDRIVEN, False)
+        limit_known = conditions.overdriven(_OVERDRIVEN, known=True)
+        limit_ignored = conditions.overdriven(_OVERDRIVEN, known=False)
         return [
             self._run("voltage limit", limit_known, reference),
             self._run("no anti-windup", limit_ignored, reference, law=free, clip=limit),

@@ -23,11 +23,11 @@ from workflow.engine.errors import CommandInterruptedError, InputError, naming, 
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import KEPT_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.exports import Logged, model_bytes, write_controller
+from workflow.tasks.point_models import JointsLoopResult
 from workflow.tasks.results import ReferenceFilterResult, RunResults
 from workflow.tasks.stage import Stage, StageInput, stages_for
 from workflow.tasks.stages import PLANT, STAGES
-from workflow.tasks.summary import summarise
-from workflow.text.templates import RunSummary, said
+from workflow.text.sentences.friction import certified_for as about_what
 
 
 def run_pipeline(
@@ -45,8 +45,8 @@ def run_pipeline(
     begun: RunDirectory | None = None,
     earlier: RunDirectory | None = None,
     progress: Progress | None = None,
-) -> RunSummary:
-    """Run every stage into a directory and return its numbers.
+) -> RunResults:
+    """Run every stage into a directory and return the results of its stages.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def run_pipeline(
 
     Returns
     -------
-    RunSummary
+    RunResults
         A result that is not certified is no error.
 
     Raises
@@ -145,7 +145,7 @@ def run_pipeline(
             for name in KEPT_FILES:
                 if run.path / name not in written:
                     (run.path / name).unlink(missing_ok=True)
-            summary = summarise(stage_input.results, config)
+            holds = is_certified_and_settles(stage_input.results)
         except BaseException as error:
             # A library may turn an interrupt into any other error, so that it is asked for, too.
             if isinstance(error, KeyboardInterrupt) or interrupts.came():
@@ -155,8 +155,8 @@ def run_pipeline(
                 raise CommandInterruptedError(run.path) from None
             _fail(run, error, created=not existed)
             raise
-        run.record_status("complete" if summary.certified else "complete, not certified")
-    return summary
+        run.record_status("complete" if holds else "complete, not certified")
+    return stage_input.results
 
 
 def identify_only(
@@ -191,14 +191,25 @@ def identify_only(
             _perform(stage, stage_input, inputs, earlier=earlier)
 
 
-def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunSummary:
+def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunResults:
     """Perform the last stage again on a finished run. Raises InputError when a stage is missing."""
     config = any_config_of(run)
     stage_input = _stage_input(config, run, progress or Progress())
     stage_input.progress.plan([(page.name, page.expected_s)])
     with run.locked():
         _perform(page, stage_input, {}, always=True)
-    return summarise(stage_input.results, config)
+    return stage_input.results
+
+
+def is_certified_and_settles(results: RunResults) -> bool:
+    """Whether the controller of a run is certified and every run of its closed loop settles."""
+    loop = results.closed_loop
+    if isinstance(loop, JointsLoopResult):
+        settled, points = loop.settled_points()
+        settles = settled == points
+    else:
+        settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
+    return results.certify.certified and settles
 
 
 def _stage_input(
@@ -216,7 +227,7 @@ def certified_for(results: RunResults, config: AnyConfig) -> str:
         return f"{len(models.points)} operating points"
     channel = config.control_channel
     unit = results.records.unit(channel.input)
-    return said("certified_for", channel.uncertainty, results.uncertainty.equivalent, unit)
+    return about_what(channel.uncertainty.response, results.uncertainty.equivalent, unit)
 
 
 def config_of(run: RunDirectory) -> RunConfig:

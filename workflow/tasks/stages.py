@@ -27,7 +27,7 @@ from workflow.tasks.results import (
 )
 from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.uncertainty import find_uncertainty
-from workflow.text.templates import said
+from workflow.text.sentences.design import no_filter
 
 
 def design_controller(stage: StageInput) -> DesignResult:
@@ -78,7 +78,7 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
     settings = stage.config.reference_filter
     law = stage.results.design.controller
     if law is None:
-        return ReferenceFilterResult(reason=None if settings is None else said("no_filter"))
+        return ReferenceFilterResult(reason=None if settings is None else no_filter())
     with naming("reference filter"):
         result = find_filter(law, stage.plants, settings)
     friction = stage.results.identify.friction

@@ -56,7 +56,8 @@ from workflow.tasks.results import (
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
-from workflow.text.templates import said, words
+from workflow.text.sentences.records import rate_part, unexplained_logs
+from workflow.text.templates import words
 
 # Frequencies over a band of the data at least, some decade: a nominal model has a tenth as many numbers.
 _FEWEST_FREQUENCIES = 100
@@ -306,7 +307,7 @@ def uncertain_channel(
     nominal = nominal_of(posterior, poles, omega, pairs[untold])
     further_parts = tuple(
         UncertainMember(
-            said("rate_part", member.from_rad_s, member.to_rad_s),
+            rate_part(member.from_rad_s, member.to_rad_s),
             member.response,
             nominal_of(member.response, member.poles, omega, pairs[untold]),
             bands_of(member.response.at(omega, level)),
@@ -330,7 +331,7 @@ def uncertain_channel(
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
-        about=said("rate_part", members[0].from_rad_s, members[0].to_rad_s) if further_parts else "",
+        about=rate_part(members[0].from_rad_s, members[0].to_rad_s) if further_parts else "",
         others=further_parts,
     )
 
@@ -384,7 +385,9 @@ def refuse_unexplained(
         if times > _BEYOND_NOISE:
             why = f"its best fit to one is {best:.0f} %, and it leaves {times:.0f} times the sensor's noise"
     if why:
-        raise ValueError(said("unexplained_logs", result.output, why, friction is not None or not position))
+        raise ValueError(
+            unexplained_logs(result.output, why, friction_known=friction is not None or not position)
+        )
 
 
 def posterior_of(

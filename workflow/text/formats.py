@@ -180,6 +180,11 @@ def sentence(text: str) -> str:
     return Markup(words) if isinstance(text, Markup) else words
 
 
+def capitalised(text: str) -> str:
+    """With a capital at the start; the rest stays as it is."""
+    return text[:1].upper() + text[1:]
+
+
 def yes_no(state: bool | None) -> str:
     """A requirement's state in a table."""
     return MISSING if state is None else "yes" if state else "NO"
@@ -204,7 +209,8 @@ TESTS: Mapping[str, Callable[..., bool]] = {
 }
 _NAMED: tuple[Callable[..., Any], ...] = (
     number, at_least, at_most, margin, bound, si, percent, share, portion, signed, fixed, interval, extent,
-    frequency, hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, yes_no, setting,
+    frequency, hertz, decibels, in_decibels, unit, listing, sparkline, count, sentence, capitalised, yes_no,
+    setting,
 )  # fmt: skip
 FILTERS: Mapping[str, Callable[..., Any]] = {
     "quoted": as_typed,

@@ -8,11 +8,10 @@ import importlib.util
 import marshal
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
@@ -22,6 +21,7 @@ from markupsafe import Markup
 from ident.data.finding import Finding
 from workflow.text.formats import FILTERS, TESTS
 from workflow.text.options import option, stated
+from workflow.text.sentences.records import in_uncertainty, try_friction
 
 
 @cache
@@ -40,6 +40,7 @@ def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow")
     )
     made.filters.update(FILTERS, words=words, labelled=labelled, option=option, stated=stated)
     made.filters.update(own)
+    made.globals.update(in_uncertainty=in_uncertainty, try_friction=try_friction)
     made.tests.update(TESTS)
     return made
 
@@ -63,12 +64,12 @@ def render_text(template: str, **values: Any) -> str:
 
 def said(macro: str, *values: Any) -> str:
     """A sentence of sentences.j2 by the name of its macro, on one line; empty where nothing is to be said."""
-    return _plain(getattr(environment().get_template("sentences.j2").module, macro)(*values))
+    return plain_line(getattr(environment().get_template("sentences.j2").module, macro)(*values))
 
 
 def words(found: Finding) -> str:
     """The sentence of findings.j2 that says what ident found."""
-    return _plain(getattr(_findings(), found.kind.name.lower())(found.values))
+    return plain_line(getattr(_findings(), found.kind.name.lower())(found.values))
 
 
 @cache
@@ -76,79 +77,7 @@ def _findings() -> Any:
     return environment().get_template("findings.j2").module
 
 
-class Row(NamedTuple):
-    """One line of a table."""
-
-    label: str
-    value: str
-
-
-class TableSection(NamedTuple):
-    title: str
-    rows: Sequence[Row]
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """Rows to read, `numbers` (JSON-able) to compute with, and the verdict in one line.
-
-    `certified` is False when the specification is missed or the certificate fails; the verdict then says by
-    how much and at which frequencies. None: nothing was to be certified. brief: what a terminal shows of
-    `sections` unless all is asked for; everything where there is none. taken_over: stages of a run
-    that came from other runs, by the run; None: no run.
-    """
-
-    title: str
-    sections: Sequence[TableSection]
-    numbers: Mapping[str, Any] = field(default_factory=dict)
-    certified: bool | None = None
-    verdict: str = ""
-    report_path: str | None = None
-    brief: Sequence[TableSection] = ()
-    taken_over: Mapping[str, Sequence[str]] | None = None
-
-    def to_document(self) -> dict[str, Any]:
-        """JSON-able."""
-        return {
-            "title": self.title,
-            **({} if self.certified is None else {"certified": self.certified}),
-            "verdict": self.verdict,
-            "report": self.report_path,
-            **({} if self.taken_over is None else {"taken_over": self.taken_over}),
-            "numbers": dict(self.numbers),
-            "table": [
-                {"section": section.title, "label": row.label, "value": row.value}
-                for section in self.sections
-                for row in section.rows
-            ],
-        }
-
-
-def rows_of(
-    template: str, filters: Iterable[tuple[str, Callable[..., Any]]] = (), **values: Any
-) -> list[TableSection]:
-    """A table by template: plain text on one line each.
-
-    The template calls part("title") and {% call line("label") %}value{% endcall %}; an empty value is no row,
-    a part without rows no section. filters: (name, function) beside those of all.
-    """
-    parts: list[tuple[str, list[Row]]] = []
-
-    def part(title: str) -> str:
-        parts.append((_plain(title), []))
-        return ""
-
-    def line(label: str, caller: Callable[[], str]) -> str:
-        value = _plain(caller())
-        if value:
-            parts[-1][1].append(Row(_plain(label), value))
-        return ""
-
-    environment(*filters).get_template(template).render(part=part, line=line, **values)
-    return [TableSection(title, rows) for title, rows in parts if rows]
-
-
-def _plain(text: str) -> str:
+def plain_line(text: str) -> str:
     """Without escapes, on one line."""
     return " ".join((text.unescape() if isinstance(text, Markup) else str(text)).split())
 

@@ -1,0 +1,357 @@
+"""A run for several joints: models, design, certificate and loop at every operating point."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from markupsafe import Markup
+
+from workflow.config.joints_config import JointsConfig
+from workflow.describe.facts import (
+    Block,
+    FirstScreen,
+    PageSection,
+    Picture,
+    Quantity,
+    Remarks,
+    Row,
+    Section,
+    Table,
+    Text,
+    Verdict,
+    link,
+    said,
+    worded,
+)
+from workflow.describe.identification import sentences
+from workflow.engine import codec
+from workflow.tasks.pipeline import is_certified_and_settles
+from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
+from workflow.tasks.results import DesignResult
+from workflow.text.formats import (
+    at_least,
+    at_most,
+    count,
+    extent,
+    hertz,
+    number,
+    percent,
+    sentence,
+    share,
+    si,
+    yes_no,
+)
+from workflow.text.templates import words
+
+if TYPE_CHECKING:
+    from workflow.figures.subjects import AnyRunView
+
+
+# Share of the samples of a run at a limit from which on it is worth a sentence; chosen.
+_OFTEN_LIMITED = 0.01
+
+
+def joints_verdict(design: DesignResult, certify: JointsCertificate, settled: int, points: int) -> str:
+    """The verdict in one line; settled: operating points where every run settles, of `points`."""
+    if design.synthesis is None:
+        return f"no controller: {design.reason}"
+    if not certify.certified:
+        return f"not certified: {design.reason}"
+    of = count(points, "operating point")
+    if settled < points:
+        return f"certified, but the loop does not settle at {points - settled} of {of}"
+    return f"certified: every requirement is met, and the loop settles at {settled} of {of}"
+
+
+def joints_numbers(
+    models: PointModels, certify: JointsCertificate, loop: JointsLoopResult, config: JointsConfig
+) -> tuple[Row, ...]:
+    """The numbers of a run for several joints that everybody sees first."""
+    rows = []
+    certificate = certify.certificate
+    if certificate is not None:
+        points = count(len(models.points), "operating point")
+        gamma = Quantity(at_most(certificate.gamma, 4), codec.plain(certificate.gamma))
+        rows.append(Row("", "worst case", gamma, f"over {points}; needed: 1 or less"))
+        sensors = min(verdict.output_disk.gain for verdict in certificate.verdicts)
+        actuators = min(verdict.input_disk.gain for verdict in certificate.verdicts)
+        for name, gain in (("sensors", sensors), ("actuators", actuators)):
+            value = Quantity(f"× {at_least(gain)}", codec.plain(gain))
+            rows.append(
+                Row(
+                    f"certificate.gain_at_{name}",
+                    f"gain at the {name}",
+                    value,
+                    "tolerated in all at once, up or down",
+                )
+            )
+    settled, total = loop.settled_points()
+    if not total:
+        return tuple(rows)
+    most = -float("inf")
+    place = ""
+    for run in loop.runs:
+        for joint, overshoot in zip(config.joints, run.overshoot.tolist(), strict=True):
+            if overshoot > most:
+                most = overshoot
+                place = f"{joint.output} at {run.point}, {run.condition}"
+    rows.append(
+        Row(
+            "closed_loop.overshoot_percent", "overshoot", Quantity.of(100 * most, "%"), f"largest, of {place}"
+        )
+    )
+    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
+    settles = Quantity(f"{settled} of {total}", settled)
+    verdict = Verdict.MET if settled == total else Verdict.MISSED
+    rows.append(Row("closed_loop.settled_points", "settles", settles, f"operating points, {arm}", verdict))
+    return tuple(rows)
+
+
+def fit_row(models: PointModels, config: JointsConfig) -> Row:
+    """Fit of each output over the operating points, the worst record of each."""
+    parts = []
+    for index, joint in enumerate(config.joints):
+        worst = [point.fit_percent.min(axis=0)[index] for point in models.points]
+        parts.append(f"{extent(worst, 3)} % ({joint.output})")
+    of = ", of the increments" if config.identification.increments else ""
+    return worded("fit", ", ".join(parts) + of)
+
+
+def models_section(models: PointModels, config: JointsConfig) -> Section:
+    """Every model with its fits, warnings, and the modes of the first."""
+    of = " of the increments" if config.identification.increments else ""
+    rows = []
+    for point in models.points:
+        fits = ", ".join(percent(fit) for fit in point.fit_percent.min(axis=0).tolist())
+        rows.append(worded(point.name, f"{count(point.states, 'state')}, fit {fits}{of}"))
+    for point in models.points:
+        for fresh in point.fresh:
+            fits = ", ".join(percent(fit.fit_percent) for fit in fresh)
+            rows.append(worded("kept back", f"{fresh[0].name}: fit {fits}"))
+    for point in models.points:
+        rows += [worded("warning", f"{point.name}: {words(item)}") for item in point.warnings]
+    for omega_rad_s, zeta, moved in models.points[0].modes:
+        if moved is None:
+            continue
+        motion = ", ".join(
+            f"{joint.output} {number(size, 2)}"
+            for joint, size in zip(config.joints, moved.tolist(), strict=True)
+        )
+        rows.append(worded("mode", f"{number(hertz(omega_rad_s))} Hz, damping {number(zeta, 2)}: {motion}"))
+    return Section("model", tuple(rows))
+
+
+def joints_certificate_section(certify: JointsCertificate) -> Section:
+    """Worst case at every operating point, and the loop at its limits."""
+    rows: list[Row] = []
+    for plant in () if certify.certificate is None else certify.certificate.verdicts:
+        if not plant.stable:
+            text = "unstable"
+        elif plant.obstacle:
+            text = plant.obstacle
+        else:
+            text = (
+                f"at most {number(max(plant.bounds.values()))} at all frequencies; gains at the sensors may "
+                f"change by {number(plant.output_disk.gain)} at once"
+            )
+        rows.append(worded(plant.plant, text))
+        if plant.limited is not None and plant.limited.steps:
+            met = "met" if plant.limited.ends else "NOT met"
+            away = (
+                f"{at_most(100 * plant.limited.worst, 3)} % away from where it must end (at most 2 %): {met}"
+            )
+            rows.append(worded(f"{plant.plant}, at the limits", away))
+    return Section("certificate", tuple(rows))
+
+
+def joints_loop_section(loop: JointsLoopResult) -> Section:
+    """How many operating points and runs settle."""
+    if loop.skipped:
+        return Section("closed loop", (worded("not run", loop.skipped),))
+    settled, points = loop.settled_points()
+    runs = sum(run.settled for run in loop.runs)
+    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
+    text = (
+        f"at {settled} of {count(points, 'operating point')}, {runs} of {count(len(loop.runs), 'run')}, {arm}"
+    )
+    return Section("closed loop", (worded("settles", text),))
+
+
+def joints_design_section(design: DesignResult, files: str) -> Section:
+    """Outcome of the design; files: columns and units of the controller's, where they are not plain."""
+    return Section("design", said(worded("worst case", design.reason), worded("controller files", files)))
+
+
+def joints_first_screen(view: AnyRunView) -> FirstScreen:
+    """What the page of a run for several joints begins with."""
+    config = view.config
+    results = view.results
+    models = results.identify
+    certificate = results.certify.certificate
+    loop = results.closed_loop
+    settled, points = loop.settled_points()
+    holds = is_certified_and_settles(results)
+    bullets = [results.design.reason]
+    if "as logged" in view.signals:
+        bullets.append(
+            "The controller's files take and give the columns as logged, this page does not. "
+            f"{sentence(view.signals)}"
+        )
+    if certificate is not None:
+        bullets += [f"{plant.plant}: {plant.obstacle}" for plant in certificate.verdicts if plant.obstacle]
+        for run in loop.runs:
+            if not run.settled:
+                bullets.append(f"{run.point}, {run.condition}: the loop does not settle.")
+        for run in loop.runs:
+            if run.limited > _OFTEN_LIMITED:
+                bullets.append(
+                    f"{run.point}, {run.condition}: an actuator is at its limit for {share(run.limited)} of "
+                    "the time."
+                )
+    if holds:
+        level = share(config.identification.level)
+        of = count(len(models.points), "operating point")
+        unchecked = link("unchecked", "What was not checked")
+        bullets.append(Markup("The certificate covers the {} balls at {}. {}.").format(level, of, unchecked))
+    if not all(point.shaped for point in models.points):
+        bullets.append("Not every mode has one shape; a mode without one has more than two states.")
+    headline = "Certified: every requirement is met"
+    if not holds:
+        headline = sentence(joints_verdict(results.design, results.certify, settled, points))[:-1]
+    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
+    picture = Picture(
+        "joint-steps",
+        f"A step of all joints at once: {arm}, at every operating point and under every condition.",
+        (view,),
+    )
+    rows = joints_numbers(models, results.certify, loop, config)
+    return FirstScreen(headline, "certified" if holds else "refused", rows, tuple(bullets), picture)
+
+
+def joints_pages(view: AnyRunView) -> list[PageSection]:
+    """Requirements, closed loop and model of a run for several joints."""
+    config = view.config
+    names = [joint.output for joint in config.joints]
+    results = view.results
+    blocks: list[Block] = [
+        Picture(
+            "joint-requirements",
+            "Largest singular value of each weighted function, the worst over the balls of all operating "
+            "points. At most 1 is needed.",
+            (view,),
+        )
+    ]
+    certificate = results.certify.certificate
+    if certificate is not None:
+        rows = tuple(
+            (
+                plant.plant,
+                number(max(plant.worst.values()), 4),
+                number(max(plant.bounds.values()), 4),
+                number(plant.stability_radius),
+                number(plant.output_disk.gain),
+                number(plant.input_disk.gain),
+                "yes" if plant.met else "no",
+            )
+            for plant in certificate.verdicts
+        )
+        head = (
+            "operating point",
+            "worst case on the grid",
+            "bound for all frequencies",
+            "uncertainty may grow by",
+            "gain at sensors",
+            "gain at actuators",
+            "specification met",
+        )
+        blocks.append(Table(head, rows, met=tuple(plant.met for plant in certificate.verdicts)))
+    runs = results.closed_loop.runs
+    of_runs = tuple(
+        (
+            run.point,
+            run.condition,
+            *(percent(overshoot) for overshoot in (100 * run.overshoot).clip(0).tolist()),
+            share(run.limited),
+            yes_no(run.settled),
+        )
+        for run in runs
+    )
+    overshoots = (f"overshoot of {name}" for name in names)
+    loop_head = ("operating point", "condition", *overshoots, "at a limit", "settles")
+    loop_table = Table(loop_head, of_runs, met=tuple(run.settled for run in runs))
+    return [
+        PageSection("requirements", "Requirements", "Requirements", tuple(blocks)),
+        PageSection("loop", "Closed loop", "Loop", (loop_table,)),
+        PageSection("model", "Model", "Model", tuple(_model_blocks(view, names))),
+    ]
+
+
+def _model_blocks(view: AnyRunView, names: Sequence[str]) -> list[Block]:
+    config = view.config
+    models = view.results.identify.points
+    level = share(config.identification.level)
+    increments = config.identification.increments
+    blocks: list[Block] = [
+        Remarks(sentences(point.warnings), "warning", f"Warnings about {point.name}") for point in models
+    ]
+    blocks += [
+        Picture(
+            "matrix-response",
+            f"Size of every channel at every operating point, with the range over its {level} ball.",
+            (view,),
+        ),
+        Picture(
+            "singular-values",
+            "Largest and smallest gain over all directions of the inputs at once, at every operating point, "
+            "with the range over its ball.",
+            (view,),
+        ),
+        Picture("mode-shapes", f"Modes of {models[0].name}: how much each joint moves.", (view,)),
+    ]
+    if increments:
+        blocks.append(
+            Text(
+                "The fit is that of differences between samples, in which sensor noise weighs most: 70 % may "
+                "be all that can be explained."
+            )
+        )
+    kept_back = any(point.fresh for point in models)
+    head = ["operating point", "states", *(f"fit of {name}" for name in names)]
+    if kept_back:
+        head.append("fit of records kept back")
+    head += [f"noise of {name}" for name in names]
+    rows = []
+    for point in models:
+        cells: list[object] = [point.name, point.states]
+        cells += [percent(fit) for fit in point.fit_percent.min(axis=0).tolist()]
+        if kept_back:
+            fits = [fit.fit_percent for record in point.fresh for fit in record]
+            cells.append(percent(min(fits)) if fits else "none")
+        cells += [
+            si(noise, view.results.records.unit(name))
+            for noise, name in zip(point.noise_std, names, strict=False)
+        ]
+        rows.append(tuple(cells))
+    blocks.append(Table(tuple(head), tuple(rows)))
+    how = ", in differences between samples" if increments else ""
+    blocks.append(
+        Picture(
+            "joint-validation",
+            f"Of the records that were kept back the one that the model meets worst{how}.",
+            (view,),
+        )
+    )
+    return blocks
+
+
+def joints_document(
+    models: PointModels, design: DesignResult, certify: JointsCertificate, loop: JointsLoopResult
+) -> dict[str, Any]:
+    """The stages for programs."""
+    return {
+        "points": [codec.plain(point, arrays=False) for point in models.points],
+        "design": {"gamma": design.gamma, "reason": design.reason},
+        "certificate": codec.plain(certify.certificate),
+        "closed_loop": codec.plain(loop, arrays=False),
+    }

@@ -1,0 +1,301 @@
+"""What was measured: records of a run, and how the logs of `flexlink identify` were read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, get_args
+
+from ident.data.distortion import Distortion
+from ident.data.record import Record
+from workflow.config.joints_config import JointsConfig
+from workflow.config.run_config import Notes, Role, RunConfig
+from workflow.describe.facts import (
+    Block,
+    PageSection,
+    Picture,
+    Remarks,
+    Row,
+    Section,
+    Table,
+    Text,
+    said,
+    worded,
+)
+from workflow.tasks.results import RecordsResult
+from workflow.text.formats import count, listing, number, sentence, setting, si
+from workflow.text.sentences.records import cut_off, signal, time_base
+from workflow.text.templates import words
+
+if TYPE_CHECKING:
+    from workflow.figures.subjects import AnyRunView, ChannelView
+
+# A command that is held for less than this share of a row changes between two rows.
+_HELD_THROUGH = 0.999
+
+ROLES: tuple[Role, ...] = get_args(Role)
+
+
+def records_section(records: RecordsResult) -> Section:
+    """How many records a run has by what they are used for, with samples and length."""
+    rows: list[Row] = []
+    for role in ROLES:
+        chosen = records.of_role(role)
+        if not chosen:
+            continue
+        samples = sum(item.record.n_samples for item in chosen)
+        length_s = sum(item.duration_s for item in chosen)
+        text = f"{count(len(chosen), 'record')}, {samples} samples, {si(length_s, 's', 4)}"
+        rows.append(worded(role, text))
+    return Section("records", tuple(rows))
+
+
+def logs_section(logs: Sequence[Record], input_limit: float | None) -> Section:
+    """How logs of one channel were read.
+
+    Args:
+        logs: All of them, at least one.
+        input_limit: What the amplifier gives, where it was stated.
+    """
+    first = logs[0]
+    return Section(
+        "logs",
+        said(
+            *(worded(record.name, time_base(record)) for record in logs),
+            worded("input", signal(first.input_names[0], first.input_units)),
+            worded("output", signal(first.output_names[0], first.output_units)),
+            worded("input limit", cut_off(logs, input_limit, "".join(first.input_units))),
+        ),
+    )
+
+
+def records_page(view: AnyRunView) -> PageSection:
+    """What was measured, and how it was read."""
+    config = view.config
+    several = isinstance(config, JointsConfig)
+    items = view.results.records.records
+    simulated = config.source.kind != "files"
+    inputs = list(dict.fromkeys(column.input for column in config.columns))
+    outputs = list(dict.fromkeys(column.output for column in config.columns))
+    rows = [
+        (
+            number_of,
+            item.name,
+            item.role,
+            item.record.n_samples,
+            number(item.duration_s),
+            "open" if item.record.reference is None else "closed",
+            "; ".join(text for text in (item.condition, item.remark) if text),
+        )
+        for number_of, item in enumerate(items, 1)
+    ]
+    head = ("no.", "record", "used for", "samples", "length [s]", "loop", "condition, remark")
+    blocks: list[Block] = [
+        Text(_about_records(view, simulated=simulated)),
+        Picture("records", "All records on one time axis.", (items, inputs, outputs)),
+        Table(head, tuple(rows)),
+        *_limit_blocks(view, several=several),
+    ]
+    effects = getattr(config.source, "effects", ())
+    if effects:
+        told = tuple((effect["name"], setting(effect)) for effect in effects)
+        blocks.append(Table(("effect on the simulated arm", "parameters"), told))
+    if not simulated:
+        read = tuple(f"{item.name}: {time_base(item.record)}" for item in items)
+        doubts = [sentence(words(doubt)) for item in items for doubt in item.record.doubts]
+        blocks.append(Remarks(read, "plain", "How time was read"))
+        blocks.append(Remarks(tuple(dict.fromkeys(doubts)), "warning"))
+    of_points = hasattr(config.source, "points")
+    if all(item.role != "validation" for item in items) and not of_points:
+        blocks.append(
+            Remarks(
+                (
+                    "There is no validation record: the model was not tested on new data. Give one record "
+                    "role = 'validation'.",
+                ),
+                "warning",
+            )
+        )
+    return PageSection("records", "Excitation and records", "Records", tuple(blocks))
+
+
+def _about_records(view: AnyRunView, *, simulated: bool) -> str:
+    """How many records there are, what they are used for, and what their command did between two rows."""
+    items = view.results.records.records
+    uses = {"estimation": "for estimation", "validation": "for validation", "repeat": "as repeats"}
+    split = []
+    for role, use in uses.items():
+        chosen = sum(item.role == role for item in items)
+        if chosen:
+            split.append(f"{chosen} {use}")
+    seconds = number(sum(item.duration_s for item in items))
+    step_ms = number(1000 * items[0].record.dt_s)
+    was = "was" if len(items) == 1 else "were"
+    source = "simulated" if simulated else "read from files"
+    text = (
+        f"{count(len(items), 'record')} ({seconds} s in all, sampled every {step_ms} ms) {was} {source}: "
+        f"{listing(split)}."
+    )
+    timing = view.results.records.timing
+    if timing is not None:
+        period_s = timing.period_s
+        if timing.rows_per_command > 1:
+            text += (
+                f" The command changes every {timing.rows_per_command} rows of the logs: the rows at which "
+                "it changes are used."
+            )
+        elif timing.known and period_s is not None and period_s < _HELD_THROUGH * timing.row_step_s:
+            text += (
+                f" The controller that made them held its command for {si(period_s, 's')}: the input is "
+                "filtered so that, held from row to row, it moves the arm as the recorded command did."
+            )
+        elif not timing.known:
+            text += (
+                " What the command did between two rows is not known: the ellipses hold every period up to "
+                f"{si(timing.row_step_s, 's')}."
+            )
+    controller_dt_s = None
+    if isinstance(view.config, RunConfig):
+        used = view.results.design.specification or view.config.specification
+        controller_dt_s = used.controller_dt_s
+    if controller_dt_s is not None:
+        text += (
+            f" The new controller runs every {si(controller_dt_s, 's')}; records, model and ellipses below "
+            "are at the step of the records."
+        )
+    return text
+
+
+def _limit_blocks(view: AnyRunView, *, several: bool) -> list[Block]:
+    """What was clipped to the amplifier's limit, or may have been."""
+    config = view.config
+    records = [item.record for item in view.results.records.records]
+    stated_limit = getattr(config.source, "input_limit", None)
+    cut = cut_off(records, stated_limit, view.results.records.unit(config.loops[0].input))
+    if cut:
+        return [Text(f"{cut}.")]
+    if stated_limit is not None:
+        return []
+    blocks: list[Block] = []
+    for index, loop in enumerate(config.loops):
+        about = config.joints[index] if several else view.results.design.specification or config.specification
+        limit = about.input_limit
+        largest = view.largest_recorded(loop.input)
+        if limit is None or largest <= limit:
+            continue
+        unit = view.results.records.unit(loop.input)
+        name = f" {loop.input}" if several else ""
+        key = "its input_limit" if several else "specification.input_limit"
+        blocks.append(
+            Remarks(
+                (
+                    f"The recorded input{name} reaches {si(largest, unit)}, beyond the {si(limit, unit)} of "
+                    f"{key}. If the amplifier clips there, the arm never got these commands: set input_limit "
+                    f"= {setting(limit)} in [source].",
+                ),
+                "warning",
+            )
+        )
+    return blocks
+
+
+def distortion_page(channel: ChannelView) -> PageSection:
+    """Noise and nonlinear distortion of a channel's records, as far as they show them."""
+    return PageSection(
+        "distortion", "Noise and nonlinear distortion", "Distortion", tuple(distortion_blocks(channel))
+    )
+
+
+def distortion_blocks(channel: ChannelView) -> list[Block]:
+    """Levels of noise and distortion by band."""
+    found, known, refused = channel.distortion
+    blocks: list[Block] = []
+    if refused:
+        blocks.append(Text(f"Not analysed: {refused}."))
+    blocks.append(Remarks(tuple(sentence(words(item)) for item in known), "plain"))
+    about = f"{channel.name}: gain" if channel.file else "Gain"
+    blocks.append(
+        Picture(
+            "distortion",
+            f"{about} and scatter at every frequency of the input. Points above the noise curve are "
+            "nonlinear distortion.",
+            (found, channel.units),
+            channel.file,
+        )
+    )
+    for levels in found:
+        if levels.excited is None or not len(levels.bands_rad_s):
+            continue
+        blocks.append(_distortion_table(levels, channel.units[0]))
+    return blocks
+
+
+def _distortion_table(levels: Distortion, input_unit: str) -> Table:
+    assert levels.excited is not None
+    rows = []
+    for low, high in levels.bands_rad_s:
+        at = levels.excited.within(low, high)
+        if at is None:
+            continue
+        odd = None if levels.odd is None else levels.odd.within(low, high)
+        even = None if levels.even is None else levels.even.within(low, high)
+        rows.append(
+            (
+                f"{number(low)} to {number(high)}",
+                number(100 * at.distortion, 2),
+                f"{number(100 * at.interval[0], 2)} to {number(100 * at.interval[1], 2)}",
+                number(None if odd is None else 100 * odd.distortion, 2),
+                number(None if even is None else 100 * even.distortion, 2),
+                number(100 * at.noise, 2),
+            )
+        )
+    head = (
+        "band [rad/s]",
+        "distortion, of the gain [%]",
+        "95 % interval [%]",
+        "odd lines [%]",
+        "even lines [%]",
+        "noise [%]",
+    )
+    caption = (
+        f"{si(levels.rms, input_unit)} rms: {count(levels.realisations, 'realisation')} of "
+        f"{count(levels.periods, 'period')}"
+    )
+    return Table(head, tuple(rows), caption)
+
+
+def rig_page(notes: Notes) -> PageSection:
+    """What the user says about the rig."""
+    blocks: list[Block] = [
+        Remarks(tuple(notes.known), "good", "Known"),
+        Remarks(tuple(notes.unknown), "warning", "Not known"),
+    ]
+    if not notes.known and not notes.unknown:
+        blocks.append(Text("The configuration says nothing about the rig ([notes] known, unknown)."))
+    return PageSection("rig", "What is known about the rig", "Rig", tuple(blocks))
+
+
+def reproduce_page(view: AnyRunView, *, is_design: bool) -> PageSection:
+    """Seed, versions and hashes; times differ from run to run and stay in the manifest.
+
+    Args:
+        view: The run.
+        is_design: The page stands away from the run's files, and names none of them.
+    """
+    manifest = view.manifest
+    rows: list[tuple[object, ...]] = [("seed of every random stream", view.config.run.seed)]
+    rows += sorted((manifest.get("versions") or {}).items(), key=lambda item: item[0].lower())
+    for name, stage in (manifest.get("stages") or {}).items():
+        if stage.get("taken_over_from"):
+            rows.append((f"stage {name}", f"taken over from {stage['taken_over_from']}"))
+    blocks: list[Block] = [Table(("what", "value"), tuple(rows))]
+    inputs = manifest.get("inputs")
+    if inputs:
+        blocks.append(Table(("input file", "SHA-256"), tuple(inputs.items())))
+    if not is_design:
+        blocks.append(
+            Text(
+                "Beside this page: the configuration as it was given (config.toml), times of the stages "
+                "(manifest.json)."
+            )
+        )
+    return PageSection("reproduce", "To reproduce this", "Reproduce", tuple(blocks))

@@ -1,0 +1,308 @@
+"""What a run says at its end, on a terminal and to programs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from control_design.controllers.engineers_numbers import ControllerNumbers, engineers_numbers
+from control_design.specification import Specification
+from ident.command_timing import CommandTiming
+from ident.data.finding import Finding
+from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.config.run_config import RunConfig
+from workflow.describe.certificate import certificate_section, margin_rows
+from workflow.describe.closed_loop import closed_loop_numbers, loop_numbers, loop_section
+from workflow.describe.controller import controller_section, pid_row
+from workflow.describe.design import design_section, filter_section, gave_way_text, run_verdict
+from workflow.describe.facts import Row, Section, answer, said, worded
+from workflow.describe.friction import amplitude_row, friction_row
+from workflow.describe.identification import model_rows
+from workflow.describe.joints import (
+    fit_row,
+    joints_certificate_section,
+    joints_design_section,
+    joints_document,
+    joints_loop_section,
+    joints_numbers,
+    joints_verdict,
+    models_section,
+)
+from workflow.describe.records import records_section
+from workflow.describe.summary import RunSummary
+from workflow.describe.uncertainty import channel_numbers, ellipse_rows, untold_below_rad_s
+from workflow.engine import codec
+from workflow.engine.run_directory import RunDirectory
+from workflow.tasks.design import bracket_numbers, joint_numbers
+from workflow.tasks.exports import Logged
+from workflow.tasks.giving_way import gave_way
+from workflow.tasks.pipeline import is_certified_and_settles
+from workflow.tasks.results import CertifyResult, DesignResult, RunResults
+from workflow.text.sentences.design import lowered, tracking_begins
+from workflow.text.sentences.friction import certified_for
+from workflow.text.templates import words
+
+
+def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
+    """What a run whose stages are all there says."""
+    if isinstance(config, JointsConfig):
+        sections = joints_sections(results, config)
+        several: Any = results
+        document = joints_document(several.identify, several.design, several.certify, several.closed_loop)
+        verdict = joints_verdict(several.design, several.certify, *several.closed_loop.settled_points())
+    else:
+        sections = run_sections(results, config)
+        document = run_document(results, config)
+        verdict = verdict_of_run(results, config)
+    return RunSummary(
+        title=title_of(config, results.run),
+        sections=sections,
+        numbers=with_rows(document, sections),
+        certified=is_certified_and_settles(results),
+        verdict=verdict,
+        report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
+        taken_over=results.run.taken_over(),
+    )
+
+
+def title_of(config: AnyConfig, run: RunDirectory) -> str:
+    """Headline of a run: what the configuration calls it, else its folder."""
+    named = config.run.name != type(config.run).model_fields["name"].default
+    return config.run.title or (config.run.name if named else run.path.resolve().name)
+
+
+def with_rows(document: Mapping[str, Any], sections: Sequence[Section]) -> dict[str, Any]:
+    """The stages of a run for programs, with every row that has a key in its place beside them.
+
+    Raises:
+        ValueError: A row has the key of something that is there.
+    """
+    return _merged(document, answer(sections))
+
+
+def _merged(document: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(document)
+    for key, value in more.items():
+        there = merged.get(key)
+        if isinstance(value, dict) and isinstance(there, dict):
+            merged[key] = _merged(there, value)
+        elif there is None:
+            merged[key] = value
+        else:
+            raise ValueError(f"the key {key!r} of a row is there already")
+    return merged
+
+
+def run_sections(results: RunResults, config: RunConfig) -> list[Section]:
+    """The closed loop and the plant of a run of one loop, with everything else as their parts."""
+    certify = results.certify
+    used = results.design.specification or config.specification
+    given_way = gave_way(config.specification, results.design.specification)
+    input_unit = results.records.unit(config.control_channel.input)
+    output_unit = results.records.unit(config.control_channel.output)
+    signals = signals_where_scaled(config, results)
+    numbers = numbers_of_controller(results, config)
+    loop = Section(
+        "closed loop",
+        said(
+            *loop_numbers(results, config),
+            *(() if certify.certificate is None else margin_rows(certify.certificate)),
+            worded("gave way", gave_way_text(given_way)),
+            pid_row(numbers),
+        ),
+        parts=(
+            loop_section(
+                results.closed_loop,
+                input_unit,
+                output_unit,
+                feedforward=config.closed_loop.friction_feedforward,
+            ),
+            certificate_section(
+                certify,
+                joint_numbers(certify.sampled),
+                certified_for(
+                    config.control_channel.uncertainty.response, results.uncertainty.equivalent, input_unit
+                ),
+                whole=False,
+            ),
+            design_section(
+                results.design,
+                results.achievable_performance,
+                used.controller_order,
+                bandwidth=lowered_bandwidth(results, config),
+                given_way=given_way,
+                tracking=tracking_begins(config.specification, results.design.specification),
+                files=signals,
+            ),
+            controller_section(numbers, used.computational_delay_samples, signals),
+            filter_section(results.reference_filter),
+        ),
+    )
+    friction = results.identify.friction
+    plant = Section(
+        "plant",
+        said(
+            None if friction is None else friction_row(friction, input_unit, output_unit),
+            first_warning([words(item) for item in warnings_of(results)]),
+        ),
+        parts=(
+            records_section(results.records),
+            *channel_sections(results),
+            Section("friction", said(amplitude_row(results.uncertainty.equivalent, input_unit))),
+        ),
+    )
+    return [loop, plant]
+
+
+def joints_sections(results: Any, config: JointsConfig) -> list[Section]:
+    """The closed loop and the plant of a run for several joints, with everything else as their parts.
+
+    Args:
+        results: `RunResults` whose stages are those of several joints.
+        config: Its configuration.
+    """
+    models = results.identify
+    certify = results.certify
+    loop = Section(
+        "closed loop",
+        joints_numbers(models, certify, results.closed_loop, config),
+        parts=(
+            joints_loop_section(results.closed_loop),
+            joints_certificate_section(certify),
+            joints_design_section(results.design, signals_where_scaled(config, results)),
+        ),
+    )
+    warnings = [words(item) for point in models.points for item in point.warnings]
+    plant = Section(
+        "plant",
+        said(fit_row(models, config), first_warning(warnings)),
+        parts=(records_section(results.records), models_section(models, config)),
+    )
+    return [loop, plant]
+
+
+def channel_sections(results: RunResults) -> list[Section]:
+    """Model and ellipses of every channel."""
+    sections = []
+    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+        rows = (
+            *model_rows(found, spread.intervals, whole=False),
+            *(worded("warning", words(item)) for item in found.identification.warnings),
+            *ellipse_rows(spread, whole=False),
+        )
+        sections.append(Section(f"channel {found.name}", rows))
+    return sections
+
+
+def warnings_of(results: RunResults) -> list[Finding]:
+    """Warnings about the models, and residual tests that fail, channel by channel."""
+    warnings: list[Finding] = []
+    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+        warnings += found.identification.warnings
+        warnings += [test.finding for test in spread.tests if not test.passed]
+    return warnings
+
+
+def first_warning(warnings: Sequence[str]) -> Row | None:
+    """The first of several warnings, and how many more there are; each counts once."""
+    distinct = list(dict.fromkeys(warnings))
+    if not distinct:
+        return None
+    more = f" ({len(distinct) - 1} more: --verbose)" if len(distinct) > 1 else ""
+    return worded("warning", f"{distinct[0]}{more}")
+
+
+def signals_where_scaled(config: AnyConfig, results: RunResults) -> str:
+    """What the controller's files take and give, where that is not the quantities of the model; else ""."""
+    signals = Logged.of(config, results.records).signals
+    return signals if "as logged" in signals else ""
+
+
+def lowered_bandwidth(results: RunResults, config: RunConfig) -> str:
+    """Which bandwidth is which where a lower one was taken than specified; "" elsewhere."""
+    design = results.design
+    blocking = () if design.synthesis is None else design.synthesis.blocking
+    reached = bandwidth_numbers(design, results.certify, config.specification)["reached"]
+    return lowered(config.specification, design.specification, blocking, reached or 0.0)
+
+
+def numbers_of_controller(results: RunResults, config: AnyConfig) -> ControllerNumbers | None:
+    """The controller in an engineer's numbers, as the run's files have it; None without one, for several
+    joints, and where it has no such factors."""
+    if not isinstance(config, RunConfig) or results.design.controller is None:
+        return None
+    return engineers_numbers(Logged.of(config, results.records).law(results.design.controller))
+
+
+def verdict_of_run(results: RunResults, config: RunConfig) -> str:
+    """The verdict on a run of one loop in one line."""
+    design = results.design
+    return run_verdict(
+        design,
+        results.certify,
+        results.closed_loop,
+        results.achievable_performance,
+        (design.specification or config.specification).controller_order,
+        untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
+        results.uncertainty.conditions(config),
+        config.specification,
+        results.identify.modes_rad_s,
+    )
+
+
+def run_document(results: RunResults, config: RunConfig) -> dict[str, Any]:
+    """The stages of a run of one loop for programs."""
+    design = results.design
+    certify = results.certify
+    synthesis = design.synthesis
+    pairs = zip(results.identify.channels, results.uncertainty.channels, strict=True)
+    numbers = numbers_of_controller(results, config)
+    used = design.specification or config.specification
+    return {
+        "command_timing": timing_numbers(results.records.timing),
+        "channels": [channel_numbers(found, spread) for found, spread in pairs],
+        "design": {
+            "met": design.met,
+            "reason": design.reason,
+            "gamma": design.gamma,
+            "outcome": "IMPOSSIBLE" if synthesis is None else synthesis.outcome.name,
+            "blocking": [] if synthesis is None else codec.plain(synthesis.blocking),
+            "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
+            "gave_way": codec.plain(gave_way(config.specification, design.specification)),
+            "tracking_from_rad_s": used.tracking_from_rad_s,
+            "controller_dt_s": None if design.controller is None else design.controller.dt_s,
+        },
+        "engineers_numbers": None if numbers is None else numbers.to_dict(),
+        "signals": Logged.of(config, results.records).signals,
+        "certificate": codec.plain(certify.certificate),
+        "certificate_conditions": [words(doubt) for doubt in results.uncertainty.conditions(config)],
+        "achievable_performance": bracket_numbers(results.achievable_performance, design.gamma),
+        "sampled_responses": joint_numbers(certify.sampled),
+        "reference_filter": codec.plain(results.reference_filter.filter),
+        "closed_loop": closed_loop_numbers(results.closed_loop),
+    }
+
+
+def timing_numbers(timing: CommandTiming | None) -> dict[str, Any] | None:
+    """How the period of the controller that made the logs is known; None of simulated records."""
+    if timing is None:
+        return None
+    return {
+        "source": timing.source.value,
+        "row_step_s": timing.row_step_s,
+        "controller_period_s": timing.period_s,
+        "rows_per_command": timing.rows_per_command,
+        "known": timing.known,
+    }
+
+
+def bandwidth_numbers(
+    design: DesignResult, certify: CertifyResult, asked: Specification
+) -> dict[str, float | None]:
+    """Specified, designed for, and reached: up to there every plant has |S| below -3 dB."""
+    plants = () if certify.certificate is None else certify.certificate.plants
+    return {
+        "specified": asked.bandwidth_rad_s,
+        "designed_for": (design.specification or asked).bandwidth_rad_s,
+        "reached": min((plant.bandwidth_rad_s for plant in plants), default=None),
+    }
