@@ -49,7 +49,7 @@ def save(model: GobfModel, path: Path) -> None:
 def _macros() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
-    from workflow.diagnose.words import times_noise
+    from workflow.describe.diagnosis_words import times_noise
     from workflow.text.formats import at_least, at_most, bound, listing
     from workflow.text.templates import words
 

@@ -5,8 +5,9 @@ from dataclasses import replace
 import pytest
 
 from diagnosis.where.findings import Alternative, Dependence, PartGap, Where
-from workflow.diagnose.words import FILTERS
+from workflow.engine import codec
 from workflow.figures.gap_where import draw_dependences
+from workflow.text.dependence import alternatives_words, dependence_line, dependence_words
 
 SPRING = Dependence(
     place="elbow", acts="force", quantity="position", of="elbow", unit="rad", own=True, value_unit="N m",
@@ -41,18 +42,18 @@ PART = PartGap(5.0, (4.0, 6.0), 1.0, (0.9, 1.0), 0.0, True)
     ],
 )  # fmt: skip
 def test_a_dependence_is_said_with_its_size_and_unit(changed, said):
-    assert said in FILTERS["dependence_line"](replace(SPRING, **changed))
+    assert said in dependence_line(codec.plain(replace(SPRING, **changed)))
 
 
 def test_a_sentence_says_what_a_constant_does_and_what_else_it_may_be():
     also = Alternative("elbow", "command", "motor2", "", 0.52)
     told = replace(SPRING, constant_share=0.2, also=(also,), beside=True)
-    said = FILTERS["dependence"](told)
+    said = dependence_words(codec.plain(told))
     assert said.startswith("beside that, the error depends on the angle of elbow: a missing torque at elbow")
     assert "(what is constant in it alone: 20 %)" in said
     assert "sensor" not in said
-    assert "the command motor2 (52 %, at elbow)" in FILTERS["alternatives"](told)
-    assert FILTERS["alternatives"](SPRING) == ""
+    assert "the command motor2 (52 %, at elbow)" in alternatives_words(codec.plain(told))
+    assert alternatives_words(codec.plain(SPRING)) == ""
 
 
 def test_each_dependence_has_a_panel_with_units():

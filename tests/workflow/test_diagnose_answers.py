@@ -25,14 +25,15 @@ from flexlink import shown
 from plant.effects.joint import GroundSpring
 from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
+from workflow.describe.fleet import FleetMachine, overview_page
 from workflow.describe.summary import RunSummary
 from workflow.diagnose import command, outputs, pages
 from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import load_case
-from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase
+from workflow.report.rendering import render_described
 from workflow.text.templates import environment
 
 TWO = ("dry friction", "backlash")
@@ -206,7 +207,7 @@ def drawn(loaded, found, coming, monkeypatch):
         for count in (1, 2)
     )
     assert several.sections
-    command._overview([FleetMachine.of(document)] * 2, {"other": "no such luck"})
+    render_described(overview_page([FleetMachine.of(document)] * 2, {"other": "no such luck"}))
     rows = [(row.name, row.text) for section in one.sections for row in section.rows]
     assert shown.text(found)
     return document, " ".join(page.split()), rows

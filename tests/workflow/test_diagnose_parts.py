@@ -7,9 +7,10 @@ from diagnosis.machine.case import Case, Experiment
 from plant import EFFECTS, parse_effects, simulate
 from plant.effects import in_words
 from tests.workflow.diagnosis_examples import small_rig
-from workflow.diagnose import words as told
-from workflow.diagnose.controller_check import check_controller, sampled_linear_machine
-from workflow.text import formats
+from workflow.describe import diagnosis_words as told
+from workflow.describe.diagnosis_rows import short_answer
+from workflow.tasks.controller_check import check_controller, sampled_linear_machine
+from workflow.text.names import name_words, unit_of
 
 LINEAR = {
     "nothing": [],
@@ -84,9 +85,9 @@ def test_every_effect_has_words_and_every_parameter_its_unit():
     for name, effect in EFFECTS.items():
         assert in_words(name) != name.replace("_", " "), name
         for parameter in effect.model_fields:
-            assert told.unit_of(parameter) or parameter in ("ratio", "cycles_per_rev"), parameter
-    assert told.unit_of("stiffness_Nm_rad") == "N m/rad"
-    assert told.unit_of("hub.inertia_kg_m2") == "kg m²"
+            assert unit_of(parameter) or parameter in ("ratio", "cycles_per_rev"), parameter
+    assert unit_of("stiffness_Nm_rad") == "N m/rad"
+    assert unit_of("hub.inertia_kg_m2") == "kg m²"
     assert told.parameter_words("delay_s", 0.012, (0.011, 0.013)) == "delay 0.012 s (95 %: 0.011 to 0.013)"
     assert told.parameter_words("ratio", 1.25, None) == "ratio 1.25"
     assert told.key_words("link.youngs_modulus_Pa") == "Young's modulus (link)"
@@ -100,11 +101,6 @@ def test_no_probability_is_called_certain():
     assert told.probability_words(0.996) == "99.6 %"
 
 
-def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
-    """The shared macros of a diagnosis' page go through the shared ones."""
-    assert not set(told.FILTERS) & (set(formats.FILTERS) | {"words"})
-
-
 @pytest.mark.parametrize(
     ("verdict", "needs", "said"),
     [
@@ -116,7 +112,7 @@ def test_filters_of_diagnoses_hide_none_of_the_shared_ones():
 def test_an_answer_of_which_nothing_was_tried_names_none_of_the_candidates(verdict, needs, said):
     presence = {f"effect_{k}": {"probability": 0.1, "needs": need} for k, need in enumerate(needs)}
     document = {"detail_verdict": verdict, "verdict": verdict, "combination": [], "presence": presence}
-    assert told.short_answer(document) == said
+    assert short_answer(document) == said
 
 
 @pytest.mark.parametrize(
@@ -131,7 +127,7 @@ def test_no_model_error_is_significant_only_where_that_is_all(complete, said):
         "detail_verdict": "none", "verdict": "none", "combination": [], "presence": {}, "shares": {},
         "completeness": {"probability": complete},
     }  # fmt: skip
-    assert told.short_answer(document) == said
+    assert short_answer(document) == said
 
 
 @pytest.mark.parametrize(
@@ -144,4 +140,4 @@ def test_no_model_error_is_significant_only_where_that_is_all(complete, said):
     ],
 )
 def test_a_name_is_words_and_a_unit(name, words, unit):
-    assert (told.FILTERS["parameter_name"](name), told.unit_of(name)) == (words, unit)
+    assert (name_words(name), unit_of(name)) == (words, unit)

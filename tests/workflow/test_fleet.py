@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from workflow.describe import fleet
 from workflow.describe.summary import RunSummary
-from workflow.diagnose import command, fleet
+from workflow.diagnose import command
 from workflow.engine import codec
 from workflow.engine.executor import Failure
+from workflow.report.rendering import render_described
 
 
 def machine(name: str, level: float | None = None, value: float = 1.0, **more) -> fleet.FleetMachine:
@@ -99,7 +101,7 @@ def test_machines_of_one_cause_come_apart_where_their_sizes_have_a_gap():
     assert [len(group.machines) for group in found] == [7, 5, 4, 1]
     size = ("elbow.frictionloss", "level_Nm")
     assert [group.apart for group in found] == [size, size, size, None]
-    page = command._overview(every, {})
+    page = render_described(fleet.overview_page(every, {})).html
     assert all(f"level {group.sizes[size][1]:.3g} N m to" in page for group in found[:3])
     # Of negative sizes the same, and a size that only some have sets nothing apart.
     tilted = [machine(f"{k}", -level) for k, level in enumerate([1, 1.1, 1.05, 9, 9.5, 9.2])]

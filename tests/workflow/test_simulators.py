@@ -15,13 +15,13 @@ from scipy.signal import lfilter
 
 from diagnosis import Change
 from diagnosis.machine.telling import Alike, Telling, telling
+from plant.effects import in_words
 from tests.workflow.command import ROOT
+from workflow.describe.fleet import FleetMachine
 from workflow.diagnose import check
 from workflow.diagnose.command import _summary
-from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.simulator_case import load_simulator_case
 from workflow.diagnose.simulator_settings import settings_of
-from workflow.diagnose.words import FILTERS
 from workflow.engine.errors import InputError
 
 # A model that multiplies.
@@ -698,8 +698,8 @@ def test_advice_stays_a_sentence_and_names_are_those_of_the_model():
     alike = tuple(Alike((f"a_{k}.x", f"b_{k}.y"), 0.1) for k in range(8))
     (words,) = check._advice(Telling({}, (), alike))
     assert words.startswith("for a_0.x and b_0.y; a_1.x and b_1.y and 6 more groups: record at another speed")
-    assert FILTERS["effect"]("elbow_cmd.delay") == "elbow_cmd.delay"
-    assert FILTERS["effect"]("own_effect") == "own effect"
+    assert in_words("elbow_cmd.delay") == "elbow_cmd.delay"
+    assert in_words("own_effect") == "own effect"
 
 
 @pytest.mark.parametrize("command", [("check",), ("diagnose", "--out", "found")])

@@ -13,8 +13,8 @@ from diagnosis.machine.own_plant import Plant
 from diagnosis.next_experiment.next_experiment import NextExperiment, Separation
 from diagnosis.next_experiment.repeat import Repeat
 from plant.effects import EFFECTS, in_words
+from workflow.describe.diagnosis_words import names_words, probability_words, setting_words, with_sizes
 from workflow.diagnose.following import Following
-from workflow.diagnose.words import parameter_words, probability_words, setting_words
 from workflow.text.formats import interval, listing, number, si
 from workflow.text.names import stated_name
 
@@ -54,11 +54,7 @@ def _time(found: Diagnosis, coming: Following) -> Iterator[str]:
 
 
 def _confirm(found: Diagnosis, coming: Following) -> Iterator[str]:
-    sizes = []
-    for effect in found.unlisted:
-        parameters = [parameter_words(key, value) for key, value in effect.parameters().items()]
-        sizes.append(f"{in_words(effect.id)} ({' and '.join(parameters)})")
-    yield f"Look at the machine for {' and '.join(sizes)}: one run without it would confirm it."
+    yield f"Look at the machine for {with_sizes(found.unlisted)}: one run without it would confirm it."
 
 
 def _repeat_worst(found: Diagnosis, coming: Following) -> Iterator[str]:
@@ -95,7 +91,7 @@ def _none(found: Diagnosis, coming: Following) -> Iterator[str]:
 
 def _look(found: Diagnosis, coming: Following) -> Iterator[str]:
     open_answers = _open_answers(found)
-    left_open = f"These records leave {listing([in_words(name) for name in open_answers])} open."
+    left_open = f"These records leave {names_words(open_answers)} open."
     repeat = coming.repeat
     if repeat is not None and repeat.separates:
         yield f"{_of_repeat(repeat)} {left_open}"

@@ -7,25 +7,23 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.probed import doubtful_columns
 from diagnosis.machine.telling import Telling, telling
-from workflow.describe.from_template import rows_of
+from workflow.describe.check import Candidates, LogSeen, check_sections
 from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_settings import case_document
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
 from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
-from workflow.diagnose.words import FILTERS
 from workflow.engine import codec
 from workflow.engine.errors import InputError
 from workflow.text.formats import listing
 
-# Groups that are shown, those that are most alike; candidates of every list; what a next record needs.
-_MOST_SHOWN, _MOST_LISTED, _MOST_ADVICE = 8, 20, 6
+# Groups that are shown, those that are most alike; what a next record needs.
+_MOST_SHOWN, _MOST_ADVICE = 8, 6
 _NAMED = 2  # groups that one sentence of advice names: it stays a sentence
 # A command with more values than these may be cut that is at the ends of its range for this share of the
 # time, and at one of them so many times longer than at other levels that it holds.
@@ -72,38 +70,32 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     alike = tuple(sorted(found.alike, key=lambda one: (len(one.names), one.left)))
     shown = dict(sorted(found.least.items(), key=lambda item: item[1]))
     first = replace(found, least=shown, alike=alike[:_MOST_SHOWN])
-    told = {
-        "logs": logs,
-        "doubts": doubts,
-        "dt_s": case.dt_s,
-        "telling": first,
-        "shows": [name for name in shown if name not in found.hidden],
-        "most": _MOST_LISTED,
-        "more": len(alike) - len(first.alike),
-        "sizes": {
-            effect.name: loaded.units.get(effect.name, {}).get(size, size)
-            for effect in case.plant.effects
-            for size in [effect.parameters[0].name]
-        },
-        "limits": [effect.name for effect in case.plant.effects if not effect.grows],
-        "units": case.units,
-        "values": {name: case.plant.value(key) for name, key in case.plant.value_candidates.items()},
-        "value_names": {
-            name: next((one.name for one in of[key].parameters), "") if key in of else key
-            for name, key in case.plant.value_candidates.items()
-        },
-        "untried": untried,
-        "advice": list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE],
+    sizes = {
+        effect.name: loaded.units.get(effect.name, {}).get(size, size)
+        for effect in case.plant.effects
+        for size in [effect.parameters[0].name]
     }
+    values = {}
+    for name, key in case.plant.value_candidates.items():
+        with_unit = key
+        if key in of:
+            with_unit = next((parameter.name for parameter in of[key].parameters), "")
+        values[name] = (case.plant.value(key), with_unit)
+    limits = [effect.name for effect in case.plant.effects if not effect.grows]
+    advice = list(dict.fromkeys(_advice(first)))[:_MOST_ADVICE]
     return RunSummary(
         title=case.name,
-        sections=rows_of("summary/check.j2", FILTERS.items(), **told),
-        numbers={
-            "logs": codec.plain(logs),
-            "doubts": list(doubts),
-            **codec.plain(found),
-            "advice": told["advice"],
-        },
+        sections=check_sections(
+            logs,
+            case.dt_s,
+            case.units,
+            doubts,
+            first,
+            Candidates(sizes, values, limits, untried),
+            advice,
+            groups_left_out=len(alike) - len(first.alike),
+        ),
+        numbers={"logs": codec.plain(logs), "doubts": list(doubts), **codec.plain(found), "advice": advice},
         verdict=f"{len(shown) - len(found.hidden)} of {len(shown)} candidates show"
         + (
             f"; {len(alike)} groups of them look alike in these records, if one of them is present. "
@@ -114,15 +106,15 @@ def of_case(loaded: SimulatorCase, found: Telling) -> RunSummary:
     )
 
 
-def _log(loaded: SimulatorCase, k: int) -> dict[str, Any]:
+def _log(loaded: SimulatorCase, k: int) -> LogSeen:
     case = loaded.case
     e, limited = case.experiments[k], {}
     for name, command in zip(loaded.inputs, e.input.T, strict=False):  # behind them what was measured
         if share := _at_ends(command):
             limited[name] = share
     motion = np.std(e.output, axis=0)
-    outputs = list(zip(case.outputs, map(float, motion), map(float, case.noise), strict=True))
-    return {"name": e.name, "role": e.role, "samples": len(e.output), "outputs": outputs, "limited": limited}
+    outputs = tuple(zip(case.outputs, map(float, motion), map(float, case.noise), strict=True))
+    return LogSeen(e.name, e.role, len(e.output), outputs, limited)
 
 
 def _at_ends(command: Real) -> float:

@@ -14,16 +14,15 @@ from typing import Any
 from diagnosis.answer import Diagnosis
 from diagnosis.diagnosis import diagnose
 from workflow.config.settings import repeated
-from workflow.describe.from_template import rows_of
+from workflow.describe.diagnosis_rows import diagnosis_section, failed_case, short_answer
+from workflow.describe.fleet import FleetMachine, csv_text, groups, machines_section, overview_page, trends
 from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import LAYOUT_VERSION, DiagnosisDirectory
-from workflow.diagnose.fleet import FleetMachine, csv_text, groups, trends
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
 from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of
-from workflow.diagnose.words import FILTERS, short_answer
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import (
@@ -37,11 +36,11 @@ from workflow.engine.errors import (
 )
 from workflow.engine.executor import Executor, Failure, Report, ThisProcess, workers
 from workflow.engine.progress import Progress
-from workflow.report.rendering import render_page
+from workflow.report.rendering import render_described
 
 _Failed = tuple[str, Failure]  # case, why it has no answer
 _CASE_S = 30.0  # expected: it shapes the progress bar only
-# Of more cases the terminal shows groups alone, and the overview draws no line for each.
+# Of more cases the terminal shows groups alone.
 _MOST_SHOWN = 20
 
 
@@ -139,7 +138,8 @@ def diagnose_cases(
             page = out / "index.html"
             with progress.stage("overview"):
                 failed = {case: failure.reason for case, failure in failures}
-                overview, table = _overview(machines, failed), csv_text(machines, failed)
+                overview = render_described(overview_page(machines, failed)).html
+                table = csv_text(machines, failed)
                 directory.write({"index.html": overview.encode(), "fleet.csv": table.encode()})
         summary = _summary(documents, machines, failures, page)
     return DiagnosisRun(documents, tuple(failures), summary)
@@ -287,37 +287,20 @@ def _compute(
     )
 
 
-def _overview(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -> str:
-    """The page of several cases: groups of one cause, trends, a picture, a table with links, what failed."""
-    return render_page(
-        "diagnosis/overview.html.j2",
-        filters=FILTERS.items(),
-        title="Gap diagnosis",
-        cases=machines,
-        groups=groups(machines),
-        trends=trends(machines),
-        drawn=len(machines) <= _MOST_SHOWN,
-        failed=failed,
-    ).html
-
-
 def _summary(
     documents: Answers, machines: Sequence[FleetMachine], failures: Sequence[_Failed], page: Path
 ) -> RunSummary:
-    count, several = len(documents), len(documents) > 1
+    count = len(documents)
+    sections = []
+    if count > 1:
+        sections.append(machines_section(groups(machines), trends(machines)))
+    if count <= _MOST_SHOWN:
+        sections += [diagnosis_section(document, page.parent) for document in documents]
+    sections += [failed_case(case, failure.reason) for case, failure in failures]
+    alone = count == 1 and not failures
     return RunSummary(
         title="Gap diagnosis",
-        sections=rows_of(
-            "diagnosis/summary.j2",
-            FILTERS.items(),
-            documents=documents if count <= _MOST_SHOWN else (),
-            groups=groups(machines) if several else (),
-            trends=trends(machines) if several else (),
-            failures=failures,
-            folder=page.parent,
-        ),
-        verdict=short_answer(documents[0])
-        if count == 1 and not failures
-        else f"{count} of {count + len(failures)} cases answered",
+        sections=sections,
+        verdict=short_answer(documents[0]) if alone else f"{count} of {count + len(failures)} cases answered",
         report_path=str(page) if documents or failures else None,
     )

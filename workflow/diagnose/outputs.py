@@ -14,18 +14,19 @@ from diagnosis.answer import Diagnosis
 from diagnosis.machine.telling import telling
 from diagnosis.where.where import where, where_in_records
 from plant.rig import Rig
+from workflow.describe.diagnosis_view import DiagnosisView, moved, shown
 from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.check import of_case
-from workflow.diagnose.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.diagnose.directory import answer_text
 from workflow.diagnose.document import completeness_of, document_of
 from workflow.diagnose.following import following
-from workflow.diagnose.pages import case_page, moved, plant_page, remains_of, shown
+from workflow.diagnose.pages import case_page, plant_page, remains_of
 from workflow.diagnose.simulator_case import SimulatorCase, with_units
 from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
+from workflow.tasks.controller_check import ControllerCheck, NoControllerError, check_controller
 from workflow.text.templates import render_text
 
 # Seconds for what records can tell.
@@ -83,17 +84,15 @@ def _of_rig(
         case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
     )
     html = case_page(
-        found,
-        lambda f, m: report(_DIAGNOSED + (1 - _DIAGNOSED) * f, f"drawing {m}"),
-        loaded=loaded,
-        where=place,
-        remains=remains,
-        next_experiment=coming,
-        advice=advice,
+        DiagnosisView(found, place, remains),
+        loaded,
+        coming,
+        advice,
         check=check,
         no_check=no_check,
         rig_text=rig,
         effects_text=effects,
+        progress=lambda f, m: report(_DIAGNOSED + (1 - _DIAGNOSED) * f, f"drawing {m}"),
     )
     files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
     if effects:

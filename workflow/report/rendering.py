@@ -13,6 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
+from workflow.describe.page import Page
 from workflow.figures.style import drawings
 from workflow.figures.svg import COMMON_STYLE, Drawn, drawn, style_of
 from workflow.text.templates import environment
@@ -64,6 +65,11 @@ def render_page(
     # The name of a file, in a locale that cannot read it, holds halves of characters.
     html = html.encode("utf-8", "replace").decode()
     return RenderedPage(html.strip() + "\n", pictures, styles)
+
+
+def render_described(page: Page, progress: Callable[[float, str], None] | None = None) -> RenderedPage:
+    """A page whose sentences `workflow.describe` has made; equal pages give equal bytes."""
+    return render_page("described.html.j2", progress, title=page.title, page=page)
 
 
 @dataclass(frozen=True)

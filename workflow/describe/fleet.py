@@ -1,4 +1,7 @@
-"""Many machines at once: those of one cause and size together, sizes that change with their numbers."""
+"""Many machines at once: those of one cause and size together, sizes that change with their numbers.
+
+Groups and trends, and what terminal and overview say of them.
+"""
 
 from __future__ import annotations
 
@@ -11,13 +14,26 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from plant.effects import in_words
-from workflow.diagnose.words import closure_words, short_answer
-from workflow.text.formats import listing
+from workflow.describe.diagnosis_rows import explained_words, present_of, short_answer
+from workflow.describe.diagnosis_words import (
+    key_words,
+    names_words,
+    probability_words,
+    times_noise,
+    value_words,
+)
+from workflow.describe.facts import Picture, Quantity, Row, Section
+from workflow.describe.page import FirstScreen, Line, Page, PageSection, Table, Warnings, link
+from workflow.text.formats import count, listing, sentence
+from workflow.text.names import stated_name
 
 # Chance of one false trend in an overview, or one false gap among sizes, all of them together (Bonferroni).
 _FALSE_TREND = 0.01
+# Machines that a group names, and machines of an overview with a line each in its picture.
+_MOST_NAMED, _MOST_DRAWN = 12, 20
 # With fewer machines no order of them is as unlikely as that.
 _LEAST_MACHINES = 6
 _NUMBERS = ("probability", "gap_before", "gap_refit", "gap_after", "noise_floor")
@@ -41,16 +57,12 @@ class FleetMachine:
     @property
     def cause(self) -> str:
         """The effects, without how sure they are; where none is named, the answer."""
-        return listing([in_words(name) for name in self.effects]) if self.effects else self.answer
+        return names_words(self.effects) if self.effects else self.answer
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> FleetMachine:
         """Of a JSON answer."""
-        present = {
-            name: effect
-            for name, effect in document["presence"].items()
-            if name in document["combination"] or effect["probability"] >= 0.5
-        }
+        present = {name: document["presence"][name] for name in present_of(document)}
         unknown = (float("nan"), float("nan"))
         return cls(
             document["case"],
@@ -58,7 +70,7 @@ class FleetMachine:
             document["verdict"] != "unknown" and document["detail_verdict"] != "not_converged",
             tuple(sorted(present)),
             short_answer(document),
-            closure_words(document),
+            explained_words(document),
             {key: document[key] for key in _NUMBERS},
             {
                 (name, key): (value, *(effect["intervals"].get(key) or unknown))
@@ -208,3 +220,126 @@ def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> s
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
+
+
+def trend_words(trend: Trend) -> str:
+    """A trend in one sentence without its full stop."""
+    what = key_words(trend.parameter)
+    if trend.effect:
+        what = f"{in_words(trend.effect)}: {stated_name(trend.parameter)}"
+    grows = "grows" if trend.tau > 0 else "falls"
+    slope = value_words(trend.parameter, abs(trend.per_number))
+    return (
+        f"{what} {grows} with the number in the name, by {slope} per number (Kendall's tau {trend.tau:.2f}, "
+        f"p = {trend.p:.1g}, {trend.machines} machines)"
+    )
+
+
+def machines_section(found: Sequence[Group], found_trends: Sequence[Trend]) -> Section:
+    """Groups and trends on a terminal."""
+    rows = []
+    for group in found:
+        words = group.cause
+        for (effect, key), (middle, low, high) in group.sizes.items():
+            extent = f"{value_words(key, low)} to {value_words(key, high)}"
+            words += f"; {in_words(effect)}: {stated_name(key)} {value_words(key, middle)} ({extent})"
+        rows.append(Row("", count(len(group.machines), "machine"), Quantity.words(words)))
+    rows += [Row("", "trend", Quantity.words(trend_words(trend))) for trend in found_trends]
+    return Section("machines", tuple(rows))
+
+
+def overview_page(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -> Page:
+    """The page of several cases.
+
+    Args:
+        machines: Those with an answer.
+        failed: Case without an answer -> why.
+    """
+    found = groups(machines)
+    bullets = [_group_words(group) for group in found]
+    bullets += [sentence(trend_words(trend)) for trend in trends(machines)]
+    sections = []
+    causes = causes_table(found)
+    if causes.lines:
+        sections.append(PageSection("causes", "Machines of one cause", "Causes", (causes,), open=True))
+    if machines:
+        picture = Picture(
+            "gap_overview",
+            "RMS of (measured - model) over the sensor noise, validation records.",
+            (machines,),
+        )
+        drawn = (picture,) if len(machines) <= _MOST_DRAWN else ()
+        blocks = (*drawn, cases_table(machines))
+        sections.append(PageSection("cases", "All cases", "Cases", blocks, open=True))
+    if failed:
+        reasons = Warnings(tuple(f"{case}: {reason}" for case, reason in failed.items()))
+        sections.append(PageSection("failed", "Cases without an answer", "Failed", (reasons,), open=True))
+    first = FirstScreen(
+        outcome_words(machines, failed),
+        (),
+        tuple(bullets),
+        anchor="verdict",
+        short="Outcome",
+        all_bullets=True,
+    )
+    return Page("Gap diagnosis", first, tuple(sections))
+
+
+def outcome_words(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -> str:
+    """How many cases have which kind of answer."""
+    verdicts = Counter(machine.verdict for machine in machines)
+    kinds = [
+        (verdicts["effect"], "with a named effect"),
+        (verdicts["none"], "without a model error"),
+        (verdicts["unknown"], "with none of the candidate effects"),
+        (len(failed), "failed"),
+    ]
+    parts = listing([f"{number} {what}" for number, what in kinds if number])
+    return f"{count(len(machines) + len(failed), 'case')}: {parts}"
+
+
+def _group_words(group: Group) -> str:
+    """Machines of one cause, with links to their pages."""
+    words = f"{count(len(group.machines), 'machine')}: {group.cause}"
+    if group.apart:
+        key = group.apart[1]
+        _, low, high = group.sizes[group.apart]
+        words += f", {stated_name(key)} {value_words(key, low)} to {value_words(key, high)}"
+    names = [link(one.name, f"{one.name}.html") for one in group.machines[:_MOST_NAMED]]
+    more = ", …" if len(group.machines) > _MOST_NAMED else ""
+    return Markup("{} ({}{})").format(words, Markup(", ").join(names), more)
+
+
+def causes_table(found: Sequence[Group]) -> Table:
+    """Sizes of the effects of every group."""
+    lines: list[tuple[str, ...]] = []
+    for group in found:
+        of_group = (group.cause, str(len(group.machines)))
+        for (effect, key), sizes in group.sizes.items():
+            values = [value_words(key, size) for size in sizes]
+            lines.append((*of_group, in_words(effect), stated_name(key), *values))
+            of_group = ("", "")
+    return Table.of(
+        ("cause", "machines", "effect", "parameter", "median", "smallest", "largest"),
+        lines,
+        "A row of everything for each machine: fleet.csv.",
+    )
+
+
+def cases_table(machines: Sequence[FleetMachine]) -> Table:
+    """The answer of every case, with a link to its page."""
+    lines = []
+    for machine in machines:
+        file = f"{machine.name}.html"
+        cells = (
+            machine.name,
+            machine.answer,
+            probability_words(machine.numbers["probability"]),
+            times_noise(machine.numbers["gap_before"]),
+            times_noise(machine.numbers["gap_after"]),
+            machine.closed,
+            link(file, file),
+        )
+        lines.append(Line(cells))
+    head = ("case", "answer", "probability", "error before", "error after", "explained", "page")
+    return Table(head, tuple(lines), "Explained: with its 95 % interval.")
