@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ident.data.finding import FindingKind
 from ident.data.foreign_files import as_typed, path_as_typed
-from workflow.describe.from_template import rows_of
+from workflow.describe.look import look_page, look_sections
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.tasks.log_look import LogLook, look_at, options_typed
@@ -30,12 +30,9 @@ def look(
     found = look_at(log, time, time_unit, decimal)
     command = _next(found, options_typed(time_unit, decimal))
     if out is not None:
-        from workflow.report.rendering import render_page  # loads all that draws: a second
+        from workflow.report.rendering import render_described  # loads all that draws: a second
 
-        storage.write_text(
-            out,
-            render_page("look.html.j2", title=f"Log {log.name}", found=found, next=command).html,
-        )
+        storage.write_text(out, render_described(look_page(found, command)).html)
     columns = {
         column.name: {
             "unit": column.unit,
@@ -50,7 +47,7 @@ def look(
     parts = {name: codec.plain(getattr(found, name)) for name in ("rows", "layout", "time", "response")}
     return RunSummary(
         title=str(log),
-        sections=rows_of("summary/look.j2", found=found),
+        sections=look_sections(found),
         numbers=parts | {"columns": columns},
         verdict=command,
         report_path=None if out is None else str(out),
