@@ -31,9 +31,10 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.figures.matplotlib_figure import figure_of
 from workflow.figures.style import PREDICTED
 from workflow.figures.svg import alone
-from workflow.report.rendering import render_page
+from workflow.report.rendering import render_described
 from workflow.study.columns import COLUMNS, numbers_of
-from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of, study_summary
+from workflow.study.described import study_page, study_summary
+from workflow.study.page import PointRow, StudyView, draw_pareto, pareto_front, row_of
 from workflow.study.points import Point, PointMaker, load_base, short
 from workflow.study.settings import ParetoPlot, StudyAxis, last_name, load_study, parse_key, tidy, with_values
 from workflow.study.task import PointTask
@@ -256,12 +257,12 @@ def test_a_point_at_a_lower_bandwidth_is_marked_everywhere():
     axes = figure_of(draw_pareto(view)).axes[0]
     ring = {line.get_label(): line for line in axes.lines}["certified at a lower bandwidth than specified"]
     assert list(ring.get_xdata()) == [5.7]
-    page = render_page("study.html.j2", title="a study", study=view).html
+    page = render_described(study_page(view)).html
     assert "2 of 2 points certified, 1 of them at a lower bandwidth than specified" in page
     assert f"Point 1 (certified at a lower bandwidth): {why}" in page
     assert "bandwidth of the design [rad/s]" in page
     assert "lowest_bandwidth_rad_s = 1.6 of the base is left out" in page
-    told = [row.value for section in study_summary(view, "").sections for row in section.rows]
+    told = [row.text for section in study_summary(view, "").sections for row in section.rows]
     assert any("lowest_bandwidth_rad_s = 1.6 of the base is left out" in value for value in told)
     assert any(value.startswith("certified at a lower bandwidth") for value in told)
 
@@ -363,7 +364,7 @@ def test_tables_show_what_was_asked_for_and_no_empty_column():
     row = PointRow(1, "a", {axis.key: 1.0}, "keeps moving", "why", numbers)
     config: Any = SimpleNamespace(axes=(axis,), pareto=())
     view = StudyView("a study", config, "[study]", "the arm", [row], {})
-    page = render_page("study.html.j2", title="a study", study=view).html
+    page = render_described(study_page(view)).html
     tables = re.findall(r"<thead>(.*?)</thead>\s*<tbody>(.*?)</tbody>", page, re.DOTALL)
     heads = [re.findall(r"<th[^>]*>(.*?)</th>", head) for head, _ in tables]
     rows = [re.findall(r"<td[^>]*>(.*?)</td>", body) for _, body in tables]

@@ -1,4 +1,4 @@
-"""Rows of a study's table, its page, its Pareto plots; every sentence stands in the templates `study*.j2`."""
+"""Rows of a study's table, what is best of them, and its Pareto plots."""
 
 from __future__ import annotations
 
@@ -14,9 +14,7 @@ import pandas as pd
 
 from workflow.config.joints_config import JointsConfig
 from workflow.describe.design import gave_way_text, never_settles, run_verdict
-from workflow.describe.from_template import rows_of
 from workflow.describe.run import summarise
-from workflow.describe.summary import RunSummary
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
@@ -27,7 +25,6 @@ from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import RunResults
 from workflow.text.sentences.design import lowered as lowered_text, order_advice
-from workflow.text.templates import render_text
 
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
@@ -204,18 +201,6 @@ class StudyView:
                 "points": self.rows,
             }
         )
-
-
-def study_summary(study: StudyView, path: str) -> RunSummary:
-    """What the terminal says of it."""
-    return RunSummary(
-        title=study.title,
-        sections=rows_of("study_summary.j2", study=study),
-        numbers=study.document,
-        certified=any(row.good for row in study.rows),
-        verdict=render_text("study_verdict.j2", study=study).strip(),
-        report_path=path,
-    )
 
 
 _DOT: dict[str, Any] = {"ls": "none", "zorder": 3, "marker": "o", "ms": 6}

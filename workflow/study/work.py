@@ -18,9 +18,10 @@ from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.svg import svg_file
 from workflow.report.pages import REPORT
-from workflow.report.rendering import render_page
+from workflow.report.rendering import render_described
+from workflow.study.described import study_page, study_summary
 from workflow.study.directory import StudyDirectory
-from workflow.study.page import StudyView, csv_text, row_of, study_summary
+from workflow.study.page import StudyView, csv_text, row_of
 from workflow.study.points import (
     Base,
     Point,
@@ -242,7 +243,7 @@ def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequ
         title, study, file.text, where, rows, _units(directory, base.config, rows), base.left_out
     )
     directory.link_numbers(rows)
-    page = render_page("study.html.j2", title=title, study=view)
+    page = render_described(study_page(view))
     files = {f"{name}.svg": svg_file(made, page.looks) for name, made in page.pictures.items()}
     files["table.csv"] = csv_text(study.axes, rows, view.fronts).encode()
     files["table.json"] = codec.plain_text(view.document).encode()
