@@ -15,21 +15,34 @@ import numpy as np
 import pytest
 from jinja2 import StrictUndefined
 
-from diagnosis.answer import Completeness, DetailVerdict, Diagnosis, NamedEffect, Shares, share_closed
+from diagnosis.answer import (
+    Completeness,
+    DetailVerdict,
+    Diagnosis,
+    NamedEffect,
+    Prediction,
+    Shares,
+    share_closed,
+)
 from diagnosis.machine.own_plant import Plant, PlantCase, PlantExperiment
 from diagnosis.machine.plant_effect import Change, EffectParameter, PlantEffect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
 from diagnosis.next_experiment.next_experiment import Considered, NextExperiment, Separation
 from diagnosis.next_experiment.repeat import Change as Changed, Repeat
+from diagnosis.where.findings import Where
 from flexlink import shown
 from plant.effects.joint import GroundSpring
 from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
+from workflow.describe.diagnosis import far_off, headline, is_noise, numbers, unexplained_words
+from workflow.describe.diagnosis_view import DiagnosisView
+from workflow.describe.facts import Section, answer
 from workflow.describe.fleet import FleetMachine, overview_page
 from workflow.describe.summary import RunSummary
 from workflow.diagnose import command, outputs, pages
 from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import load_case
+from workflow.diagnose.document import document_of
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase
@@ -348,3 +361,96 @@ def test_no_more_than_all_is_explained(loaded):
     before, after = ({e.name: size * np.ones((200, 2)) for e in answer.case.experiments} for size in (9, 0.9))
     assert share_closed(answer.case, before, after, rng, 1.0) == (1.0, (1.0, 1.0))
     assert share_closed(answer.case, before, before, rng, 1.0) == (0.0, (0.0, 0.0))
+
+
+def view_of(found: Diagnosis, where: Where) -> DiagnosisView:
+    return DiagnosisView(found, where, where)
+
+
+@pytest.fixture(scope="module")
+def somewhere(loaded):
+    _, found = loaded["exact"]
+    return pages.remains_of(found)
+
+
+def test_numbers_of_the_first_screen_are_those_of_the_answer(loaded, somewhere):
+    """A row with a key says what the JSON answer has there; sizes in per cent of the motion have none."""
+    for kind in ("exact", "rough", "own"):
+        case, found = loaded[kind]
+        rows = numbers(view_of(found, somewhere))
+        assert len(rows) == 5
+        document = document_of(case, found)
+        told = answer([Section("numbers", rows)])
+        assert told["probability"] == document["probability"] == found.probability
+        assert told["completeness"]["probability"] == document["completeness"]["probability"]
+        assert told["gap_closed"] == document["gap_closed"]
+        if kind == "exact":
+            assert (told["gap_before"], told["gap_after"]) == (document["gap_before"], document["gap_after"])
+        else:
+            assert "gap_before" not in told
+            assert all(row.value.unit == "% of the motion" for row in rows[:2])
+
+
+def test_no_number_stands_for_an_answer_that_is_none(loaded, somewhere):
+    _, found = loaded["exact"]
+    for changes in (
+        {"detail_verdict": "not_converged"},
+        {"verdict": "unknown", "effects": tuple(replace(e, untried="time") for e in found.effects[:-2])},
+    ):
+        without = replace(found, **changes)
+        if changes.get("effects"):
+            without = replace(without, effects=(*without.effects, *found.effects[-2:]))
+        keys = [row.key for row in numbers(view_of(without, somewhere))]
+        assert "probability" not in keys
+        assert "completeness.probability" not in keys
+
+
+@pytest.mark.parametrize(("off", "said"), [(1.99, False), (2.0, True), (-2.4, True)])
+def test_a_nominal_value_is_named_from_two_tolerances_on(off, said):
+    words = far_off({"hub.inertia_kg_m2": off, "motor.resistance_ohm": 0.1})
+    assert words == (f"inertia (hub) by {off:+.2f} tolerances" if said else "")
+
+
+@pytest.mark.parametrize(("size", "noise"), [(1.03, True), (1.031, False)])
+def test_a_size_within_three_per_cent_of_the_floor_is_no_more_than_it(size, noise):
+    assert is_noise(size, 1.0) == noise
+
+
+@pytest.mark.parametrize(("share", "said"), [(float("nan"), ""), (0.049, ""), (0.05, "5 %"), (0.3, "30 %")])
+def test_what_nothing_explains_is_said_where_it_is_much(loaded, share, said):
+    _, found = loaded["own"]
+    prediction = Prediction(("drag",), (), 9.0, 1.0, 1.0, 0.1, share, ())
+    words = unexplained_words(replace(found, prediction=prediction))
+    assert words.startswith(said)
+    assert bool(words) == bool(said)
+    assert unexplained_words(replace(found, prediction=prediction, verdict="none")) == ""
+
+
+@pytest.mark.parametrize(
+    ("gap_after", "complete", "said"),
+    [(0.5, 0.9, "below your"), (5.5, 0.6, "close to your"), (9.0, 0.1, "above your")],
+)
+def test_what_remains_is_set_against_the_threshold(loaded, somewhere, gap_after, complete, said):
+    _, found = loaded["rough"]
+    quiet = replace(
+        as_judged(found, "none", "none"), combination=(), effects=found.effects[-1:],
+        completeness=replace(found.completeness, probability=complete, remains={"hub_angle_rad": 0.2}),
+    )  # fmt: skip
+    view = view_of(quiet, somewhere)
+    view.__dict__["shown"] = replace(view.shown, gap_after=gap_after)
+    assert said in headline(view)
+    assert ("significant" in headline(view)) == (complete >= 0.5)
+
+
+@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "a & b"])
+def test_names_of_a_user_are_text_on_a_page(loaded, somewhere, name):
+    _, found = loaded["own"]
+    drag = replace(found.effects[0], name=name)
+    hostile = replace(
+        found, case=replace(found.case, name=name), effects=(drag, *found.effects[1:]), combination=(name,),
+        probabilities={**found.probabilities, name: 0.9}, repair=(Change(name, {"force_N": 0.3}),),
+        doubts=(f"column {name} never changes",),
+    )  # fmt: skip
+    page = pages.plant_page(hostile, (f"Look at {name}.",), repaired=f"{name}.xml", places=(somewhere,) * 2)
+    assert name not in page
+    assert escape(name) in page

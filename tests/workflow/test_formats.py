@@ -2,13 +2,14 @@
 
 import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from markupsafe import Markup
 
-import workflow.study.page  # noqa: F401 (a drawing outside workflow.figures)
+import workflow.study.page
 from workflow.figures.description import Picture, new_picture
 from workflow.figures.style import drawings
 from workflow.report import rendering
@@ -132,12 +133,15 @@ def test_texts_are_not_escaped(line):
     assert render_text("test.txt.j2", name="a < b & c") == "a < b & c"
 
 
-def test_templates_name_every_drawing_that_is_there_and_no_other():
+def test_pages_name_every_drawing_that_is_there_and_no_other():
+    """In a template, or as the `Picture` of a function."""
     environment, named = shared(), set()
     for template in environment.list_templates(extensions=["j2"]):
         source = environment.loader.get_source(environment, template)[0]
         source = re.sub(r"{#.*?#}", "", source, flags=re.DOTALL)
         named.update(re.findall(r'call figure\("([^"]+)"', source))
+    for source in Path(workflow.__file__).parent.rglob("*.py"):
+        named.update(re.findall(r'\bPicture\(\s*"([^"]+)"', source.read_text("utf-8")))
     assert named == set(drawings())
 
 

@@ -25,7 +25,7 @@ from ident.data.table import Table
 from ident.data.time_grid import option_for
 from ident.data.wrapping import wraps_at
 from workflow.commands.logs import Reading, to_type
-from workflow.describe.from_template import rows_of
+from workflow.describe.init import init_sections
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
 from workflow.engine.errors import InputError, naming
@@ -129,9 +129,20 @@ def init(
     storage.write_text(out, text)
     look = found.draft.look
     draft = found.draft
+    validation = ""
+    if len(found.read.records) > 1:
+        run = found.read.tables[-1].run
+        validation = f"{found.logs[-1].name}, {run}" if run else found.logs[-1].name
     return RunSummary(
         title=str(out),
-        sections=rows_of("summary/init.j2", found=found, config=config),
+        sections=init_sections(
+            draft,
+            found.read.roles,
+            found.read.unit_of,
+            validation,
+            found.doubts,
+            logs=len(found.read.records),
+        ),
         numbers={
             "configuration": config.with_defaults(),
             "seen": {
