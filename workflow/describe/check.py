@@ -113,7 +113,7 @@ def _numbered(sentences: Iterable[str]) -> tuple[Row, ...]:
 
 
 def _more(left_out: int, candidates: int) -> Iterator[Row]:
-    """That a list is longer."""
+    """A row that says how long a list is whose end is left out."""
     if left_out > 0:
         yield _said("more", f"{count(candidates, 'candidate')} in the JSON answer")
 

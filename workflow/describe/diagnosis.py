@@ -61,13 +61,13 @@ def far_off(moved: Mapping[str, float]) -> str:
     )
 
 
-def unexplained_words(found: Diagnosis) -> str:
+def unexplained_words(answer: Diagnosis) -> str:
     """What the repaired model of a diagnosis leaves that nothing on the list explains.
 
     "" where that is little, no repair was made, or the answer is that nothing is missing.
     """
-    prediction = found.prediction
-    if not prediction or found.verdict == "none":
+    prediction = answer.prediction
+    if not prediction or answer.verdict == "none":
         return ""
     # nan where there is no error to explain.
     if not prediction.unexplained >= LEAST_UNEXPLAINED:
@@ -75,9 +75,9 @@ def unexplained_words(found: Diagnosis) -> str:
     return f"{portion(prediction.unexplained)} of the error is explained by nothing on the list."
 
 
-def with_probabilities(found: Diagnosis, effects: Iterable[str]) -> str:
+def with_probabilities(answer: Diagnosis, effects: Iterable[str]) -> str:
     """Effects, each with its probability of being there."""
-    return listing([f"{in_words(name)} ({probability_words(found.presence(name))})" for name in effects])
+    return listing([f"{in_words(name)} ({probability_words(answer.presence(name))})" for name in effects])
 
 
 # -- headline ------------------------------------------------------------------------------------------------
@@ -85,25 +85,25 @@ def with_probabilities(found: Diagnosis, effects: Iterable[str]) -> str:
 
 def headline(view: DiagnosisView) -> str:
     """Both answers in one line: which effects are present, and whether that is all."""
-    found = view.shown
+    answer = view.shown
     if not view.converged:
         return "No verdict: the fit did not converge"
-    if found.present:
+    if answer.present:
         return _present_headline(view)
-    if found.nothing_tried:
+    if answer.nothing_tried:
         return "No answer: nothing was tried within the time limit"
-    if found.detail_verdict == "parametric":
+    if answer.detail_verdict == "parametric":
         return "No effect is missing, but nominal parameters are outside their tolerances"
-    if found.verdict == "none":
+    if answer.verdict == "none":
         return _none_headline(view)
     return _unknown_headline(view)
 
 
 def _present_headline(view: DiagnosisView) -> str:
-    found = view.shown
-    names = [effect.name for effect in found.present]
+    answer = view.shown
+    names = [effect.name for effect in answer.present]
     present = []
-    for effect in found.present:
+    for effect in answer.present:
         first_size = [f", {value_words(key, value)}" for key, value in list(effect.parameters.items())[:1]]
         probability = probability_words(effect.presence)
         present.append(f"{in_words(effect.name)} ({probability}{''.join(first_size)})")
@@ -111,19 +111,19 @@ def _present_headline(view: DiagnosisView) -> str:
     if not view.is_all:
         words += f" and something else: {_unexplained_by_present(view)}"
 
-    others = [
-        f"{in_words(name)} ({probability_words(found.presence(name))})"
-        for name in found.instead
-        if name not in ("none", "unknown") and LEAST_LIKELY <= found.presence(name) < PRESENT
+    rivals = [
+        f"{in_words(name)} ({probability_words(answer.presence(name))})"
+        for name in answer.instead
+        if name not in ("none", "unknown") and LEAST_LIKELY <= answer.presence(name) < PRESENT
     ]
-    if others:
-        words += f"; or instead {' or '.join(others)}"
-    also = [name for name in found.perhaps if name not in names]
+    if rivals:
+        words += f"; or instead {' or '.join(rivals)}"
+    also = [name for name in answer.perhaps if name not in names]
     if also:
-        words += f"; perhaps also {with_probabilities(found, also)}"
+        words += f"; perhaps also {with_probabilities(answer, also)}"
     beside = [
-        f"{in_words(name)} (not certain: {probability_words(found.presence(name))})"
-        for name in found.beside
+        f"{in_words(name)} (not certain: {probability_words(answer.presence(name))})"
+        for name in answer.beside
         if name not in names
     ]
     if beside:
@@ -131,52 +131,54 @@ def _present_headline(view: DiagnosisView) -> str:
     return begun(words)
 
 
-def _left_in_record(found: Diagnosis) -> str:
-    complete = found.completeness
+def _left_in_record(answer: Diagnosis) -> str:
+    complete = answer.completeness
     return f"{percentage(complete.most_in_record, 2)} of the motion of {complete.in_record} is unexplained"
 
 
 def _unexplained_by_present(view: DiagnosisView) -> str:
     """What remains beside the effects that are present, and between which frequencies."""
-    found = view.shown
-    if found.completeness.above_elsewhere:
-        words = _left_in_record(found)
+    answer = view.shown
+    if answer.completeness.above_elsewhere:
+        words = _left_in_record(answer)
     elif view.rough:
-        words = f"{percentage(found.completeness.most, 2)} of the motion is unexplained"
+        words = f"{percentage(answer.completeness.most, 2)} of the motion is unexplained"
     else:
-        words = f"the error left is {view.size(found.gap_after)}"
+        words = f"the error left is {view.size(answer.gap_after)}"
     lies = mostly(view.remains)
     return f"{words}, {lies}" if lies else words
 
 
 def _none_headline(view: DiagnosisView) -> str:
-    found = view.shown
+    answer = view.shown
     if not view.rough:
         return "No model error beyond sensor noise and tolerances"
     what = "No significant model error" if view.is_all else "No candidate effect is present"
-    threshold = f"your threshold of {number(found.noise_floor, 3)} %"
-    if not view.is_all and found.completeness.above_elsewhere:
-        return f"{what}: {_left_in_record(found)}, above {threshold}, though validation records stay below it"
+    threshold = f"your threshold of {number(answer.noise_floor, 3)} %"
+    if not view.is_all and answer.completeness.above_elsewhere:
+        return (
+            f"{what}: {_left_in_record(answer)}, above {threshold}, though validation records stay below it"
+        )
     beside = "above"
-    if found.gap_after <= found.noise_floor:
+    if answer.gap_after <= answer.noise_floor:
         beside = "below"
     elif view.is_all:
         beside = "close to"
-    return f"{what}: {view.size(found.gap_after)} unexplained, {beside} {threshold}"
+    return f"{what}: {view.size(answer.gap_after)} unexplained, {beside} {threshold}"
 
 
 def _unknown_headline(view: DiagnosisView) -> str:
-    found = view.shown
-    candidates = "candidate effects that were tried" if found.untried else "candidate effects"
-    partly = found.partial_model and not found.unlisted
+    answer = view.shown
+    candidates = "candidate effects that were tried" if answer.untried else "candidate effects"
+    partly = answer.partial_model and not answer.unlisted
     words = f"None of the {candidates} explains the model error{' completely' if partly else ''}"
-    if found.unlisted:
-        words += f"; it looks like {names_words(effect.id for effect in found.unlisted)}"
+    if answer.unlisted:
+        words += f"; it looks like {names_words(effect.id for effect in answer.unlisted)}"
     if partly:
-        explain = "together explain" if len(found.partial_model) > 1 else "explains"
-        words += f"; {names_words(found.partial_model)} {explain} {percentage(found.gap_closed)}"
-    if found.untried:
-        words += f"; {len(found.untried)} were not tried"
+        explain = "together explain" if len(answer.partial_model) > 1 else "explains"
+        words += f"; {names_words(answer.partial_model)} {explain} {percentage(answer.gap_closed)}"
+    if answer.untried:
+        words += f"; {len(answer.untried)} were not tried"
     return words
 
 
@@ -188,49 +190,49 @@ def numbers(view: DiagnosisView) -> tuple[Row, ...]:
 
     Sizes have a key where the page shows them as the answer holds them, over the noise.
     """
-    found = view.shown
+    answer = view.shown
 
     def size(key: str, name: str, value: float, remark: str) -> Row:
         unit = "% of the motion" if view.rough else "× noise"
         quantity = Quantity(view.size(value), float(value), unit)
         return Row("" if view.rough else key, name, quantity, remark)
 
-    limit = number(found.noise_floor, 3)
+    limit = number(answer.noise_floor, 3)
     floor = f"threshold: {limit} %" if view.rough else f"noise alone: {limit}"
     rows = [
         size(
             "gap_before",
             "model error before",
-            found.gap_before,
+            answer.gap_before,
             f"validation, nominal parameters; {floor}",
         )
     ]
-    if found.added:
-        rows.append(size("gap_after", "model error after", found.gap_after, "validation, effects added"))
-        if not math.isnan(found.gap_closed):
-            above = "noise and rounding" if found.rounding_rms and view.rough else "noise"
-            least = percentage(found.gap_closed_interval[0])
+    if answer.added:
+        rows.append(size("gap_after", "model error after", answer.gap_after, "validation, effects added"))
+        if not math.isnan(answer.gap_closed):
+            above = "noise and rounding" if answer.rounding_rms and view.rough else "noise"
+            least = percentage(answer.gap_closed_interval[0])
             rows.append(
                 Row(
                     "gap_closed",
                     "explained",
-                    Quantity(percentage(found.gap_closed, 3), float(found.gap_closed)),
+                    Quantity(percentage(answer.gap_closed, 3), float(answer.gap_closed)),
                     f"of the energy above {above}, against the better nominal; at least {least} (95 %)",
                 )
             )
-    elif found.deviations:
+    elif answer.deviations:
         rows.append(
-            size("gap_refit", "model error after", found.gap_refit, "validation, parameters re-estimated")
+            size("gap_refit", "model error after", answer.gap_refit, "validation, parameters re-estimated")
         )
-    if view.converged and not found.nothing_tried:
-        complete = found.completeness.probability
+    if view.converged and not answer.nothing_tried:
+        complete = answer.completeness.probability
         what_remains = "below the threshold" if view.rough else "noise"
         rows += [
             Row(
                 "probability",
                 "probability of the answer",
-                Quantity(probability_words(found.probability), float(found.probability)),
-                sureness(found.probability),
+                Quantity(probability_words(answer.probability), float(answer.probability)),
+                sureness(answer.probability),
             ),
             Row(
                 "completeness.probability",
@@ -247,12 +249,12 @@ def numbers(view: DiagnosisView) -> tuple[Row, ...]:
 
 def repair_sentences(view: DiagnosisView) -> Iterator[str]:
     """What makes the simulation predict better, whoever is the cause."""
-    found = view.shown
-    moved = [key for key, deviation in found.deviations.items() if deviation]
-    if found.nothing_tried:
+    answer = view.shown
+    moved = [key for key, deviation in answer.deviations.items() if deviation]
+    if answer.nothing_tried:
         return
-    if not found.added and not moved:
-        if found.prediction:
+    if not answer.added and not moved:
+        if answer.prediction:
             yield (
                 "No effect and no moved value that was tried predicts validation records better than the "
                 "nominal model."
@@ -260,55 +262,55 @@ def repair_sentences(view: DiagnosisView) -> Iterator[str]:
         return
 
     changes = "The repaired model"
-    if found.added:
-        changes += f" has {with_sizes(found.repair)}"
+    if answer.added:
+        changes += f" has {with_sizes(answer.repair)}"
     if moved:
-        changes += f"{' and' if found.added else ''} moves {listing([key_words(key) for key in moved])}"
-    elif found.deviations:
+        changes += f"{' and' if answer.added else ''} moves {listing([key_words(key) for key in moved])}"
+    elif answer.deviations:
         changes += "; all nominal values stay as stated"
-    nominal = f"nominal {view.bare_size(found.gap_before)}"
-    if found.deviations:
-        nominal += f", re-estimated {view.bare_size(found.gap_refit)}"
+    nominal = f"nominal {view.bare_size(answer.gap_before)}"
+    if answer.deviations:
+        nominal += f", re-estimated {view.bare_size(answer.gap_refit)}"
     yield (
         f"{changes}. Of validation records, to which nothing was fitted, it leaves "
-        f"{view.size(found.gap_after)} ({nominal})."
+        f"{view.size(answer.gap_after)} ({nominal})."
     )
-    unexplained = unexplained_words(found)
+    unexplained = unexplained_words(answer)
     if unexplained:
         yield unexplained
 
 
 def which_sentences(view: DiagnosisView) -> Iterator[str]:
     """Which effects, how large, and which other answers the records do not exclude."""
-    found = view.shown
+    answer = view.shown
     if not view.converged:
         yield "The fit did not converge. The numbers are the best point it reached, not an answer."
-    if found.verdict == "effect":
-        for effect in found.effects:
-            if effect.name in found.combination:
+    if answer.verdict == "effect":
+        for effect in answer.effects:
+            if effect.name in answer.combination:
                 yield from _effect_sentence(effect)
-    elif found.verdict == "unknown" and not found.untried:
-        if found.unlisted:
-            yield f"Best explanation: {with_sizes(found.unlisted)}."
+    elif answer.verdict == "unknown" and not answer.untried:
+        if answer.unlisted:
+            yield f"Best explanation: {with_sizes(answer.unlisted)}."
         else:
             floor = "the threshold" if view.rough else "the noise"
             yield f"No small set of effects brings the residual down to {floor}."
-    if found.verdict == "unknown" and view.partial:
+    if answer.verdict == "unknown" and view.partial:
         parts = []
         for names, explained in view.partial:
             explain = "explains" if len(names) == 1 else "explain"
             parts.append(f"{names_words(names)} {explain} {percentage(explained)}")
         yield f"Partial answers, each by itself: {'; '.join(parts)}."
-    yield from _untried_sentences(found)
-    yield from _remarks_on_values(found)
-    if found.held_out_decided:
+    yield from _untried_sentences(answer)
+    yield from _remarks_on_values(answer)
+    if answer.held_out_decided:
         yield (
             "The validation records did not confirm the answer of the estimation records. They were counted "
             "in as well, so they are not an independent check."
         )
-    if found.perhaps:
-        yield f"There could also be {with_probabilities(found, found.perhaps)}."
-    yield from _other_answers(found)
+    if answer.perhaps:
+        yield f"There could also be {with_probabilities(answer, answer.perhaps)}."
+    yield from _other_answers(answer)
 
 
 def _effect_sentence(effect: NamedEffect) -> Iterator[str]:
@@ -328,22 +330,22 @@ def explains_words(effect: NamedEffect) -> str:
     return "" if math.isnan(effect.explains[0]) else portion(effect.explains[0])
 
 
-def _untried_sentences(found: Diagnosis) -> Iterator[str]:
+def _untried_sentences(answer: Diagnosis) -> Iterator[str]:
     """Untried is not absent."""
-    by_need = sorted(found.untried.items(), key=lambda item: item[1])
+    by_need = sorted(answer.untried.items(), key=lambda item: item[1])
     for needs, items in groupby(by_need, key=lambda item: item[1]):
         names = [name for name, _ in items]
         need = "This needs" if len(names) == 1 else "These need"
         yield f"Not tried, and not excluded: {names_words(names)}. {need} {needs}."
-    not_tried = found.shares.not_tried if found.shares else ()
-    left_out = [name for name in not_tried if name not in found.untried]
+    not_tried = answer.shares.not_tried if answer.shares else ()
+    left_out = [name for name in not_tried if name not in answer.untried]
     if left_out:
         yield f"The time limit left out: {names_words(left_out)}."
 
 
-def _remarks_on_values(found: Diagnosis) -> Iterator[str]:
+def _remarks_on_values(answer: Diagnosis) -> Iterator[str]:
     """Values whose interval does not say all."""
-    for effect in found.present:
+    for effect in answer.present:
         name = in_words(effect.name)
         for key, remark in effect.remarks.items():
             yield f"{name}: {stated_name(key)} is {remark}; these records do not determine it."
@@ -354,49 +356,49 @@ def _remarks_on_values(found: Diagnosis) -> Iterator[str]:
             )
 
 
-def _other_answers(found: Diagnosis) -> Iterator[str]:
+def _other_answers(answer: Diagnosis) -> Iterator[str]:
     """Answers that could stand in place of this one, else the next likeliest."""
-    if found.instead:
-        likely = [name for name in found.instead if found.presence(name) >= LEAST_LIKELY]
-        alike = [name for name in found.instead if found.presence(name) < LEAST_LIKELY]
+    if answer.instead:
+        likely = [name for name in answer.instead if answer.presence(name) >= LEAST_LIKELY]
+        alike = [name for name in answer.instead if answer.presence(name) < LEAST_LIKELY]
         if likely:
-            yield f"These records do not exclude another answer: {with_probabilities(found, likely)}."
+            yield f"These records do not exclude another answer: {with_probabilities(answer, likely)}."
         if alike:
             yield (
                 f"{begun(names_words(alike))} would fit as well, with parameters that these records do not "
                 "need."
             )
-        for name in found.combination:
+        for name in answer.combination:
             distinguishes = EFFECTS[name].beside if name in EFFECTS else ""
-            if distinguishes and "unknown" in found.ambiguous_with:
+            if distinguishes and "unknown" in answer.ambiguous_with:
                 yield (
                     f"Causes that are not candidates act like {in_words(name)} too: {distinguishes} would "
                     "distinguish them."
                 )
-    elif found.verdict == "effect" and not found.perhaps:
-        second = found.runner_up
-        if found.presence(second) >= LEAST_RUNNER_UP:
-            yield f"Next likeliest: {with_probabilities(found, [second])}."
+    elif answer.verdict == "effect" and not answer.perhaps:
+        second = answer.runner_up
+        if answer.presence(second) >= LEAST_RUNNER_UP:
+            yield f"Next likeliest: {with_probabilities(answer, [second])}."
         else:
             yield "Every other answer has a probability below 0.1 %."
 
 
 def closure_sentences(view: DiagnosisView) -> Iterator[str]:
     """What the repaired model is worth, beside the numbers of the first screen."""
-    found = view.shown
-    if not found.added:
+    answer = view.shown
+    if not answer.added:
         return
-    if math.isnan(found.gap_closed):
+    if math.isnan(answer.gap_closed):
         yield (
             "The validation records show no model error beyond noise: the effect shows in the estimation "
             "records."
         )
         return
-    shares = found.shares
+    shares = answer.shares
     if shares and shares.small:
         parts = [
             f"{portion(shares.carried[name][0])} of the error, present with "
-            f"{probability_words(found.presence(name))}"
+            f"{probability_words(answer.presence(name))}"
             for name in shares.small
         ]
         verb = "is" if len(shares.small) == 1 else "are"
@@ -404,9 +406,9 @@ def closure_sentences(view: DiagnosisView) -> Iterator[str]:
             f"{names_words(shares.small)} {verb} in the repaired model too, but not certain: "
             f"{'; '.join(parts)}."
         )
-    if found.partial_model and not found.unlisted:
+    if answer.partial_model and not answer.unlisted:
         yield (
-            f"{names_words(found.partial_model)} may stand in for the true cause: at other speeds or "
+            f"{names_words(answer.partial_model)} may stand in for the true cause: at other speeds or "
             "amplitudes the model may be worse."
         )
     if shares and shares.silent:
@@ -415,7 +417,7 @@ def closure_sentences(view: DiagnosisView) -> Iterator[str]:
             "rests on the estimation records."
         )
     if shares and shares.horizon_samples:
-        window = si(shares.horizon_samples * found.case.dt_s, "s")
+        window = si(shares.horizon_samples * answer.case.dt_s, "s")
         yield (
             f"In windows of {window}, each from the state that fits it best, "
             f"{percentage(shares.horizon_closed)} is explained."
@@ -424,28 +426,27 @@ def closure_sentences(view: DiagnosisView) -> Iterator[str]:
 
 def size_sentences(view: DiagnosisView) -> Iterator[str]:
     """What is behind the size of the model error, what makes the answer doubtful, and what it names."""
-    found = view.shown
-    if not found.deviations:
+    answer = view.shown
+    if not answer.deviations:
         yield "The rig file gives no tolerances: its values are taken as exact."
     elif not any(view.moved_refit.values()):
         yield ("Nominal parameters are as stated: re-estimating them makes the validation records worse.")
     else:
         yield _re_estimated(view)
-    if view.rough and not found.case.machine.weighing.stated:
-        yield (
-            f"The threshold of {number(found.noise_floor, 3)} % is the usual one: model_error is unspecified."
-        )
-    for doubt in found.doubts:
+    if view.rough and not answer.case.machine.weighing.stated:
+        threshold = number(answer.noise_floor, 3)
+        yield f"The threshold of {threshold} % is the usual one: model_error is unspecified."
+    for doubt in answer.doubts:
         yield f"This makes the answer doubtful: {doubt}{'' if doubt.endswith('?') else '.'}"
-    if found.noise_below_stated:
+    if answer.noise_below_stated:
         noises = []
-        for name, seen, stated in found.noise_below_stated:
+        for name, seen, stated in answer.noise_below_stated:
             unit = output_unit(name, {})
             noises.append(f"{name_words(name)} {si(seen, unit, 3)} (specified: {si(stated, unit, 3)})")
         yield (
             f"The records show less noise than specified; the noise they show is used: {'; '.join(noises)}."
         )
-    if found.verdict == "none":
+    if answer.verdict == "none":
         yield "No candidate effect is needed to explain the records."
     elif not view.converged:
         yield "No cause is named: more or better records are needed."
@@ -453,13 +454,13 @@ def size_sentences(view: DiagnosisView) -> Iterator[str]:
 
 def _re_estimated(view: DiagnosisView) -> str:
     """What the nominal parameters alone explain, and whether they had to move far for it."""
-    found = view.shown
+    answer = view.shown
     words = (
         "Re-estimating the nominal parameters (tolerances as standard deviations) leaves "
-        f"{view.size(found.gap_refit)}"
+        f"{view.size(answer.gap_refit)}"
     )
     far = far_off(view.moved_refit)
-    if is_noise(found.gap_refit, found.noise_floor):
+    if is_noise(answer.gap_refit, answer.noise_floor):
         words += f", {'below the threshold' if view.rough else 'no more than noise'}"
         if far:
             words += f", but only by moving {far}"
@@ -470,21 +471,21 @@ def _re_estimated(view: DiagnosisView) -> str:
 
 def remaining_sentences(view: DiagnosisView) -> Iterator[str]:
     """What the repaired model still misses."""
-    found = view.shown
-    name, worst = found.worst_experiment
-    if not is_noise(worst, found.noise_floor):
+    answer = view.shown
+    name, worst = answer.worst_experiment
+    if not is_noise(worst, answer.noise_floor):
         yield f"The largest residual left is {view.size(worst)}, in {name}."
     else:
-        every = "With the effects added, every" if found.added else "Every"
+        every = "With the effects added, every" if answer.added else "Every"
         if view.rough:
             yield (
-                f"{every} experiment is below the threshold of {number(found.noise_floor, 3)} %: at most "
+                f"{every} experiment is below the threshold of {number(answer.noise_floor, 3)} %: at most "
                 f"{view.size(worst)}, in {name}."
             )
         else:
             yield f"{every} experiment is within 3 % of the noise."
-    if view.rough and found.rounding_rms:
-        yield f"Rounding of the sensor alone leaves {view.size(found.rounding_rms)}, whatever the model."
+    if view.rough and answer.rounding_rms:
+        yield f"Rounding of the sensor alone leaves {view.size(answer.rounding_rms)}, whatever the model."
     far = far_off(view.moved)
     if far:
         yield f"Nominal parameters far outside their tolerances: {far}. Measure them."
@@ -493,7 +494,7 @@ def remaining_sentences(view: DiagnosisView) -> Iterator[str]:
 def first_bullets(
     view: DiagnosisView, where: str, advice: Sequence[str], of_model: Sequence[str] = ()
 ) -> tuple[str, ...]:
-    """All sentences of the first screen, the weightiest first.
+    """Sentences of the first screen, the weightiest first.
 
     Args:
         view: The diagnosis.

@@ -184,12 +184,12 @@ def own_plant_page(
         moving: The machine in motion as SVG; "" without.
         numbers_text: Parameters and effects of the repaired model, as JSON.
     """
-    found = view.found
+    answer = view.found
     bullets = first_bullets(
         view, in_short(view.place, view.floor), advice, _of_repaired_file(view, repaired_file)
     )
-    if is_of_forces(found.case.model_error, model_error):
-        threshold = percentage(found.case.model_error, 3)
+    if is_of_forces(answer.case.model_error, model_error):
+        threshold = percentage(answer.case.model_error, 3)
         bullets += (
             f"The threshold of {threshold} of the motion is {percentage(model_error)} (model_error) of what "
             "the forces of the actuators make.",
@@ -199,13 +199,13 @@ def own_plant_page(
     picture = Picture(
         "gap_measured",
         "Validation record with the largest model error: measured, and "
-        f"{replayed if found.replays else 'simulated '}before and after. Below: measured less simulated."
-        f"{runs_away if found.replays else ''}",
-        (found,),
+        f"{replayed if answer.replays else 'simulated '}before and after. Below: measured less simulated."
+        f"{runs_away if answer.replays else ''}",
+        (answer,),
     )
     pictures: tuple[Block, ...] = (picture,)
     if moving:
-        pictures += (Sketch(moving, _moving_caption(found.models[-1])),)
+        pictures += (Sketch(moving, _moving_caption(answer.models[-1])),)
     sections = [*common_sections(view, ())]
     if can_show:
         whatever = (
@@ -217,15 +217,15 @@ def own_plant_page(
         )
     unchecked = (
         _ONLY_CANDIDATES,
-        "" if found.case.plant.settled else "Every record is assumed to start as the simulation does.",
-        "" if found.deviations else _NOMINAL_IS_EXACT,
+        "" if answer.case.plant.settled else "Every record is assumed to start as the simulation does.",
+        "" if answer.deviations else _NOMINAL_IS_EXACT,
     )
     files = FileText("Parameters and effects to put into the simulation", numbers_text)
     sections.append(
         PageSection("unchecked", "What was not checked", "Not checked", (Warnings(unchecked), files))
     )
     return Page(
-        found.case.name, FirstScreen(headline(view), numbers(view), bullets, pictures), tuple(sections)
+        answer.case.name, FirstScreen(headline(view), numbers(view), bullets, pictures), tuple(sections)
     )
 
 
@@ -338,24 +338,24 @@ def _where_section(view: DiagnosisView) -> PageSection:
 
 
 def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection:
-    found = view.shown
+    answer = view.shown
     blocks: list[Block] = []
     for name in suspected:
-        part = " and is part of the answer" if name in found.combination else ""
-        probability = probability_words(found.presence(name))
+        part = " and is part of the answer" if name in answer.combination else ""
+        probability = probability_words(answer.presence(name))
         blocks.append(f"You asked about {in_words(name)}: probability {probability}{part}.")
     blocks.append(
         Picture(
             "gap_probabilities",
             "Presence of every candidate effect; last, whether something else is missing.",
-            (found,),
+            (answer,),
         )
     )
     possible = presence_table(view)
     if possible.lines:
         blocks.append(possible)
     # One answer that is accepted explains what the numbers above say already.
-    if view.partial and (not found.combination or len(view.partial) > 1):
+    if view.partial and (not answer.combination or len(view.partial) > 1):
         caption = "What effects explain by themselves, on validation records."
         blocks.append(Picture("gap_partial", caption, (view.partial,)))
     if view.of_rig:
@@ -398,62 +398,62 @@ def _explained_section(view: DiagnosisView) -> PageSection:
 
 def carried_table(view: DiagnosisView) -> Table:
     """Share of the error that every effect of the repaired model explains."""
-    found = view.shown
+    answer = view.shown
     head: tuple[str, ...] = ("effect", "explains", "95 % interval")
     caption = "Share of the energy above sensor noise, whatever the order of the effects."
-    if found.combination:
+    if answer.combination:
         head += ("significant",)
         caption += " A nominal value far outside its tolerance is significant too."
     lines: list[tuple[str, ...]] = []
-    if found.shares:
-        for name, (explained, low, high) in found.shares.carried.items():
+    if answer.shares:
+        for name, (explained, low, high) in answer.shares.carried.items():
             cells = (in_words(name), percentage(explained), f"{percentage(low)} to {percentage(high)}")
-            significant = ("no" if name in found.shares.small else "yes",) if found.combination else ()
+            significant = ("no" if name in answer.shares.small else "yes",) if answer.combination else ()
             lines.append((*cells, *significant))
     return Table.of(head, lines, caption)
 
 
 def left_table(view: DiagnosisView) -> Table:
     """What every model misses of every output, in per cent of its motion and in its unit."""
-    found = view.shown
-    shares = found.shares
+    answer = view.shown
+    shares = answer.shares
     caption = (
         "Model error of the validation records beyond sensor noise, in per cent of the motion and in units"
     )
     in_windows: tuple[str, ...] = ()
     if shares and shares.horizon_samples:
-        window = si(shares.horizon_samples * found.case.dt_s, "s")
+        window = si(shares.horizon_samples * answer.case.dt_s, "s")
         caption += f"; in windows of {window} no drift can grow"
         # Where the answer itself rests on windows, the columns beside them say the same.
         if not shares.in_windows:
             in_windows = ("re-estimated, in windows", "effects added, in windows")
     lines = []
     for k, left in enumerate(view.left):
-        unit = output_unit(left.output, found.case.units)
+        unit = output_unit(left.output, answer.case.units)
         errors = [f"{percentage(share, 3)}, {si(rms, unit, 3)}" for share, rms in left.errors]
         cells = [name_words(left.output), *errors, si(left.noise, unit, 3)]
         if shares and in_windows:
             cells += [percentage(shares.horizon_before[k]), percentage(shares.horizon_after[k])]
         lines.append(tuple(cells))
-    models = [MODELS[model] for model in found.models]
+    models = [MODELS[model] for model in answer.models]
     return Table.of(("output", *models, "sensor noise", *in_windows), lines, f"{caption}.")
 
 
 def experiments_table(view: DiagnosisView) -> Table:
     """What every model misses in every experiment."""
-    found = view.shown
+    answer = view.shown
     lines = []
     for experiment in view.found.case.experiments:
-        sizes = [times_noise(size) for size in found.gap_by_experiment[experiment.name].values()]
+        sizes = [times_noise(size) for size in answer.gap_by_experiment[experiment.name].values()]
         lines.append((experiment.name, role_words(experiment.role), *sizes))
     if view.of_rig:
-        lines.append(("validation, together", "", *(times_noise(size) for size in found.gaps.values())))
+        lines.append(("validation, together", "", *(times_noise(size) for size in answer.gaps.values())))
     caption = (
         "Model error in per cent of the motion, of the output with most."
         if view.rough
         else "Residual over noise, RMS."
     )
-    return Table.of(("experiment", "role", *(MODELS[model] for model in found.models)), lines, caption)
+    return Table.of(("experiment", "role", *(MODELS[model] for model in answer.models)), lines, caption)
 
 
 def role_words(role: str) -> str:
@@ -462,9 +462,9 @@ def role_words(role: str) -> str:
 
 
 def _remains_section(view: DiagnosisView) -> PageSection:
-    found = view.shown
+    answer = view.shown
     blocks: list[Block] = [*remaining_sentences(view)]
-    if found.added:
+    if answer.added:
         blocks += [
             in_short(view.remains, view.floor),
             *at_length(view.remains, view.floor, "the effects added"),
@@ -483,23 +483,23 @@ def _remains_section(view: DiagnosisView) -> PageSection:
             (view.found,),
         )
     )
-    if found.deviations:
+    if answer.deviations:
         blocks.append(nominal_table(view))
     return PageSection("remains", "What remains", "Remains", tuple(blocks))
 
 
 def nominal_table(view: DiagnosisView) -> Table:
     """Nominal values that have a tolerance, and how far each moved."""
-    found = view.found
+    answer = view.found
     head: tuple[str, ...] = ("nominal parameter", "nominal", "re-estimated", "moved by [tolerances]")
-    if found.added:
+    if answer.added:
         head += ("without effects",)
-    stated, without_effects = found.case.machine.description, view.moved_refit
+    stated, without_effects = answer.case.machine.description, view.moved_refit
     lines = []
     for key, tolerances in view.moved.items():
         nominal = value_words(key, stated.value(key), 5)
-        cells = [key_words(key), nominal, value_words(key, found.rig.value(key), 5), signed(tolerances)]
-        if found.added:
+        cells = [key_words(key), nominal, value_words(key, answer.rig.value(key), 5), signed(tolerances)]
+        if answer.added:
             cells.append(signed(without_effects[key]))
         lines.append(tuple(cells))
     return Table.of(head, lines, "Values that have a tolerance.")

@@ -86,7 +86,7 @@ class DiagnosisView:
 
     @property
     def moved_refit(self) -> Mapping[str, float]:
-        """The same without effects."""
+        """How far nominal values have to move without any effect, in tolerances."""
         return moved(self.found, self.found.deviations_refit)
 
     @property
@@ -110,11 +110,11 @@ class DiagnosisView:
         )
 
     def bare_size(self, size: float) -> str:
-        """The one size of the model error on a page, without its unit."""
+        """A size of the model error without its unit."""
         return number(size, 3) if self.rough else times_noise(size)
 
     def size(self, size: float) -> str:
-        """The same with its unit: over the sensor noise, or in per cent of the motion."""
+        """A size of the model error with its unit: over the noise, or in per cent of the motion."""
         return f"{self.bare_size(size)} {'% of the motion' if self.rough else '× noise'}"
 
 

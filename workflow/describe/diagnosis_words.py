@@ -93,7 +93,7 @@ def with_sizes(effects: Iterable[Any]) -> str:
 
 
 def begun(text: str) -> str:
-    """As a sentence begins, but for names of a model (arm.payload)."""
+    """Text with the capital that begins a sentence, but for names of a model (arm.payload)."""
     return text if "." in text.split(" ")[0] else text[:1].upper() + text[1:]
 
 

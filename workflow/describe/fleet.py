@@ -61,7 +61,7 @@ class FleetMachine:
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> FleetMachine:
-        """Of a JSON answer."""
+        """What an overview keeps of a JSON answer."""
         present = {name: document["presence"][name] for name in present_of(document)}
         unknown = (float("nan"), float("nan"))
         return cls(
@@ -77,7 +77,10 @@ class FleetMachine:
                 for name, effect in present.items()
                 for key, value in effect["parameters"].items()
             },
-            {key: (one["stated"], one["repaired"]) for key, one in document["repair"]["values"].items()},
+            {
+                key: (value["stated"], value["repaired"])
+                for key, value in document["repair"]["values"].items()
+            },
         )
 
 
@@ -92,11 +95,11 @@ class Group:
 
     @property
     def sizes(self) -> dict[tuple[str, str], tuple[float, float, float]]:
-        found: dict[tuple[str, str], tuple[float, float, float]] = {}
-        for key in dict.fromkeys(key for one in self.machines for key in one.sizes):
-            values = [one.sizes[key][0] for one in self.machines if key in one.sizes]
-            found[key] = float(np.median(values)), min(values), max(values)
-        return found
+        sizes: dict[tuple[str, str], tuple[float, float, float]] = {}
+        for key in dict.fromkeys(key for machine in self.machines for key in machine.sizes):
+            values = [machine.sizes[key][0] for machine in self.machines if key in machine.sizes]
+            sizes[key] = float(np.median(values)), min(values), max(values)
+        return sizes
 
 
 @dataclass(frozen=True)
@@ -116,10 +119,10 @@ class Trend:
 
 def groups(machines: Iterable[FleetMachine]) -> list[Group]:
     """By cause, the most frequent first, and by size where there is a gap."""
-    found: dict[str, list[FleetMachine]] = {}
-    for one in machines:
-        found.setdefault(one.cause, []).append(one)
-    ordered = sorted(found.items(), key=lambda item: (-len(item[1]), item[0]))
+    by_cause: dict[str, list[FleetMachine]] = {}
+    for machine in machines:
+        by_cause.setdefault(machine.cause, []).append(machine)
+    ordered = sorted(by_cause.items(), key=lambda item: (-len(item[1]), item[0]))
     return [
         Group(cause, tuple(part), apart) for cause, members in ordered for part, apart in _by_size(members)
     ]
@@ -135,9 +138,9 @@ def _by_size(
     """
     n = len(members)
     best: tuple[float, float, tuple[str, str]] = (_FALSE_TREND, 0.0, ("", ""))
-    keys = [key for key in members[0].sizes if all(key in one.sizes for one in members)]
+    keys = [key for key in members[0].sizes if all(key in machine.sizes for machine in members)]
     for key in keys if n >= _LEAST_MACHINES else ():
-        sizes = np.sort([one.sizes[key][0] for one in members])
+        sizes = np.sort([machine.sizes[key][0] for machine in members])
         x = np.sign(sizes) * np.log(np.abs(sizes)) if np.min(sizes) * np.max(sizes) > 0 else sizes
         k = int(np.argmax(np.diff(x))) + 1
         gap = x[k] - x[k - 1]
@@ -147,8 +150,11 @@ def _by_size(
     chance, first, key = best
     if not chance < _FALSE_TREND:
         return [(members, apart)]
-    parts = [[one for one in members if (one.sizes[key][0] >= first) == large] for large in (False, True)]
-    return [found for part in parts for found in _by_size(part, key)]
+    parts = [
+        [machine for machine in members if (machine.sizes[key][0] >= first) == large]
+        for large in (False, True)
+    ]
+    return [split for part in parts for split in _by_size(part, key)]
 
 
 def serial_numbers(names: Sequence[str]) -> dict[str, int]:
@@ -172,17 +178,17 @@ def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
     """
     from scipy.stats import kendalltau, theilslopes  # here: it takes its time to load
 
-    numbers = serial_numbers([one.name for one in machines])
-    known = [one for one in machines if one.name in numbers and one.decided]
+    numbers = serial_numbers([machine.name for machine in machines])
+    known = [machine for machine in machines if machine.name in numbers and machine.decided]
     series: dict[tuple[str, str], list[tuple[int, float]]] = {}
-    for key in dict.fromkeys(key for one in known for key in one.sizes):
+    for key in dict.fromkeys(key for machine in known for key in machine.sizes):
         without = (1.0 if key[1] == "ratio" else 0.0,)
-        series[key] = [(numbers[one.name], one.sizes.get(key, without)[0]) for one in known]
-    for value in dict.fromkeys(value for one in known for value in one.values):
+        series[key] = [(numbers[machine.name], machine.sizes.get(key, without)[0]) for machine in known]
+    for value in dict.fromkeys(value for machine in known for value in machine.values):
         series["", value] = [
-            (numbers[one.name], one.values[value][1]) for one in known if value in one.values
+            (numbers[machine.name], machine.values[value][1]) for machine in known if value in machine.values
         ]
-    found = []
+    significant = []
     for (effect, parameter), pairs in series.items():
         at, size = np.array(pairs, dtype=np.float64).T
         if len(pairs) < _LEAST_MACHINES or np.ptp(size) == 0:
@@ -190,26 +196,28 @@ def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
         tau, p = kendalltau(at, size)
         if p * len(series) < _FALSE_TREND:
             slope = float(theilslopes(size, at)[0])
-            found.append(Trend(effect, parameter, float(tau), float(p), slope, len(pairs)))
-    return sorted(found, key=lambda one: one.p)
+            significant.append(Trend(effect, parameter, float(tau), float(p), slope, len(pairs)))
+    return sorted(significant, key=lambda trend: trend.p)
 
 
 def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> str:
     """One row per machine with answer, numbers, sizes with intervals and values; then what failed."""
-    numbers = serial_numbers([one.name for one in machines])
+    from scipy.stats import kendalltau, theilslopes  # here: it takes its time to load
+
+    numbers = serial_numbers([machine.name for machine in machines])
     rows: list[dict[str, Any]] = []
-    for one in machines:
+    for machine in machines:
         row: dict[str, Any] = {
-            "case": one.name,
-            "number": numbers.get(one.name, ""),
-            "verdict": one.verdict,
-            "answer": one.answer,
+            "case": machine.name,
+            "number": numbers.get(machine.name, ""),
+            "verdict": machine.verdict,
+            "answer": machine.answer,
         }
-        row |= one.numbers
-        for (effect, key), size in one.sizes.items():
+        row |= machine.numbers
+        for (effect, key), size in machine.sizes.items():
             ends = ("", ".low", ".high")
             row |= {f"{effect}.{key}{end}": value for end, value in zip(ends, size, strict=True)}
-        for key, (stated, repaired) in one.values.items():
+        for key, (stated, repaired) in machine.values.items():
             row |= {f"{key} (stated)": stated, f"{key} (repaired)": repaired}
         rows.append(row)
     rows += [{"case": case, "verdict": "failed", "answer": reason} for case, reason in failures.items()]
@@ -235,16 +243,16 @@ def trend_words(trend: Trend) -> str:
     )
 
 
-def machines_section(found: Sequence[Group], found_trends: Sequence[Trend]) -> Section:
+def machines_section(machine_groups: Sequence[Group], size_trends: Sequence[Trend]) -> Section:
     """Groups and trends on a terminal."""
     rows = []
-    for group in found:
+    for group in machine_groups:
         words = group.cause
         for (effect, key), (middle, low, high) in group.sizes.items():
             extent = f"{value_words(key, low)} to {value_words(key, high)}"
             words += f"; {in_words(effect)}: {stated_name(key)} {value_words(key, middle)} ({extent})"
         rows.append(Row("", count(len(group.machines), "machine"), Quantity.words(words)))
-    rows += [Row("", "trend", Quantity.words(trend_words(trend))) for trend in found_trends]
+    rows += [Row("", "trend", Quantity.words(trend_words(trend))) for trend in size_trends]
     return Section("machines", tuple(rows))
 
 
@@ -255,11 +263,11 @@ def overview_page(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -
         machines: Those with an answer.
         failed: Case without an answer -> why.
     """
-    found = groups(machines)
-    bullets = [_group_words(group) for group in found]
+    machine_groups = groups(machines)
+    bullets = [_group_words(group) for group in machine_groups]
     bullets += [sentence(trend_words(trend)) for trend in trends(machines)]
     sections = []
-    causes = causes_table(found)
+    causes = causes_table(machine_groups)
     if causes.lines:
         sections.append(PageSection("causes", "Machines of one cause", "Causes", (causes,), open=True))
     if machines:
@@ -305,15 +313,15 @@ def _group_words(group: Group) -> str:
         key = group.apart[1]
         _, low, high = group.sizes[group.apart]
         words += f", {stated_name(key)} {value_words(key, low)} to {value_words(key, high)}"
-    names = [link(one.name, f"{one.name}.html") for one in group.machines[:_MOST_NAMED]]
+    names = [link(machine.name, f"{machine.name}.html") for machine in group.machines[:_MOST_NAMED]]
     more = ", …" if len(group.machines) > _MOST_NAMED else ""
     return Markup("{} ({}{})").format(words, Markup(", ").join(names), more)
 
 
-def causes_table(found: Sequence[Group]) -> Table:
+def causes_table(machine_groups: Sequence[Group]) -> Table:
     """Sizes of the effects of every group."""
     lines: list[tuple[str, ...]] = []
-    for group in found:
+    for group in machine_groups:
         of_group = (group.cause, str(len(group.machines)))
         for (effect, key), sizes in group.sizes.items():
             values = [value_words(key, size) for size in sizes]

@@ -64,7 +64,7 @@ class Floor:
 
     @property
     def units(self) -> str:
-        """Of a number of floors."""
+        """What a number of floors counts."""
         return "times the threshold" if self.is_threshold else "noise deviations"
 
     def times(self, gap_rms: float) -> float:
@@ -108,16 +108,16 @@ def mostly(where: Where) -> str:
 
 def in_short(where: Where, floor: Floor) -> str:
     """Where the error lies, in one sentence."""
-    beyond = floor.words if floor.is_threshold else "sensor noise"
+    floor_words = floor.words if floor.is_threshold else "sensor noise"
     if not where.is_gap:
-        return f"No sensor, experiment or frequency band lies above {beyond}."
+        return f"No sensor, experiment or frequency band lies above {floor_words}."
     if not where.gap.gap_rms > 0:
         single = (
             "single experiments or frequency bands are above their share of it"
             if floor.is_threshold
             else "parts of them do not"
         )
-        return f"All records together stay within {beyond}; {single}."
+        return f"All records together stay within {floor_words}; {single}."
 
     parts = []
     if where.dominant_sensor:
@@ -133,7 +133,7 @@ def in_short(where: Where, floor: Floor) -> str:
     elif where.linear is not None and where.linear.linear is not None:
         parts.append(f"{'linear' if where.linear.linear else 'not linear'} in the voltage")
     place = "; ".join(parts) or "in all sensors and frequencies"
-    depends = [f"; {dependence_short(codec.plain(one))}" for one in where.dependences[:1]]
+    depends = [f"; {dependence_short(codec.plain(dependence))}" for dependence in where.dependences[:1]]
     return f"Where it lies: {place}{''.join(depends)}."
 
 
@@ -169,7 +169,7 @@ def dependences_words(where: Where) -> str:
     for dependence in where.dependences:
         plain = codec.plain(dependence)
         sentences += [sentence(dependence_words(plain)), sentence(alternatives_words(plain))]
-    return " ".join(one for one in sentences if one)
+    return " ".join(words for words in sentences if words)
 
 
 def sensors_words(where: Where, floor: Floor) -> str:
@@ -177,14 +177,14 @@ def sensors_words(where: Where, floor: Floor) -> str:
     with_error = [sensor for sensor in where.sensors if sensor.gap.found]
     only = where.dominant_sensor
     if only:
-        others = [sensor for sensor in where.sensors if sensor.sensor != only]
-        beyond = floor.words if floor.is_threshold else "noise"
+        other_sensors = [sensor for sensor in where.sensors if sensor.sensor != only]
+        floor_words = floor.words if floor.is_threshold else "noise"
         little = (
             "shows next to nothing of it"
-            if any(sensor.gap.found for sensor in others)
-            else f"shows nothing beyond {beyond}"
+            if any(sensor.gap.found for sensor in other_sensors)
+            else f"shows nothing beyond {floor_words}"
         )
-        names = " and ".join(name_words(sensor.sensor) for sensor in others)
+        names = " and ".join(name_words(sensor.sensor) for sensor in other_sensors)
         return f"The model error shows in {name_words(only)}; {names} {little}."
     if not with_error:
         return ""
@@ -216,22 +216,22 @@ def experiments_words(where: Where, floor: Floor) -> str:
     if not with_error:
         return ""
     if quiet and len(with_error) > len(quiet):
-        names = ", ".join(_file_words(one.experiment) for one in quiet)
+        names = ", ".join(_file_words(gap.experiment) for gap in quiet)
         return f"All experiments but {names} show a model error; there it stays within {floor.words}."
     if quiet:
-        names = ", ".join(_file_words(one.experiment) for one in with_error)
+        names = ", ".join(_file_words(gap.experiment) for gap in with_error)
         show = "shows" if len(with_error) == 1 else "show"
         return f"Only {names} {show} a model error; the others stay within {floor.words}."
 
-    by_size = sorted(with_error, key=lambda one: one.gap.gap_rms)
-    most, least = by_size[-1], by_size[0]
+    by_size = sorted(with_error, key=lambda experiment: experiment.gap.gap_rms)
+    largest = by_size[-1]
+    smallest = by_size[0]
     all_show = f"All {len(with_error)} experiments show the model error"
-    if most.gap.interval[0] <= CLEARLY_LARGER * least.gap.interval[1]:
+    if largest.gap.interval[0] <= CLEARLY_LARGER * smallest.gap.interval[1]:
         return f"{all_show}, about equally."
-    return (
-        f"{all_show}, {_file_words(most.experiment)} most ({floor.said(most.gap.gap_rms)} {floor.units}), "
-        f"{_file_words(least.experiment)} least ({floor.said(least.gap.gap_rms)})."
-    )
+    most = f"{_file_words(largest.experiment)} most ({floor.said(largest.gap.gap_rms)} {floor.units})"
+    least = f"{_file_words(smallest.experiment)} least ({floor.said(smallest.gap.gap_rms)})"
+    return f"{all_show}, {most}, {least}."
 
 
 def _file_words(experiment: str) -> str:
@@ -358,7 +358,7 @@ def periodic_words(finding: PeriodicFinding, floor: Floor) -> str:
     groups = [group for group in finding.groups if group.found]
     sentences = []
     if bands:
-        band = max(bands, key=lambda one: one.distance)
+        band = max(bands, key=lambda band: band.distance)
         sentences.append(
             "The measured frequency response differs most from the model's between "
             f"{number(band.low_Hz)} and {number(band.high_Hz)} Hz in {name_words(band.sensor)}: "
@@ -366,7 +366,7 @@ def periodic_words(finding: PeriodicFinding, floor: Floor) -> str:
             "radius."
         )
     if groups:
-        group = max(groups, key=lambda one: one.repeated_rms)
+        group = max(groups, key=lambda group: group.repeated_rms)
         kind = f"{group.group.split(' ')[-1]} " if finding.even_odd_separable else ""
         sentences.append(
             f"The machine responds at frequencies that were not excited ({number(group.repeated_rms, 2)} "
