@@ -27,7 +27,6 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import naming
 from workflow.engine.executor import Report
 from workflow.tasks.controller_check import ControllerCheck, NoControllerError, check_controller
-from workflow.text.templates import render_text
 
 # Seconds for what records can tell.
 _TOLD_S = 10.0
@@ -156,17 +155,24 @@ def rig_text(
 
     The head names every moved value with how far it moved; effects_file is empty where there are no effects.
     """
-    moved = []
+    head = [f"# {case}: rig as repaired by flexlink diagnose"]
     for key, tolerances in deviations.items():
         old, new = stated.value(key), repaired.value(key)
         if old != new:
-            moved.append((key, old, new, 100 * (new / old - 1) if old else 0.0, tolerances))
-    toml = repaired.to_toml()
-    return render_text("diagnosis/rig.toml.j2", case=case, moved=moved, effects_file=effects_file, toml=toml)
+            percent = 100 * (new / old - 1) if old else 0.0
+            head.append(
+                f"#   {key}: {old:.6g} stated, {new:.6g} now ({percent:+.2f} %, {tolerances:+.2f} tolerances)"
+            )
+    if effects_file:
+        head.append(f"# The effects to add stand in {effects_file}.")
+    return "\n".join([*head, repaired.to_toml()])
 
 
 def effects_text(found: Diagnosis) -> str:
     """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
     tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in found.repair]})
-    cause = not found.partial_model
-    return render_text("diagnosis/effects.toml.j2", case=found.case.name, cause=cause, toml=tables)
+    origin = "found by flexlink diagnose"
+    if found.partial_model:
+        origin = "with which flexlink diagnose leaves less; the cause is not known"
+    head = f"# {found.case.name}: effects {origin}; in a run configuration they go under [[source.effects]]"
+    return f"{head}\n\n{tables}"
