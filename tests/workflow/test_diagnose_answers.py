@@ -36,7 +36,7 @@ from tests.workflow.command import build_nothing
 from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.describe.diagnosis import far_off, headline, is_noise, numbers, unexplained_words
 from workflow.describe.diagnosis_view import DiagnosisView
-from workflow.describe.facts import Section, answer
+from workflow.describe.facts import Section, answer, by_key
 from workflow.describe.fleet import FleetMachine, overview_page
 from workflow.describe.summary import RunSummary
 from workflow.diagnose import command, outputs, pages
@@ -221,6 +221,12 @@ def drawn(loaded, found, coming, monkeypatch):
     )
     assert several.sections
     render_described(overview_page([FleetMachine.of(document)] * 2, {"other": "no such luck"}))
+    # A row with a key says what the answer has there.
+    for key, row in by_key(one.sections).items():
+        value = document
+        for level in key.split("."):
+            value = value[level]
+        assert row.value.plain == value
     rows = [(row.name, row.text) for section in one.sections for row in section.rows]
     assert shown.text(found)
     return document, " ".join(page.split()), rows

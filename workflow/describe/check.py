@@ -137,8 +137,10 @@ def _hidden_rows(telling: Telling, candidates: Candidates) -> Iterator[Row]:
     """Candidates that the logs do not show, whatever the reason."""
     for name in telling.hidden[:_MOST_LISTED]:
         least = telling.least[name]
-        shows_from = f"only from {candidates.size_words(name, least)} on"
-        yield _said(name, shows_from if least < NOTHING_SHOWS else "does nothing in these records")
+        words = "does nothing in these records"
+        if least < NOTHING_SHOWS:
+            words = f"only from {candidates.size_words(name, least)} on"
+        yield _said(name, words)
     yield from _more(len(telling.hidden) - _MOST_LISTED, len(telling.hidden))
     by_need = sorted(candidates.untried.items(), key=lambda item: item[1])
     for needs, items in groupby(by_need, key=lambda item: item[1]):
