@@ -202,7 +202,6 @@ def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
 
 def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> str:
     """One row per machine with answer, numbers, sizes with intervals and values; then what failed."""
-    from scipy.stats import kendalltau, theilslopes  # here: it takes its time to load
 
     numbers = serial_numbers([machine.name for machine in machines])
     rows: list[dict[str, Any]] = []
