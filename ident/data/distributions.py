@@ -54,7 +54,7 @@ def normal_tail(value: npt.ArrayLike) -> RealArray:
 def student_quantile(probability: npt.ArrayLike, freedom: npt.ArrayLike) -> RealArray:
     """Return below what Student's t of so many degrees of freedom stays with this probability.
 
-    Of any shape; nan without a degree of freedom.
+    Of any shape, probabilities between 0 and 1 alone; nan without a degree of freedom.
     """
     quantile: RealArray = _SPECIAL.stdtrit(_positive(freedom), probability)
     return quantile

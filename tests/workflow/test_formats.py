@@ -9,7 +9,7 @@ import pytest
 from jinja2 import ChoiceLoader, DictLoader, Environment
 from markupsafe import Markup
 
-import workflow.study.page
+import workflow
 from workflow.figures.description import Picture, new_picture
 from workflow.figures.style import drawings
 from workflow.report import rendering
@@ -143,6 +143,7 @@ def test_pages_name_every_drawing_that_is_there_and_no_other():
     for source in Path(workflow.__file__).parent.rglob("*.py"):
         named.update(re.findall(r'\bPicture\(\s*"([^"]+)"', source.read_text("utf-8")))
     assert named == set(drawings())
+    assert all(callable(drawings()[name]) for name in named)
 
 
 @pytest.fixture

@@ -79,43 +79,49 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
 
 # Drawings by the module that makes them. A page loads those it draws with and no other: the drawings of a run
 # need the whole design, those of one log next to nothing.
-DRAWINGS_OF: dict[str, tuple[str, ...]] = {
-    "bode": ("bode", "response", "bode-loop", "distortion"),
-    "closed_loop": ("closed-loop", "measured-sensitivity", "closed-loop-conditions", "friction-in-the-loop"),
-    "gap_answer": (
+_DRAWINGS_OF: dict[str, tuple[str, ...]] = {
+    "workflow.figures.bode": ("bode", "response", "bode-loop", "distortion"),
+    "workflow.figures.closed_loop": (
+        "closed-loop",
+        "measured-sensitivity",
+        "closed-loop-conditions",
+        "friction-in-the-loop",
+    ),
+    "workflow.figures.gap_answer": (
         *("gap_probabilities", "gap_waterfall", "gap_partial"),
         *("gap_overview", "gap_next", "gap_controller"),
     ),
-    "gap_records": ("gap_measured", "gap_traces", "gap_spectra"),
-    "gap_where": ("gap_bands", "gap_regimes", "gap_dependences"),
-    "joints": (
+    "workflow.figures.gap_records": ("gap_measured", "gap_traces", "gap_spectra"),
+    "workflow.figures.gap_where": ("gap_bands", "gap_regimes", "gap_dependences"),
+    "workflow.figures.joints": (
         *("joint-steps", "matrix-response", "singular-values"),
         *("joint-requirements", "joint-validation", "mode-shapes"),
     ),
-    "nyquist": ("nyquist",),
-    "overview": ("overview",),
-    "pole_search": ("error-surface", "order"),
-    "poles": ("poles",),
-    "records": ("records", "log", "excitation"),
-    "sensitivity": ("sensitivities",),
-    "validation": ("validation", "residuals", "repeats"),
+    "workflow.figures.nyquist": ("nyquist",),
+    "workflow.figures.overview": ("overview",),
+    "workflow.figures.pole_search": ("error-surface", "order"),
+    "workflow.figures.poles": ("poles",),
+    "workflow.figures.records": ("records", "log", "excitation"),
+    "workflow.figures.sensitivity": ("sensitivities",),
+    "workflow.figures.validation": ("validation", "residuals", "repeats"),
+    "workflow.study.page": ("pareto",),
 }
-# Which of these modules a drawing is in.
-_MODULE_OF = {name: module for module, names in DRAWINGS_OF.items() for name in names}
-# Functions that draw, by the names that pages call them by; those of modules that were loaded.
+# The module of each drawing: the table above, the other way round.
+_MODULE_OF = {name: module for module, names in _DRAWINGS_OF.items() for name in names}
+# Drawings of the modules that are loaded.
 _LOADED: dict[str, Drawing] = {}
 
 
 def drawing(name: str) -> Callable[[D], D]:
     """Name of a drawing, by which a template asks for it: `figure("nyquist", run)`.
 
-    It takes typed results; None means there is nothing to draw. Raises ValueError for a name that
-    `DRAWINGS_OF` does not have under its module.
+    It takes typed results; None means there is nothing to draw. Raises ValueError for a name that is not
+    listed above under its module.
     """
 
     def register(draw: D) -> D:
-        if draw.__module__ != f"{__package__}.{_MODULE_OF.get(name)}":
-            raise ValueError(f"DRAWINGS_OF lists no drawing {name!r} of {draw.__module__}")
+        if draw.__module__ != _MODULE_OF.get(name):
+            raise ValueError(f"_DRAWINGS_OF has no {name!r} of {draw.__module__}: list it there")
         _LOADED[name] = draw
         return draw
 
@@ -126,7 +132,7 @@ class _Drawings(Mapping[str, Drawing]):
     """Every drawing by its name; its module is loaded when it is asked for."""
 
     def __getitem__(self, name: str) -> Drawing:
-        importlib.import_module(f"{__package__}.{_MODULE_OF[name]}")
+        importlib.import_module(_MODULE_OF[name])
         return _LOADED[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -137,7 +143,7 @@ class _Drawings(Mapping[str, Drawing]):
 
 
 def drawings() -> Mapping[str, Drawing]:
-    """Every drawing of this package by its name. KeyError: none is called so."""
+    """Every drawing by its name. KeyError: none is called so."""
     return _Drawings()
 
 
