@@ -17,10 +17,13 @@ import scipy.linalg
 from benchmarks.harness import Print, main
 
 _DT_S = 0.01
-_SLACK = 1e-6  # relative; what eigenvalues next to the circle are trusted to
-_RADIUS = 1e-9  # of the circle, for the same reason
+# Relative error to which eigenvalues next to the circle are trusted.
+_SLACK = 1e-6
+# Distance of a pole from the circle that counts as none, for the same reason.
+_RADIUS = 1e-9
 
-System = tuple[Any, Any, Any, float]  # A (n, n), B (n, 1), C (1, n), D
+# A (n, n), B (n, 1), C (1, n), D.
+System = tuple[Any, Any, Any, float]
 
 
 def run(out: Print, *, controllers: int = 1000, seed: int = 47) -> None:

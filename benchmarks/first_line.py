@@ -28,9 +28,12 @@ import numpy as np
 from benchmarks.harness import Print, main
 
 DT_S = 0.002
-N = 4000  # samples of a log: 8 s
-LONGEST_S = 120  # wall clock and CPU: then a case is ended and lost
-SEARCHED_S = 4  # CPU: whoever is not refused by then has gone on to search
+# Samples of a log: 8 s.
+N = 4000
+# Wall clock and CPU: then a case is ended and lost.
+LONGEST_S = 120
+# CPU: whoever is not refused by then has gone on to search.
+SEARCHED_S = 4
 
 Columns = dict[str, np.ndarray]
 

@@ -26,7 +26,8 @@ from typing import Any, TypeVar
 
 RESULTS = Path(__file__).parent / "results"
 
-Print = Callable[..., None]  # tells a line, or an empty one
+# Tells a line, or an empty one.
+Print = Callable[..., None]
 R = TypeVar("R")
 C = TypeVar("C")
 

@@ -45,7 +45,8 @@ ITEMS = {
     "effort_dB": Item("<= 10", lambda v: (20 - v) / 10, lambda v: (10 - v) / 10),
 }
 _HZ = np.arange(1, 1001) * 0.01
-_FINE = np.geomspace(1e-3, np.pi, 2000)  # rad/sample, for the crossovers
+# Frequencies for the crossovers, rad/sample.
+_FINE = np.geomspace(1e-3, np.pi, 2000)
 
 
 @dataclass(frozen=True, eq=False)

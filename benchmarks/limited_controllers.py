@@ -36,11 +36,16 @@ StateSpace = tuple[Array, Array, Array, Array]
 FORMS = ("sections", "companion", "tf2ss", "random states")
 PLANTS = ("motor", "second order", "integrating", "flexible")
 
-_LEFT = 0.02  # of limit and step: what may be left of the way at the end
-_SLOWEST = 1 - 2e-5  # largest closed-loop pole radius of a loop that is drawn: settles within 350 000 samples
-_MARGIN = 0.3  # least distance of the loop from -1
-_ROUNDED = 0.01  # largest change of the response by writing the law in its form: beyond, it is another law
-_TRIES = 200  # draws until a loop is good; a seed that needs more is left out and counted
+# What may be left of the way at the end, of limit and step.
+_LEFT = 0.02
+# Largest closed-loop pole radius of a loop that is drawn: settles within 350 000 samples.
+_SLOWEST = 1 - 2e-5
+# Least distance of the loop from -1.
+_MARGIN = 0.3
+# Largest change of the response by writing the law in its form: beyond, it is another law.
+_ROUNDED = 0.01
+# Draws until a loop is good; a seed that needs more is left out and counted.
+_TRIES = 200
 
 # The loop around the code under test: state of the plant, output, command; `reference` less the output is the
 # error. Written here, so that the arithmetic of the loop is the judge's own.

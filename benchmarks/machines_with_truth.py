@@ -22,7 +22,8 @@ import scipy.signal
 
 from benchmarks.harness import Print, flexlink, main
 
-_RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
+# Chi-square of two degrees of freedom, 95 %.
+_RADIUS_2 = -2 * np.log(0.05)
 
 
 def answered(folder: Path, work: Path) -> tuple[float, int, str]:

@@ -38,7 +38,8 @@ from control_design import (
 )
 from control_design.plants.weights import RationalWeight
 
-DT_D = 0.01  # min; Tustin's rule keeps every value of D at its frequency in s
+# Sampling period of D, min: Tustin's rule keeps every value of D at its frequency in s.
+DT_D = 0.01
 
 
 def tustin(a, b, c, d, dt_s):

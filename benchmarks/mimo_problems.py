@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 Array = np.ndarray
-Response = Callable[[Array], Array]  # complex s (F,) -> (F, rows, columns)
+# Complex s (F,) -> (F, rows, columns)
+Response = Callable[[Array], Array]
 
 TS = 0.004
 CHI = np.sqrt(15.507313 / 2)

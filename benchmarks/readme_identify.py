@@ -38,7 +38,8 @@ EXPERIMENTS = (
         ),
     ),
 )
-EXCITED_HZ = 50.0  # the third mode, at 91 Hz, is not asked for
+# The third mode, at 91 Hz, is not asked for.
+EXCITED_HZ = 50.0
 
 
 def weak_records(source: SimulatedSource, seed: int) -> list[Record]:

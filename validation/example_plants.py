@@ -154,6 +154,10 @@ def _positive(rng: np.random.Generator, nominal: float, spread: float) -> float:
 
 
 def _roots_and_gain(p: Mapping[str, float]) -> tuple[Complex, Complex, float]:
+    """Poles (4,), zeros (3,) in z and the gain of the sampled link with these parameters.
+
+    The gain is that of the continuous response at .2 rad/s, far below the mode.
+    """
     decay = -p["zeta"] * p["mode"]
     mode = complex(decay, p["mode"] * np.sqrt(1 - p["zeta"] ** 2))
     poles = np.exp(_DT_S * np.array([-p["slow_pole"], -p["pole"], mode, mode.conjugate()]))

@@ -40,7 +40,8 @@ from benchmarks.closed_loop_machines.simulator import Array, Law, Plant, respons
 from benchmarks.harness import flexlink
 
 _LONGEST_S = 900
-_RADIUS_2 = -2 * np.log(0.05)  # chi-square of two degrees of freedom, 95 %
+# Chi-square of two degrees of freedom, 95 %.
+_RADIUS_2 = -2 * np.log(0.05)
 # A next step names a command, an option or a setting.
 _STEP = re.compile(r"flexlink \w+|--[a-z]|[a-z]+_[a-z_]+ = |integrators? = |\[\w+\]")
 

@@ -14,7 +14,8 @@ from benchmarks.closed_loop_machines.machines import ALL_KINDS, TAU, Draft, draf
 from benchmarks.closed_loop_machines.simulator import Array, Plant
 
 CLASSES = ("multisine", "prbs", "chirp", "moves")
-_BEFORE_S = 3.0  # every log is cut out of a longer motion
+# Every log is cut out of a longer motion.
+_BEFORE_S = 3.0
 
 
 @dataclass(frozen=True, eq=False)

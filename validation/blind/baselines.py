@@ -68,6 +68,7 @@ def _shares(case: Case, model: ResidualModel, base: Fit) -> dict[str, float]:
 
 
 def _document(case: Case, verdict: str, shares: dict[str, float], gap_after: float) -> dict[str, Any]:
+    """An answer in the form of `flexlink diagnose`; shares: of effects, made into probabilities."""
     total = sum(shares.values())
     return {
         "case": case.name,

@@ -220,6 +220,7 @@ class _Nominal:
         self._records: dict[str, Clean] = {}
 
     def largest_ratio(self, effects: list[Table]) -> float:
+        """Largest rms of the gap over its noise, over records and outputs."""
         machine = Truth(self.rig, effects)
         largest = 0.0
         for plan in self.plans:
@@ -240,6 +241,7 @@ class _Nominal:
 def _run(
     rig: Rig, effects: list[Table], plans: tuple[Planned, ...], rng: np.random.Generator
 ) -> tuple[Record, ...]:
+    """The experiments as they run on the machine with its effects, and their gaps to the machine without."""
     machine = Truth(rig, effects)
     nominal = Truth(rig)
     records = []

@@ -178,6 +178,7 @@ def _sealed_cases(out: Path, settings: Mapping[str, Any], jobs: int, progress: P
 
 
 def _predict(out: Path, names: Sequence[str], jobs: int, diagnose: Diagnose, progress: Progress) -> None:
+    """Diagnose every case that has no answer yet, and write its answer."""
     folder = out / "predictions"
     todo = [name for name in names if not (folder / f"{name}.json").is_file()]
     done = len(names) - len(todo)
@@ -202,6 +203,7 @@ def _check_cases(out: Path, labels: Sequence[Answer]) -> None:
 def _scored(
     predictions: Sequence[Mapping[str, Any]], labels: Sequence[Answer], groups: Mapping[str, str]
 ) -> dict[str, Any]:
+    """Scores of the diagnoses and of the baselines; a method that did not answer a case is wrong there."""
     document: dict[str, Any] = {"diagnosis": scores(predictions, labels, groups), "baselines": {}}
     methods = {name: None for p in predictions for name in p.get("baselines", {})}
     for method in methods:

@@ -174,6 +174,7 @@ def scores(
 
 
 def _rows(cases: pd.DataFrame) -> dict[str, Any]:
+    """Rows of the accuracy table for these cases."""
     single = cases[cases.kind == "single"]
     several = cases[cases.kind == "several"]
     clear = single[single.ratio >= CLEAR]

@@ -177,6 +177,7 @@ def _band(
     name: str,
     floor: float,
 ) -> None:
+    """Draw centre and band of a bound with the truth; floor: decibels below which the gain is not shown."""
     band = response_band(bound)
     low = np.maximum(decibels(np.maximum(band.gain_low, 1e-300)), floor - 50)
     fill: dict[str, Any] = {"color": colour, "alpha": 0.35, "lw": 0}

@@ -79,6 +79,7 @@ def _cuts(close: Panel, whole: Panel, study: SurfaceStudy) -> None:
 
 
 def _counts(panel: Panel, counts: tuple[MinimaCount, ...]) -> None:
+    """Draw how many minima grids of several sizes show."""
     place = np.arange(len(counts))
     for offset, values, colour, label in (
         (-0.2, [count.inside for count in counts], style.HIGHLIGHT, "grid minima inside the window"),

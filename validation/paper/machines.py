@@ -56,6 +56,7 @@ def _response(system: Any, omega_rad_s: RealArray, row: int = 0, column: int = 0
 
 
 def _record(name: str, u: RealArray, y: RealArray, input_name: str, input_unit: str) -> Record:
+    """A record of one input (T,) and the tip (T,)."""
     return Record(
         name=name,
         input=u[:, None],

@@ -50,6 +50,7 @@ def instrumental_variables(u: RealArray, y: RealArray, na: int, nb: int) -> tupl
 def _instrumented(
     u: RealArray, y: RealArray, instrument: RealArray, na: int, nb: int, noise: NoiseModel
 ) -> tuple[RealArray, RealArray]:
+    """Coefficients of A and B by instrumental variables, behind a noise model."""
     first = max(na, nb - 1)
     u, y, x = (noise.filtered(np.asarray(signal)) for signal in (u, y, instrument))
     past_u = shifted(u, range(nb))

@@ -156,6 +156,7 @@ def stored_fields(kind: type) -> dict[str, Any]:
 
 
 def _pack(value: Any, at: str, arrays: dict[str, AnyArray]) -> Any:
+    """A value as JSON-able document; arrays: those it refers to, by their place in it. at: that place."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | str):
@@ -198,6 +199,7 @@ def _join(at: str, name: str) -> str:
 
 
 def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    """A value of a kind from its document. at: its place, for a complaint. Raises CodecError."""
     kind = bare(kind)
     origin = get_origin(kind)
     if origin in _UNIONS:
@@ -236,6 +238,7 @@ def _unpack(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -
 
 
 def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> Any:
+    """A dataclass from its fields. Raises CodecError for a field too many, or one that is missing."""
     _expect(isinstance(document, dict), document, at, f"an object with the fields of {kind.__name__}")
     fields = stored_fields(kind)
     strange = sorted(set(document) - set(fields) - {_TYPE})
@@ -258,6 +261,7 @@ def _unpack_dataclass(kind: Any, document: Any, arrays: Mapping[str, AnyArray], 
 
 
 def _unpack_array(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: str) -> AnyArray:
+    """The array that a document refers to. Raises CodecError where it is not there or of another kind."""
     name = document.get(_ARRAY) if isinstance(document, dict) else None
     _expect(isinstance(name, str) and name in arrays, document, at, "an array that is in the archive")
     array = arrays[str(name)]
@@ -269,6 +273,7 @@ def _unpack_array(kind: Any, document: Any, arrays: Mapping[str, AnyArray], at: 
 
 
 def _unpack_scalar(kind: type, document: Any, at: str) -> Any:
+    """A single value. Raises CodecError for one of another kind."""
     if issubclass(kind, Enum):
         _expect(document in kind.__members__, document, at, f"one of {', '.join(kind.__members__)}")
         return kind[document]

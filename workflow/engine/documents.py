@@ -80,6 +80,7 @@ def json_object(text: str, source: str) -> dict[str, Any]:
 
 
 def _parsed(parse: Callable[[str], Any], text: str, source: str, what: str) -> Any:
+    """What a parser makes of a text. Raises InputError with line and column."""
     try:
         document = parse(text)
     except RecursionError:

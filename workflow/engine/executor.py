@@ -294,6 +294,7 @@ def _interrupts_wait() -> Iterator[None]:
 
 
 def _work(connection: Connection, task: Task[Any]) -> None:
+    """What runs in a process of its own: the task, its progress and its result through the connection."""
     # Interrupting from the keyboard reaches every process of the terminal; only the parent answers.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, args=(connection,), daemon=True).start()

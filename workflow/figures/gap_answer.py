@@ -101,6 +101,7 @@ def _bars(
     title: str,
     axis: str,
 ) -> Picture:
+    """Lying bars in percent with a name before and a label behind each, the first on top."""
     picture, panel = new_picture(1.0 + 0.34 * len(names))
     for at, (value, label, colour) in enumerate(zip(percent, labels, colours, strict=True)):
         panel.bars(at, value, 0.62, lying=True, color=colour)

@@ -632,6 +632,7 @@ class _Writer:
         return f'<g class="{name}" clip-path="url(#{clip})">{moving}{"".join(dots)}</g>'
 
     def area(self, mark: Area, frame: _Frame) -> list[str]:
+        """Paths of the outlines that are large enough to be seen."""
         shapes = []
         for outline in mark.outlines:
             points = np.column_stack([frame.place(X, outline[:, X]), frame.place(Y, outline[:, Y])])
@@ -692,6 +693,7 @@ class _Writer:
         return f'<path class="{self.named(looks.filling(mark.look))}" d="{path_of(points, closed=True)}"/>'
 
     def words(self, mark: Words, frame: _Frame) -> str:
+        """Words at their place; "" where that is out of view and they are not to be drawn there."""
         x, y = frame.anchor(mark)
         if mark.vertical == "center":
             y += 0.35 * mark.size
@@ -703,7 +705,8 @@ class _Writer:
             # Where there is no room to the right of a line, to its left.
             x -= 2 * mark.offset[0]
             side = "right"
-        # Classes that the page's script knows: words at a vertical rule, at a horizontal one, at a point.
+        # Classes that the page's script knows: `t` at a place in the data, `u` where only x is one, `w` where
+        # x is none.
         if mark.across_x:
             name = "w"
         elif mark.across_y:
@@ -819,6 +822,7 @@ class _Writer:
         )
 
     def title(self, frame: _Frame) -> str:
+        """The title above a panel, in its lines; "" without one."""
         panel = frame.panel
         if not frame.title:
             return ""

@@ -133,6 +133,7 @@ class StudyDirectory(Store):
 
 
 def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Done) -> None:
+    """Write a run of the study from stage files by name."""
     run.begin_run(
         config_text=f"# {point.name}\n\n{point.config.to_toml()}",
         config=point.config.to_document(),

@@ -65,6 +65,7 @@ class PointTask:
             )
 
     def _fill(self, run: RunDirectory, point: Point, earlier: Sequence[RunDirectory]) -> Done:
+        """Compute the stages of one point in a run directory; earlier: runs that may share some."""
         config: Any = point.config
         run.stages_path.mkdir(parents=True)
         for name, content in self.given.items():

@@ -249,6 +249,7 @@ def _of_the_loop(table: Table, roles: Roles) -> tuple[Finding, ...]:
 
 
 def _response(table: Table) -> ResponseLook | None:
+    """What a table holds that is a frequency response; None for a log."""
     if not has_response(table):
         return None
     try:
@@ -304,6 +305,7 @@ def _time(
 
 
 def _column(table: Table, name: str) -> ColumnLook:
+    """One column as a signal, with what keeps it from being one."""
     try:
         values = table.columns([name])[name]
     except ValueError as error:

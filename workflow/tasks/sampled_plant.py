@@ -49,6 +49,7 @@ def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.St
 def _part(
     posterior: ResponsePosterior, poles: Poles, coefficients: RealArray, feedthrough: float
 ) -> control.StateSpace:
+    """The poles of a basis with their coefficients, integrators and delay as a discrete system."""
     return GobfModel(
         poles,
         coefficients,

@@ -35,6 +35,7 @@ def design_controller(stage: StageInput) -> DesignResult:
     config = stage.config
 
     def design_for(asked: Specification, *, advise: bool) -> DesignResult:
+        """The best controller for a specification; advise: with what would be met instead."""
         report = partial(stage.progress.update, "design")
         return find_design(
             stage.plants,

@@ -148,6 +148,7 @@ def _numbers(path: Path, name: str, value: Any) -> ComplexArray:
 
 
 def _matrix(path: Path, name: str, value: Any) -> RealArray:
+    """A value of a file as finite real numbers of any shape. Raises InputError that names it."""
     try:
         matrix = np.asarray(value)
         if matrix.dtype.kind not in "fiu":

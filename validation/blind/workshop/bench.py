@@ -59,6 +59,7 @@ class Bench:
         return np.column_stack(columns)[rows_before:]
 
     def logs(self, truth: Truth) -> list[Log]:
+        """Records of a machine as the fit sees them. Raises OutOfBoundsError for one that is too stiff."""
         if truth.substeps > _MOST_SUBSTEPS:
             raise OutOfBoundsError("a machine this stiff is beyond every bound")
         logs = []

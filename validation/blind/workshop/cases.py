@@ -125,6 +125,7 @@ def make_case(plan: WorkshopPlan, rng: np.random.Generator) -> WorkshopCase:
 def _attempt(
     sort: Sort, sensor: Sensor, closed: bool, names: list[str], rng: np.random.Generator
 ) -> WorkshopCase | None:
+    """A case with one draw of the machine; None where background or an effect cannot have its size."""
     machine = draw_workshop(sensor, rng)
     quiet = Background(
         hub_offset_rad=machine.background.hub_offset_rad,
@@ -225,6 +226,8 @@ def _recorded(
     bench: Bench,
     rng: np.random.Generator,
 ) -> WorkshopCase | None:
+    """The case with its records as sensors and clock give them; None where its gap came out too small or too
+    large."""
     truth = Truth(machine.true, effects, machine.background)
     oracle = Truth(machine.true, effects, bench.quiet)
     samples = []

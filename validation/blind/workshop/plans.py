@@ -167,6 +167,7 @@ class _Makers:
         return span_rad * rise * wave / np.ptp(wave)
 
     def slews(self, span_rad: float) -> Real:
+        """A reference (T,) of smooth moves with rests in between, within a span."""
         T = self.length()
         reference = np.zeros(T)
         level = 0.0
@@ -211,6 +212,7 @@ class _Makers:
         return self._scaled(wave, span_rad)
 
     def doublets(self, span_rad: float) -> Real:
+        """A voltage (T,) of pulses forth and back with rests in between."""
         T = self.length()
         wave = np.zeros(T)
         k = self.rows_before + int(0.1 / self.dt)
