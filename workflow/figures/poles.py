@@ -146,9 +146,9 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
         for half in (line, line.conj()):
             panel.plot(half.real, half.imag, ls=dashes, **look)
         if named:
-            seen = np.flatnonzero(
-                (line.real > left) & (line.real < right) & (line.imag > max(low, 0.0)) & (line.imag < high)
-            )
+            in_width = (line.real > left) & (line.real < right)
+            in_height = (line.imag > max(low, 0.0)) & (line.imag < high)
+            seen = np.flatnonzero(in_width & in_height)
             if seen.size:
                 place = line[seen[int(_NAMED_AT.get(words, _ELSE_AT) * seen.size)]]
                 panel.words(words, place.real, place.imag, horizontal="center")

@@ -218,8 +218,11 @@ def informed(draft: Draft, channel: IdentifiedChannel, uncertain: UncertainChann
         sensitivity = 1 / np.abs(1 + k * model.frequency_response(omega))
         effort = float(np.max(np.abs(k) * sensitivity))
         recorded = float(omega[np.argmax(sensitivity > np.sqrt(0.5))])
+    # The band that is told: where the ellipses are small beside the response.
     size = np.abs(uncertain.frequency.centre)
-    known = omega[np.trace(uncertain.frequency.covariance, axis1=1, axis2=2) < (TOLD * size) ** 2]
+    variance = np.trace(uncertain.frequency.covariance, axis1=1, axis2=2)
+    is_told = variance < (TOLD * size) ** 2
+    known = omega[is_told]
     if look.told_rad_s is None or not known.size:
         return draft
     band = min(look.told_rad_s[0], float(known[0])), float(known[-1])

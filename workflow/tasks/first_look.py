@@ -294,8 +294,10 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
 def notches(model: GobfModel) -> RealArray:
     """Natural frequencies [rad/s] of lightly damped zeros, ascending."""
     zeros = np.asarray(model.zeros())
-    s = np.log(zeros[(np.imag(zeros) > 0) & (np.abs(zeros) > 0)]) / model.dt_s
-    return np.sort(np.abs(s)[np.abs(np.real(s)) < LIGHT * np.abs(s)])
+    is_upper = (np.imag(zeros) > 0) & (np.abs(zeros) > 0)
+    s = np.log(zeros[is_upper]) / model.dt_s
+    is_light = np.abs(np.real(s)) < LIGHT * np.abs(s)
+    return np.sort(np.abs(s)[is_light])
 
 
 def _rigid(records: Sequence[Record], response: FrequencyUncertainty, position: bool) -> RigidMotion | None:

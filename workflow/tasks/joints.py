@@ -203,7 +203,8 @@ def run_loops(stage: StageInput) -> JointsLoopResult:
         return JointsLoopResult(skipped=results.design.reason)
     # Twenty time constants of the slowest joint, unless a time is stated.
     bandwidth = min((joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s), default=1.0)
-    samples = int(np.ceil((config.closed_loop.duration_s or 20.0 / bandwidth) / law.dt_s))
+    duration_s = config.closed_loop.duration_s or 20.0 / bandwidth
+    samples = int(np.ceil(duration_s / law.dt_s))
     step = np.array(config.closed_loop.step or (0.1,) * len(config.joints))
     reference = np.tile(step, (samples, 1))
     reference[: samples // 20] = 0.0

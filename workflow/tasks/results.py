@@ -435,7 +435,8 @@ class UncertainChannel:
         posterior = resampled(self.posterior, controller_dt_s)
         # Where the logs and the new controller both tell a response.
         omega = self.frequency.omega_rad_s
-        omega = omega[omega < 0.99 * np.pi / max(step_s, controller_dt_s)]
+        below_both_nyquists = omega < 0.99 * np.pi / max(step_s, controller_dt_s)
+        omega = omega[below_both_nyquists]
         poles = resampled_poles(self.nominal.poles, step_s, controller_dt_s)
         return replace(
             self,
@@ -461,10 +462,11 @@ class UncertaintyResult:
 
     def conditions(self, config: RunConfig) -> tuple[Finding, ...]:
         """What a certificate over these ellipses stands or falls with."""
-        used = dict.fromkeys((config.control_index, config.performance_index))
-        return distinct(
-            [found for k in used if k is not None for found in conditions_of(self.channels[k].advice)]
-        )
+        conditions = []
+        for index in dict.fromkeys((config.control_index, config.performance_index)):
+            if index is not None:
+                conditions += conditions_of(self.channels[index].advice)
+        return distinct(conditions)
 
     def seen_by_controller(self, config: RunConfig) -> tuple[UncertainChannel, ...]:
         """The channels at the rate of the new controller."""

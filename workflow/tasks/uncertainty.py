@@ -208,8 +208,10 @@ def uncertainty_of(
     omega = display_grid(result.model, result.bounded)
     # In a band of the data the nominal model has to be right, and need not elsewhere.
     if band is not None:
-        omega = omega[(omega >= band[0]) & (omega <= band[1])]
-        omega = omega if omega.size >= _FEWEST_FREQUENCIES else np.geomspace(*band, _FEWEST_FREQUENCIES)
+        is_in_band = (omega >= band[0]) & (omega <= band[1])
+        omega = omega[is_in_band]
+        if omega.size < _FEWEST_FREQUENCIES:
+            omega = np.geomspace(*band, _FEWEST_FREQUENCIES)
     observer = friction is not None and friction.observed
     uncertain = uncertain_channel(
         channel.uncertainty.method,
@@ -343,7 +345,8 @@ def bands_of(frequency: FrequencyUncertainty) -> tuple[Band, ...]:
     edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
     bands = []
     for low, high in pairwise(edges):
-        radii = relative[(omega >= low) & (omega < high)]
+        is_in_band = (omega >= low) & (omega < high)
+        radii = relative[is_in_band]
         bands.append(Band(low, high, float(np.median(radii)), float(np.max(radii))))
     return tuple(bands)
 
