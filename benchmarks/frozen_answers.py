@@ -308,7 +308,9 @@ def run(
 ) -> None:
     """only: a pattern of names; stop: at the first answer that moved."""
     stored = Stored.read(RESULTS / f"{against}.txt")
-    wanted = [name for name, one in QUESTIONS.items() if re.search(only, name) and (slow or not one.slow)]
+    wanted = [
+        name for name, question in QUESTIONS.items() if re.search(only, name) and (slow or not question.slow)
+    ]
     skipped = {
         name: next(place for place in QUESTIONS[name].needs if not place.exists())
         for name in wanted
@@ -334,22 +336,26 @@ def run(
         spent_s = spent_s + cpu_s
         before = stored.answers.get(name)
         off = moved(before or {}, answer)
-        told = [str(one) for one in off if one.share > 1] if before is not None else []
-        state = "moved" if told else "same"
+        lines = list[str]()
         if before is None:
             state = "not stored"
-            told = [] if store else [f"it is stored by: {_storing(name, against)}"]
+            if not store:
+                lines = [f"it is stored by: {_storing(name, against)}"]
         else:
-            within += [(one.share, f"{name}: {one}") for one in off if one.share <= 1]
-        if place and (told or before is None):  # in place of a line for each value that vanished
-            told = [f"raises, in {place}: {answer['lines']['raises']}"]
-        wrong += [name] if told else []
-        rest = left_s * (time.monotonic() - begin) / max(all_s - left_s, 1.0)
+            lines = [str(move) for move in off if move.share > 1]
+            within += [(move.share, f"{name}: {move}") for move in off if move.share <= 1]
+            state = "moved" if lines else "same"
+        # In place of a line for each value that vanished.
+        if place and (lines or before is None):
+            lines = [f"raises, in {place}: {answer['lines']['raises']}"]
+        if lines:
+            wrong.append(name)
+        time_left_s = left_s * (time.monotonic() - begin) / max(all_s - left_s, 1.0)
         out(
             f"[{count}/{len(ready)}] {name}: {state}, {cpu_s:.1f} s CPU ({expected_s(name):g} s expected); "
-            f"about {rest / 60:.1f} min left"
+            f"about {time_left_s / 60:.1f} min left"
         )
-        for line in told:
+        for line in lines:
             out(f"    {line}")
         if store:
             stored.put(name, answer, cpu_s)

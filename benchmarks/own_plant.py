@@ -28,7 +28,7 @@ def constants(
     A record with named fields, which compiled code reads as well.
     """
     values = {f"{effect.name}_{p.name}": 0.0 for effect in listed for p in effect.parameters} | absent
-    values |= {f"{name}_{key}": value for name, given in effects.items() for key, value in given.items()}
+    values |= {f"{name}_{key}": value for name, sizes in effects.items() for key, value in sizes.items()}
     values |= parameters or {}
     return np.rec.array([tuple(values.values())], dtype=[(name, np.float64) for name in values])[0]
 

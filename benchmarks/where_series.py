@@ -487,7 +487,7 @@ def run(
     for route in routes:
         for variable in VARIABLES:
             here = [answered(route, variable, k, seed, out) for k in range(each)]
-            counts[route, variable] = sum(one[0] for one in here)
+            counts[route, variable] = sum(answer[0] for answer in here)
             every += here
         quiet += [answered(route, "none", k, seed, out) for k in range(none)]
         quiet += [answered(route, "shaken", k, seed, out) for k in range(each)]
@@ -495,13 +495,13 @@ def run(
     for route in routes:
         by = ", ".join(f"{variable} {counts[route, variable]}" for variable in VARIABLES)
         out(f"{route:7s} right of {each}: {by}")
-    out(f"variable right: {sum(one[0] for one in every)} of {len(every)}")
-    out(f"place right too: {sum(one[1] for one in every)} of {len(every)}")
-    out(f"false alarms: {sum(not one[0] for one in quiet)} of {len(quiet)}")
-    errors = [one[2] for one in every if np.isfinite(one[2])]
+    out(f"variable right: {sum(answer[0] for answer in every)} of {len(every)}")
+    out(f"place right too: {sum(answer[1] for answer in every)} of {len(every)}")
+    out(f"false alarms: {sum(not answer[0] for answer in quiet)} of {len(quiet)}")
+    errors = [answer[2] for answer in every if np.isfinite(answer[2])]
     if errors:
         out(f"curve against the true force: median {100 * float(np.median(errors)):.0f} % of it")
-    times = [one[3] for one in every + quiet]
+    times = [answer[3] for answer in every + quiet]
     out(f"CPU of where, median: {float(np.median(times)):.1f} s, most {max(times):.1f} s")
 
 

@@ -88,10 +88,10 @@ def worst_of(verdicts: list[dict[str, Any]]) -> dict[str, Any]:
     """What a certificate states of a machine that may be any of its plants: the least of each number."""
     margins = [verdict["worst_margins"] for verdict in verdicts]
     stated = {
-        name: min(_number(one[name]) for one in margins)
+        name: min(_number(margin[name]) for margin in margins)
         for name in ("modulus", "gain_up", "phase_rad", "delay_s")
     }
-    stated["gain_down"] = max(_number(one["gain_down"]) for one in margins)
+    stated["gain_down"] = max(_number(margin["gain_down"]) for margin in margins)
     bandwidth = min(_number(verdict["bandwidth_rad_s"]) for verdict in verdicts)
     return {"worst_margins": stated, "bandwidth_rad_s": bandwidth}
 
@@ -135,11 +135,12 @@ def violations(plant: Plant, q_operating: float, law: Law, verdict: dict[str, An
     ends = 1 + 0.99 * (up - 1), max(1 - 0.99 * (1 - down), 1e-3)
     gains = np.concatenate([np.geomspace(1, end, 20) for end in ends])
     violated += [f"gain {g:.4f} unstable, stated {down:.4f} to {up:.4f}" for g in gains if radius(g) >= 1][:1]
-    one = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))  # crossings of the unit circle
-    phase = np.abs(np.angle(-gain[one]))
+    # Where the loop crosses the unit circle.
+    crossings = np.flatnonzero(np.diff(np.sign(np.abs(gain) - 1)))
+    phase = np.abs(np.angle(-gain[crossings]))
     if np.min(phase, initial=np.pi) < 0.99 * min(worst["phase_rad"], np.pi):
         violated.append(f"phase {np.min(phase):.4f} rad, stated {worst['phase_rad']:.4f}")
-    delay = np.min(np.mod(np.angle(-gain[one]), TAU) / theta[one], initial=np.inf) * plant.dt_s
+    delay = np.min(np.mod(np.angle(-gain[crossings]), TAU) / theta[crossings], initial=np.inf) * plant.dt_s
     if delay < 0.99 * worst["delay_s"]:
         violated.append(f"delay {delay:.4g} s, stated {worst['delay_s']:.4g}")
     within = theta < 0.99 * verdict["bandwidth_rad_s"] * plant.dt_s
