@@ -24,6 +24,8 @@ from ident.frequency_fit import FrfIdentification
 from ident.identification import Identification, MimoIdentification
 from ident.search.error_surface import ErrorSurface
 from ident.uncertainty import ResponsePosterior
+from workflow.describe.facts import by_key
+from workflow.describe.summary import RunSummary
 from workflow.figures.bands import response_band
 
 __all__ = ["table"]
@@ -39,6 +41,7 @@ def table(result: object) -> pd.DataFrame:
     Certificate: a row per requirement. Synthesis: a row per active constraint. Diagnosis: a row per effect
     and parameter, with its 95 % interval and two probabilities: that the effect is `present`, and that it is
     the `main_cause` (these sum to one). Error surface: a row per grid point. Youla bracket: a row per plant.
+    Summary of a run: a row per fact, with its key in the JSON answer.
     Raises TypeError for anything else.
 
     Examples
@@ -136,6 +139,15 @@ def _diagnosis(found: Diagnosis) -> pd.DataFrame:
             low, high = effect.intervals.get(str(name), (np.nan, np.nan))
             sized = {"parameter": name, "value": value, "low": low, "high": high}
             rows.append({**about, **sized, "gap_after": effect.gap_after})
+    return pd.DataFrame(rows)
+
+
+@table.register(RunSummary)
+def _facts(summary: RunSummary) -> pd.DataFrame:
+    rows = []
+    for key, fact in by_key(summary.sections).items():
+        values = fact.value.plain if isinstance(fact.value.plain, dict) else {"value": fact.value.plain}
+        rows.append({"key": key, "name": fact.name, "unit": fact.value.unit, **values, "text": fact.text})
     return pd.DataFrame(rows)
 
 

@@ -16,6 +16,8 @@ from workflow.report import rendering
 from workflow.text import formats
 from workflow.text.templates import CompiledTemplates, environment as shared, render_text
 
+ROOT = Path(__file__).resolve().parents[2]
+
 
 @pytest.mark.parametrize(
     ("value", "text"),

@@ -42,6 +42,7 @@ from workflow.describe.friction import (
     stands_still,
     sticking,
 )
+from workflow.describe.loop_metrics import LOOP_METRICS
 from workflow.engine import codec
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, MeasuredPeak, RunResults
 from workflow.text.formats import (
@@ -63,6 +64,8 @@ from workflow.text.formats import (
 if TYPE_CHECKING:
     from workflow.figures.subjects import RunView
 
+# Where rows of `LOOP_METRICS` stand in the JSON answer.
+METRICS_AT = "closed_loop"
 # Anchor, title and short name of the section of a page.
 _PAGE = ("closed-loop", "Closed loop over time", "Closed loop")
 # Largest command over the largest recorded input from which on the records tell nothing of it; chosen.
@@ -113,27 +116,44 @@ def largest(check: LoopCheck, metric: str, more: Sequence[float | None] = ()) ->
     return None if None in values else max(values)
 
 
-def _metric(key: str, name: str, unit: str, check: LoopCheck, metric: str, more: str = "") -> Row:
-    """A metric of the runs: the largest, with prediction and spread beside it."""
-    remark = spread(check, metric, unit) + (f"; {more}" if more else "")
-    return Row(f"closed_loop.{key}", name, Quantity.of(largest(check, metric), unit), remark)
+def metric_rows(check: LoopCheck, input_unit: str, output_unit: str) -> tuple[Row, ...]:
+    """A row for each of `LOOP_METRICS`, with what was predicted and the runs beside it.
+
+    The text is the largest of prediction and runs. Programs get the prediction, the smallest and the largest
+    of the runs; null where a run never gets there.
+    """
+    rows = []
+    for metric in LOOP_METRICS:
+        unit = metric.unit or input_unit
+        largest_text = Quantity.of(largest(check, metric.name), unit).text
+        remark = spread(check, metric.name, unit)
+        if metric.name == "settling_time_s":
+            largest_text, with_friction = _settling(check, output_unit)
+            remark += f"; {with_friction}"
+        if metric.name == "peak_command" and check.input_limit is not None:
+            remark += f"; limit {si(check.input_limit, unit)}"
+        _, smallest_run, largest_run = check.spread_of(metric.name)
+        predicted = getattr(check.predicted, metric.name)
+        plain = {"predicted": predicted, "smallest": smallest_run, "largest": largest_run}
+        value = Quantity(largest_text, plain, unit)
+        rows.append(Row(f"{METRICS_AT}.{metric.name}", metric.label, value, remark))
+    return tuple(rows)
 
 
-def settling_row(check: LoopCheck, output_unit: str) -> Row:
-    """Settling time to 2 %: the longest, with friction those of steps of half to twice the size included."""
+def _settling(check: LoopCheck, output_unit: str) -> tuple[str, str]:
+    """The longest settling time, with friction those of steps of half to twice the size included; and what
+    friction does to it."""
     friction = check.friction
     linear_s = largest(check, "settling_time_s")
-    longest = Quantity.of(linear_s, "s")
-    held = "friction was not identified"
-    if friction is not None:
-        held = sticking(friction, output_unit) or f"with dry friction {settling_range(friction.settling)}"
-        worst_s = friction.settling.worst_s
-        if worst_s is not None:
-            longest = Quantity.of(largest(check, "settling_time_s", (worst_s,)), "s")
-        elif linear_s is not None:
-            longest = Quantity(f"over {si(friction.settling.watched_s, 's')}", None, "s")
-    remark = f"{spread(check, 'settling_time_s', 's')}; {held}"
-    return Row("closed_loop.settling_time_s", "settling time to 2 %", longest, remark)
+    if friction is None:
+        return Quantity.of(linear_s, "s").text, "friction was not identified"
+    held = sticking(friction, output_unit) or f"with dry friction {settling_range(friction.settling)}"
+    worst_s = friction.settling.worst_s
+    if worst_s is not None:
+        return Quantity.of(largest(check, "settling_time_s", (worst_s,)), "s").text, held
+    if linear_s is None:
+        return Quantity.of(None, "s").text, held
+    return f"over {si(friction.settling.watched_s, 's')}", held
 
 
 def not_the_arm(check: LoopCheck | None, bandwidth_rad_s: float, effects: Sequence[Mapping[str, Any]]) -> str:
@@ -174,11 +194,9 @@ def loop_numbers(results: RunResults, config: RunConfig) -> tuple[Row, ...]:
         rows.append(modulus_row(certificate, asked.modulus_margin))
     if check is None:
         return tuple(rows)
-    if check.tracking:
-        rows.append(_metric("overshoot_percent", "overshoot", "%", check, "overshoot_percent"))
-        rows.append(settling_row(check, output_unit))
-    limit = "" if check.input_limit is None else f"limit {si(check.input_limit, input_unit)}"
-    rows.append(_metric("peak_command", "peak command", input_unit, check, "peak_command", limit))
+    shown = {metric.name for metric in LOOP_METRICS if check.tracking or not metric.of_tracking}
+    metrics = metric_rows(check, input_unit, output_unit)
+    rows += [row for row in metrics if row.key.removeprefix(f"{METRICS_AT}.") in shown]
     if not check.tracking:
         error = Quantity.of(check.lasting_error, output_unit)
         disturbance = f"under a constant {si(check.disturbance_step, input_unit)} disturbance"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from workflow.config.joints_config import AnyConfig, JointsConfig
 from workflow.config.run_config import RunConfig
+from workflow.describe.loop_metrics import LOOP_METRICS
 
 if TYPE_CHECKING:
     from control_design.analysis.margins import Margins
@@ -44,11 +45,8 @@ _ALL = (
     StudyColumn("design_bandwidth_rad_s", "bandwidth of the design", "rad/s"),
     StudyColumn("mode_damping", "mode damping", "", "larger"),
     StudyColumn("mode_omega_rad_s", "of the mode at", "rad/s"),
-    StudyColumn("settling_time_s", "settling time", "s", "smaller"),
     StudyColumn("settling_time_with_friction_s", "settling time with friction, longest", "s", "smaller"),
     StudyColumn("rise_time_s", "rise time", "s", "smaller"),
-    StudyColumn("overshoot_percent", "overshoot", "%", "smaller"),
-    StudyColumn("peak_command", "peak command", "", "smaller"),
     StudyColumn("disturbance_peak", "disturbance peak", "", "smaller"),
     StudyColumn("settled_draws", "runs that stop moving"),
     StudyColumn("draws", "runs"),
@@ -66,8 +64,10 @@ _ALL = (
     StudyColumn("nominal_phase_margin_deg", "phase margin, nominal", "deg", "larger"),
     StudyColumn("nominal_delay_margin_ms", "delay margin, nominal", "ms", "larger"),
 )
+# Numbers of the reference step, which a section of a run words too.
+_OF_THE_STEP = (StudyColumn(metric.name, metric.label, metric.unit, metric.better) for metric in LOOP_METRICS)
 # Columns by name, in the order of the table.
-COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in _ALL}
+COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in (*_ALL, *_OF_THE_STEP)}
 
 
 def numbers_of(results: RunResults, config: AnyConfig) -> dict[str, Number]:
@@ -90,6 +90,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     """
     # Here: a study that is refused needs the names of the columns only.
     from control_design.analysis.margins import Margins
+    from workflow.describe.closed_loop import metric_rows
     from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
@@ -128,15 +129,11 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
             numbers["mode_omega_rad_s"] = least_damped.omega_rad_s
     check = results.closed_loop.check
     if check is not None:
+        numbers["rise_time_s"] = check.spread_of("rise_time_s")[-1]
+        numbers["disturbance_peak"] = check.spread_of("disturbance_peak")[-1]
         # A run that never gets there has no time: neither has the point.
-        for metric in (
-            "settling_time_s",
-            "rise_time_s",
-            "overshoot_percent",
-            "peak_command",
-            "disturbance_peak",
-        ):
-            numbers[metric] = check.spread_of(metric)[-1]
+        rows = metric_rows(check, "", "")
+        numbers |= {row.key.rpartition(".")[2]: row.value.plain["largest"] for row in rows}
         numbers["settled_draws"] = check.settled_draws
         numbers["draws"] = check.draws
         if check.friction is not None:
