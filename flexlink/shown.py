@@ -50,8 +50,8 @@ def _macros() -> Any:
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     from workflow.describe.diagnosis_words import times_noise
+    from workflow.text.findings.sentences import words
     from workflow.text.formats import at_least, at_most, bound, listing
-    from workflow.text.templates import words
 
     # Text; the HTML is escaped line by line.
     loader = PackageLoader("flexlink")

@@ -1,8 +1,8 @@
 """What a test or a check found, as numbers and names; its sentence is written by whoever shows it.
 
 Numerical code says what it noticed as a `Finding`: a kind and the values that belong to it. The sentences
-stand in one template of the reports (`findings.j2`), a macro for each kind called by its name in lower case,
-so that numbers can be tested without words and words be changed without code. `PriorTest` is the verdict of
+stand in `workflow.text.findings`, a function for each kind of these values, so that numbers can be tested
+without words and words be changed without numerical code. `PriorTest` is the verdict of
 the data on something that was stated as known, with the statistic that decided it.
 """
 
@@ -30,7 +30,7 @@ WHITE_LAGS = 25
 class FindingKind(Enum):
     """Which question a finding answers, or what it warns of.
 
-    Each has its sentence, and with it the names of its values, in the macro of its name in `findings.j2`.
+    Each has its sentence, and with it the names of its values, in a function of `workflow.text.findings`.
     """
 
     # Poles at a bound of the search.

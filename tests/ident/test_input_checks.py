@@ -11,7 +11,7 @@ from ident.data.finding import FindingKind
 from tests.ident.benchmark_plants import DT_S, as_record, p1, p2
 from tests.ident.findings import kinds, only
 from tests.ident.three_mode_arm import random_arm
-from workflow.text.templates import words
+from workflow.text.findings.sentences import words
 
 NYQUIST = np.pi / DT_S
 DRIFTS = {FindingKind.DRIFT, FindingKind.SLOW_POLE_IS_DRIFT}

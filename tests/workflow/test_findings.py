@@ -1,7 +1,7 @@
-"""The sentence of every finding, one line each: those of data/findings.txt, in the order of the kinds."""
+"""The sentence of every finding: each kind has one, of its values, in the words of whoever speaks."""
 
 import re
-from pathlib import Path
+from inspect import signature
 
 import pytest
 import typer.main
@@ -11,11 +11,10 @@ from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.data.finding import FindingKind, finding
 from workflow.cli import app
 from workflow.config.uncertainty_options import UncertaintyOptions
+from workflow.text.findings.sentences import SENTENCES, words
 from workflow.text.options import OPTIONS, speaking
 from workflow.text.sentences.records import unexplained_logs
-from workflow.text.templates import words
 
-STORED = Path(__file__).parent / "data" / "findings.txt"
 # One value for every name that any sentence asks for.
 VALUES = {
     "in_header": "s", "dt_s": 1.0, "own_s": 0.013, "a": 0.9999999, "integrators": 0, "omega_rad_s": 12.3456,
@@ -96,8 +95,36 @@ def sentences(**more):
     ]
 
 
+# Values that are names or places: a sentence that takes one says it.
+NAMES = {
+    "record",
+    "name",
+    "output",
+    "input",
+    "signal",
+    "inputs",
+    "reference",
+    "place",
+    "cell",
+    "units",
+    "unit",
+}
+
+
 def test_every_kind_has_its_sentences():
-    assert sentences() == STORED.read_text(encoding="utf-8").splitlines()
+    for sentence in sentences():
+        assert len(sentence.split()) > 6
+        assert "\n" not in sentence
+        assert not re.search(r"\b(None|nan|True|False)\b|[{}]|  |&\w+;", sentence)
+
+
+@pytest.mark.parametrize("kind", FindingKind, ids=lambda kind: kind.name.lower())
+def test_a_sentence_names_what_it_is_about(kind):
+    """Signs that a page escapes, too."""
+    sentence = words(finding(kind, **VALUES))
+    for name in NAMES & set(signature(SENTENCES[kind]).parameters):
+        if (kind, name) != (FindingKind.CONTROLLER_PERIOD, "reference"):  # whether there is one
+            assert str(VALUES[name]) in sentence
 
 
 def every_sentence():

@@ -26,10 +26,11 @@ from workflow.report.pages import write_report
 from workflow.tasks import pipeline
 from workflow.tasks.exports import Logged
 from workflow.tasks.results import ClosedLoopResult, ReferenceFilterResult, RunResults
+from workflow.text.findings.sentences import words
 from workflow.text.formats import at_least, at_most, bound
 from workflow.text.sentences.certificate import not_checked
 from workflow.text.sentences.design import lowered
-from workflow.text.templates import environment, words
+from workflow.text.templates import environment
 
 ATTACK = "<script>alert(1)</script>"
 

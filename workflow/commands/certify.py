@@ -21,7 +21,7 @@ from workflow.engine.errors import InputError, naming, need
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.tasks.system_documents import refuse_broken_files
-from workflow.text.templates import words
+from workflow.text.findings.sentences import words
 
 if TYPE_CHECKING:
     from control_design.analysis.certificate import Certificate

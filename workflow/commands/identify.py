@@ -21,9 +21,9 @@ from workflow.tasks.early_refusals import (
     refuse_hopeless_channel,
     single_channel,
 )
+from workflow.text.findings.sentences import words
 from workflow.text.formats import count
 from workflow.text.options import speaking
-from workflow.text.templates import words
 
 
 def identify_logs(

@@ -21,8 +21,8 @@ from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
 from workflow.tasks.exports import model_bytes
 from workflow.tasks.results import IdentifiedPlant
+from workflow.text.findings.sentences import words
 from workflow.text.formats import count
-from workflow.text.templates import words
 
 
 def identify_response(

@@ -10,8 +10,8 @@ from ident.data.foreign_files import as_typed, path_as_typed
 from workflow.describe.look import look_page, look_sections
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
-from workflow.tasks.log_look import LogLook, look_at, options_typed
-from workflow.text.templates import said
+from workflow.tasks.log_look import LogLook, ResponseLook, look_at, options_typed
+from workflow.text.formats import number
 
 
 def look(
@@ -61,7 +61,7 @@ def _next(found: LogLook, options: Sequence[str]) -> str:
     """
     log = " ".join([path_as_typed(found.path), *options])
     if found.response is not None:
-        return said("response_next", found.response, path_as_typed(found.path))
+        return _after_response(found.response, path_as_typed(found.path))
     if found.roles is None:
         return found.unclear
     roles = found.roles
@@ -87,3 +87,18 @@ def _next(found: LogLook, options: Sequence[str]) -> str:
             period = f"{doubt.values['period']:.17g}"
             typed.append(f"--unwrap {as_typed(f'{roles.output}={period}')}")
     return " ".join(["flexlink identify", log, *typed, *doubted])
+
+
+def _after_response(response: ResponseLook, path: str) -> str:
+    """The command that goes on from a frequency response, or why there is none.
+
+    path: of its file, as typed.
+    """
+    if response.why:
+        return response.why
+    design = f"flexlink design {path} --spec SPEC.toml, with [plant] dt_s"
+    if response.points == response.frequencies and not response.spread:
+        return f"{design} and [uncertainty] multiplicative = 0.1 (or what you know) in SPEC.toml"
+    # A controller's step has to tell every frequency: half of its rate is the highest.
+    longest_s = number(0.5 / response.high_Hz)
+    return f"flexlink identify {path} --dt-s SECONDS, at most {longest_s}; or {design} in SPEC.toml"

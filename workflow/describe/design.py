@@ -36,10 +36,10 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     SampledResponses,
 )
+from workflow.text.findings.sentences import words
 from workflow.text.formats import at_least, at_most, count, frequency, number, sentence, share, si
 from workflow.text.sentences import design as sentences
 from workflow.text.sentences.certificate import damping_lost, requirement
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import RunView

@@ -17,11 +17,11 @@ from workflow.describe.uncertainty import USUALLY_INSIDE_PERCENT
 from workflow.tasks.giving_way import gave_way
 from workflow.tasks.pipeline import is_certified_and_settles
 from workflow.tasks.results import RunResults
+from workflow.text.findings.sentences import words
 from workflow.text.formats import at_most, count, frequency, listing, number, percent, sentence, share
 from workflow.text.sentences.certificate import damping_lost, grounds, requirement
 from workflow.text.sentences.design import order_advice, tracking_begins
 from workflow.text.sentences.friction import certified_for
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import ChannelView, RunView

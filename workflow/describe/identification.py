@@ -26,6 +26,7 @@ from workflow.describe.facts import (
 from workflow.engine import codec
 from workflow.tasks.results import IdentifiedChannel, Intervals, ModeInterval, ModelMode
 from workflow.tasks.simulated_rig import TrueMode
+from workflow.text.findings.sentences import words
 from workflow.text.formats import (
     MISSING,
     count,
@@ -40,7 +41,6 @@ from workflow.text.formats import (
     share,
     si,
 )
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import ChannelView, RunView

@@ -44,9 +44,9 @@ from workflow.describe.uncertainty import (
 )
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import RunRecord
+from workflow.text.findings.sentences import words
 from workflow.text.formats import count, hertz, number, percent, share
 from workflow.text.sentences.records import cut_off, signal, time_base
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import ChannelView

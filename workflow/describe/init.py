@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING
 from ident.data.finding import Finding
 from ident.data.roles import Roles
 from workflow.describe.facts import Quantity, Row, Section
+from workflow.text.findings.sentences import words as finding_words
 from workflow.text.formats import frequency, hertz, number, si
-from workflow.text.templates import words as finding_words
 
 if TYPE_CHECKING:  # it loads what identifies
     from workflow.tasks.draft import Draft

@@ -29,6 +29,7 @@ from workflow.engine import codec
 from workflow.tasks.pipeline import is_certified_and_settles
 from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
 from workflow.tasks.results import DesignResult
+from workflow.text.findings.sentences import words
 from workflow.text.formats import (
     at_least,
     at_most,
@@ -42,7 +43,6 @@ from workflow.text.formats import (
     si,
     yes_no,
 )
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import AnyRunView

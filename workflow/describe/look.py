@@ -11,8 +11,8 @@ from ident.data.time_grid import LARGEST_JITTER
 from workflow.describe.facts import Picture, Quantity, Row, Section
 from workflow.describe.page import FirstScreen, Page, PageSection, Table
 from workflow.tasks.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
+from workflow.text.findings.sentences import words as finding_words
 from workflow.text.formats import count, number, share as percentage, si, sparkline
-from workflow.text.templates import words as finding_words
 
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars"}
 _TIME_UNITS = {

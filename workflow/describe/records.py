@@ -22,9 +22,9 @@ from workflow.describe.facts import (
     worded,
 )
 from workflow.tasks.results import RecordsResult
+from workflow.text.findings.sentences import words
 from workflow.text.formats import count, listing, number, sentence, setting, si
 from workflow.text.sentences.records import cut_off, signal, time_base
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import AnyRunView, ChannelView

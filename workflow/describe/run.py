@@ -38,9 +38,9 @@ from workflow.tasks.exports import Logged
 from workflow.tasks.giving_way import gave_way
 from workflow.tasks.pipeline import is_certified_and_settles
 from workflow.tasks.results import CertifyResult, DesignResult, RunResults
+from workflow.text.findings.sentences import words
 from workflow.text.sentences.design import lowered, tracking_begins
 from workflow.text.sentences.friction import certified_for
-from workflow.text.templates import words
 
 
 def summarise(results: RunResults, config: AnyConfig) -> RunSummary:

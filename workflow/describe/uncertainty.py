@@ -28,9 +28,9 @@ from workflow.describe.facts import (
 from workflow.describe.identification import model_numbers, sentences
 from workflow.engine import codec
 from workflow.tasks.results import Band, IdentifiedChannel, UncertainChannel
+from workflow.text.findings.sentences import words
 from workflow.text.formats import extent, frequency, listing, number, percent, share, si
 from workflow.text.sentences.friction import friction_law
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import ChannelView, RunView

@@ -37,8 +37,8 @@ from workflow.tasks.pipeline import certified_for, config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_documents import DOCUMENTS, read_document
 from workflow.tasks.system_files import read_state_space
+from workflow.text.findings.sentences import words
 from workflow.text.sentences.design import NOTHING_STATED, nominal_inside
-from workflow.text.templates import words
 
 if TYPE_CHECKING:
     import control

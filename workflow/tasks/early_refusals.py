@@ -86,7 +86,7 @@ def naming_readings(records: Sequence[Record]) -> Iterator[None]:
         likely = next((note for note in notes if note.kind in _NO_READINGS), None)
         if likely is None:
             raise
-        from workflow.text.templates import words  # templates take a moment to load, and few logs need them
+        from workflow.text.findings.sentences import words
 
         raise InputError(f"{words(likely).partition(' Delete such rows')[0]} Then: {refused}") from refused
 
@@ -119,7 +119,7 @@ def refuse_hopeless_logs(
     doubts = [doubt for record in measured for doubt in record.doubts if doubt.kind in _SAID_AT_ONCE]
     doubts += early_doubts(measured)
     for doubt in distinct(doubts):
-        from workflow.text.templates import words  # templates take a moment to load, and few logs need them
+        from workflow.text.findings.sentences import words
 
         progress.note(f"doubt: {words(doubt)}")
 

@@ -56,8 +56,8 @@ from workflow.tasks.results import (
     UncertaintyResult,
 )
 from workflow.tasks.stage import StageInput
+from workflow.text.findings.sentences import words
 from workflow.text.sentences.records import rate_part, unexplained_logs
-from workflow.text.templates import words
 
 # Frequencies over a band of the data at least, some decade: a nominal model has a tenth as many numbers.
 _FEWEST_FREQUENCIES = 100

@@ -55,22 +55,39 @@ def speaking(command: str) -> Iterator[None]:
         _speaker.reset(token)
 
 
+def setting_name(key: str, value: object = None) -> str:
+    """Return a setting, with the value to give it, as the command that speaks takes them."""
+    shown_value = "" if value is None else str(value)
+    command_options = OPTIONS.get(_speaker.get())
+    if command_options is None:
+        return f"{key} = {shown_value}" if shown_value else key
+    if key not in command_options:
+        return f"{key}{' = ' + shown_value if shown_value else ''} (in a configuration of flexlink run)"
+    name = command_options[key]
+    shown_value = shown_value.strip("'")
+    takes_value = name not in _SWITCHES and " " not in name
+    return f"{name} {shown_value}" if shown_value and takes_value else name
+
+
+def prior_name(prior: str) -> str:
+    """Return what was stated, "integrators = 1" or "fixed_poles", as the command that speaks takes it."""
+    key, _, value = prior.partition(" = ")
+    return setting_name(key, value or None)
+
+
+def setting_in_uncertainty(key: str, value: object = None) -> str:
+    """Return a setting of the uncertainty; where it is said by its key, with its table of a configuration."""
+    setting = setting_name(key, value)
+    return f"{setting} in [channels.uncertainty]" if setting.startswith(key) else setting
+
+
 @pass_context  # or Jinja would compile what one speaker says into the template
 def option(_: Any, key: str, value: object = None) -> str:
-    """A setting, and the value to give it, as the command that speaks takes them."""
-    told = "" if value is None else str(value)
-    own = OPTIONS.get(_speaker.get())
-    if own is None:
-        return f"{key} = {told}" if told else key
-    if key not in own:
-        return f"{key}{' = ' + told if told else ''} (in a configuration of flexlink run)"
-    name = own[key]
-    told = told.strip("'")
-    return f"{name} {told}" if told and name not in _SWITCHES and " " not in name else name
+    """`setting_name` for templates."""
+    return setting_name(key, value)
 
 
 @pass_context
-def stated(context: Any, prior: str) -> str:
-    """What was stated, "integrators = 1" or "fixed_poles", in the same words."""
-    key, _, value = prior.partition(" = ")
-    return option(context, key, value or None)
+def stated(_: Any, prior: str) -> str:
+    """`prior_name` for templates."""
+    return prior_name(prior)

@@ -18,10 +18,9 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from jinja2.bccache import Bucket, BytecodeCache
 from markupsafe import Markup
 
-from ident.data.finding import Finding
+from workflow.text.findings.sentences import words
 from workflow.text.formats import FILTERS, TESTS
 from workflow.text.options import option, stated
-from workflow.text.sentences.records import in_uncertainty, try_friction
 
 
 @cache
@@ -40,7 +39,6 @@ def environment(*own: tuple[str, Callable[..., Any]], package: str = "workflow")
     )
     made.filters.update(FILTERS, words=words, labelled=labelled, option=option, stated=stated)
     made.filters.update(own)
-    made.globals.update(in_uncertainty=in_uncertainty, try_friction=try_friction)
     made.tests.update(TESTS)
     return made
 
@@ -60,21 +58,6 @@ def labelled(rows: Markup, head: Sequence[str]) -> Markup:
 def render_text(template: str, **values: Any) -> str:
     """Plain text by template: for terminals and files. Nothing is escaped."""
     return Markup(environment().get_template(template).render(**values)).unescape()
-
-
-def said(macro: str, *values: Any) -> str:
-    """A sentence of sentences.j2 by the name of its macro, on one line; empty where nothing is to be said."""
-    return plain_line(getattr(environment().get_template("sentences.j2").module, macro)(*values))
-
-
-def words(found: Finding) -> str:
-    """The sentence of findings.j2 that says what ident found."""
-    return plain_line(getattr(_findings(), found.kind.name.lower())(found.values))
-
-
-@cache
-def _findings() -> Any:
-    return environment().get_template("findings.j2").module
 
 
 def plain_line(text: str) -> str:

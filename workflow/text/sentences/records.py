@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 from ident.data.finding import Value
 from workflow.text.formats import count, number, si
-from workflow.text.options import option
+from workflow.text.options import option, setting_in_uncertainty
 
 if TYPE_CHECKING:
     from ident.data.record import Record
 
+# Units of a time column by their symbol, as a sentence says them.
 _UNITS_OF_TIME = {
     "s": "seconds",
     "ms": "milliseconds",
@@ -100,21 +101,6 @@ def rate_part(from_rad_s: float | None, to_rad_s: float | None) -> str:
     return f"slow rate from {number(from_rad_s, 2)} to {si(to_rad_s, 'rad/s', 2)}"
 
 
-def in_uncertainty(key: str, value: str | None = None) -> str:
-    """A setting, and where it stands in a configuration; a command's own option needs no place."""
-    setting = option(None, key, value)
-    return f"{setting} in [channels.uncertainty]" if setting.startswith(key) else setting
-
-
-def try_friction() -> str:
-    """What to try where residuals are coloured and nobody has looked for friction."""
-    setting = in_uncertainty("response", '"without friction"')
-    return (
-        "friction colours residuals, too: if the output is the position of the driven shaft, try "
-        f"{setting}, which identifies friction as well"
-    )
-
-
 def loop_refused(found: Mapping[str, Value], controlled: bool) -> str:
     """Why logs made in a loop carry no model.
 
@@ -148,7 +134,7 @@ def unexplained_logs(output: str, why: str, *, friction_known: bool) -> str:
     """
     record = "Record"
     if not friction_known:
-        setting = in_uncertainty("response", '"without friction"')
+        setting = setting_in_uncertainty("response", '"without friction"')
         record = (
             f"In a loop dry friction is a common cause: if '{output}' is the position of the driven shaft, "
             f"identify friction with it ({setting}). Otherwise record"
