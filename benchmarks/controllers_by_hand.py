@@ -85,7 +85,9 @@ def checked_case(
     relative = case["relative"]
     loop = _loop(case["K"], case["G"], case["delay"])
     discs = RationalWeight(numerator=(relative or 1.0,), denominator=(1.0,))
-    plant = UncertainPlant("plant", nominal, StatedDiscs(nominal, discs) if relative else None)
+    plant = UncertainPlant(
+        nominal, name="plant", uncertainty=StatedDiscs(nominal, discs) if relative else None
+    )
     a, b, c, d = case["K"]
     controller = Controller(a, b, c, [[d]], _DT_S, computational_delay_samples=case["delay"])
     asked = Specification(modulus_margin=0.3, computational_delay_samples=case["delay"])

@@ -29,14 +29,11 @@ def run(out: Print, *, seeds: int = 5, first: int = 0, kind: str = "wheel", mach
     for seed in range(first, first + seeds):
         signals, begin = made.record(0, np.random.default_rng([seed, 85]))
         record = Record(
-            "log",
             signals["u"][begin:, None],
             signals["y"][begin:, None],
             made.plant.dt_s,
-            ("u",),
-            ("y",),
+            name="log",
             reference=signals["r"][begin:, None],
-            reference_names=("r",),
         )
         begun = time.process_time()
         fit = fit_friction([record], IdentOptions())

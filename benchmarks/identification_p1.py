@@ -23,8 +23,8 @@ import numpy as np
 from benchmarks.harness import Print, main, timed
 from ident import IdentOptions, Record, identify
 from ident.basis.structure import filter_input
+from ident.comparators.polynomial_fits import armax, arx, oe
 from tests.ident.benchmark_plants import DT_S, Truth, max_length_sequence, p1, p1_friction, run as simulated
-from validation.comparators.comparators import armax, arx, oe
 from validation.paper.methods import LinearModel, poles_of
 
 GRID = np.geomspace(0.1, 600, 400)

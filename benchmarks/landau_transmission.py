@@ -48,7 +48,7 @@ def plants() -> list[UncertainPlant]:
     """The three loads, known exactly."""
     return [
         UncertainPlant(
-            name, control.ss(control.tf(np.trim_zeros(np.array(b), "f"), np.array(a, dtype=float), TS_S))
+            control.ss(control.tf(np.trim_zeros(np.array(b), "f"), np.array(a, dtype=float), TS_S)), name=name
         )
         for name, (a, b) in LOADS.items()
     ]

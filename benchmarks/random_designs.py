@@ -191,7 +191,9 @@ def random_case(seed: int) -> tuple[UncertainPlant, ResponsePosterior, Specifica
     rng = np.random.default_rng([seed, 1])
     physical = random_physical(rng)
     posterior = posterior_of(physical, rng)
-    plant = UncertainPlant(f"random {seed}", state_space(posterior, posterior.mean), posterior)
+    plant = UncertainPlant(
+        state_space(posterior, posterior.mean), name=f"random {seed}", uncertainty=posterior
+    )
     bandwidth = float(physical.omega_rad_s[0] * 10 ** rng.uniform(-1.3, -0.2))
     gain = float(np.abs(posterior.centre(np.array([bandwidth])))[0])
     specification = Specification(

@@ -71,7 +71,7 @@ def record_of(name: str, seed: int) -> tuple[control.StateSpace, Record]:
     u = np.column_stack([prbs(13, hold, amplitude, samples, rng) for _ in range(2)])
     y = dlsim((plant.A, plant.B, plant.C, plant.D, plant.dt), u)[1]
     y = y + (rng.normal(size=y.shape) @ CORRELATION.T) * np.array(noise)
-    return plant, Record(name, u, y, plant.dt, *NAMES)
+    return plant, Record(u, y, plant.dt, name=name, input_names=NAMES[0], output_names=NAMES[1])
 
 
 def response(system: Any, omega: np.ndarray) -> np.ndarray:
@@ -144,7 +144,7 @@ def _cd_player(out: Print, path: Path) -> None:
     columns = pd.read_csv(path).to_numpy(float)[:, 1:]
     u = columns[:, :2]
     y = columns[:, 2:]
-    record = Record("CD player", u[:1024], y[:1024], 1.0, *NAMES)
+    record = Record(u[:1024], y[:1024], 1.0, name="CD player", input_names=NAMES[0], output_names=NAMES[1])
     out("CD player arm, fit % on the second half, y1 y2 (published common-pole output error in brackets)")
     published = {4: "65.2 78.1", 6: "70.9 77.9", 8: "71.4 83.2", 10: "72.6 84.0"}
     for order, peer in published.items():

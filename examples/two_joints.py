@@ -44,7 +44,14 @@ def run(folder: Path, seed: int = 0) -> None:
     arm = control.c2d(two_link_operating_point(2 * np.pi / 3), DT_S)[:2, :]
     u = np.column_stack([prbs(13, 1, 1.0, SAMPLES, rng) for _ in range(2)])
     y = dlsim((arm.A, arm.B, arm.C, arm.D, DT_S), u)[1] + NOISE_RAD * rng.normal(size=(SAMPLES, 2))
-    record = Record("arm", u, y, DT_S, ("shoulder_V", "elbow_V"), ("shoulder_rad", "elbow_rad"))
+    record = Record(
+        u,
+        y,
+        DT_S,
+        name="arm",
+        input_names=("shoulder_V", "elbow_V"),
+        output_names=("shoulder_rad", "elbow_rad"),
+    )
 
     found = identify_mimo([record], IdentOptions(integrators=1))
     print(f"model: {len(found.model.state_space()[0])} states, fit {found.output_fit_percent[0].round(2)} %")

@@ -34,7 +34,14 @@ def experiment(n_samples: int, rng: np.random.Generator) -> tuple[control.StateS
     arm = control.c2d(two_link_operating_point(ELBOW_ANGLE_RAD), DT_S)[["tip_m"], :]
     u = np.column_stack([prbs(13, 1, AMPLITUDE_V, n_samples, rng) for _ in range(2)])
     tip = dlsim((arm.A, arm.B, arm.C, arm.D, DT_S), u)[1] + NOISE_M * rng.normal(size=(n_samples, 1))
-    return arm, Record("two-link arm", u, tip, DT_S, ("shoulder_voltage_V", "elbow_voltage_V"), ("tip_m",))
+    return arm, Record(
+        u,
+        tip,
+        DT_S,
+        name="two-link arm",
+        input_names=("shoulder_voltage_V", "elbow_voltage_V"),
+        output_names=("tip_m",),
+    )
 
 
 def run(n_samples: int = 8000, seed: int = 0):

@@ -10,6 +10,7 @@ Data        `Record`, `FrfRepeats`, `FrequencyUncertainty`, `band_limited`, `emp
 Models      `identify`, `identify_frf`, `identify_mimo`, `uncertainty`, `matrix_posterior`,
             `GobfModel`, `Poles`, `IdentOptions`, `EmbeddingOptions`, `Identification`, `Uncertainty`,
             `pole_intervals`, `error_surface`
+Comparison  `compare`, `Comparison`, `arx`, `armax`, `oe`, `n4sid`: any models on one validation record
 Basis       `regressor`, `basis_response`
 Controllers `UncertainPlant`, `Specification`, `RationalWeight`, `synthesise`, `SynthesisOptions`, `certify`,
             `Certificate`, `Controller`, `simulate_loop`, `step_metrics`, `c_source`,
@@ -19,14 +20,13 @@ Joints      `MultivariablePlant`, `ResponseBall`, `MultivariableSpecification`, 
             `MultivariableCertificate`: several sensors and actuators, after `identify_mimo`
 Machines    `Rig`, `paper_link`, `effect`, `simulate`, `linear_arm`, `SampledArm`, `prbs`, `multisine`
 Causes      `Case`, `Experiment`, `load_case`, `diagnose`, `Diagnosis`
-Pictures    `plot`, `bode`, `compare`, `nyquist`, `nichols`, `step`
+Pictures    `plot`, `bode`, `nyquist`, `nichols`, `step`
 Tables      `table`
 
 `LoopRun`, `Simulation` and `SynthesisResult` are what `simulate_loop`, `simulate` and `synthesise` return.
 """
 
 import sys
-from types import FunctionType
 
 if sys.argv[0] == "-m" and "flexlink" in sys.orig_argv:
     del sys.path[0]  # of the current folder: no csv.py in it is taken for Python's own
@@ -36,17 +36,4 @@ import lazy_loader
 from flexlink.own_packages import find_own_first
 
 find_own_first()
-_attribute, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
-
-
-def __getattr__(name: str) -> object:
-    from flexlink.keywords import one_line
-    from flexlink.shown import Shown
-
-    Shown.front = sys.modules[__name__]  # results say from now on what was found
-    found = globals()[name] = _attribute(name)
-    if isinstance(found, FunctionType):
-        found = globals()[name] = one_line(found)
-    elif isinstance(found, type) and "__init__" in vars(found) and not hasattr(found, "model_fields"):
-        found.__init__ = one_line(found.__init__)  # type: ignore[misc]
-    return found
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

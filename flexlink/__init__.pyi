@@ -5,6 +5,14 @@ from .causes import (
     diagnose as diagnose,
     load_case as load_case,
 )
+from .comparison import (
+    Comparison as Comparison,
+    armax as armax,
+    arx as arx,
+    compare as compare,
+    n4sid as n4sid,
+    oe as oe,
+)
 from .design import (
     Certificate as Certificate,
     Controller as Controller,
@@ -66,7 +74,6 @@ from .models import (
 )
 from .pictures import (
     bode as bode,
-    compare as compare,
     nichols as nichols,
     nyquist as nyquist,
     plot as plot,

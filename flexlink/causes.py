@@ -6,19 +6,31 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from diagnosis import diagnosis as chain
 from diagnosis.answer import Diagnosis
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.own_plant import PlantCase
+from diagnosis.search.loop import Progress
+from flexlink.keywords import front_door
 
 __all__ = ["Case", "Diagnosis", "Experiment", "diagnose", "load_case"]
 
 
-def diagnose(case: Any, **more: Any) -> Diagnosis:
+@front_door
+def diagnose(
+    case: Any,
+    *,
+    progress: Progress | None = None,
+    rng: np.random.Generator | None = None,
+    time_limit_s: float = np.inf,
+) -> Diagnosis:
     """Find the effect that explains the model error of a rig or of your own simulation.
 
-    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md); `load_case` reads either. more:
-    `time_limit_s` and the other arguments of `diagnosis.diagnose`.
+    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md); `load_case` reads either. progress: called
+    with the share done (0 to 1) and what is being done. rng: of interval draws; without it one case has one
+    answer. time_limit_s: after it nothing more is tried, and the answer says what was not.
 
     Takes about ten seconds for records of a few thousand samples.
 
@@ -34,9 +46,10 @@ def diagnose(case: Any, **more: Any) -> Diagnosis:
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
-    return chain.diagnose(case, **more)
+    return chain.diagnose(case, progress=progress, rng=rng, time_limit_s=time_limit_s)
 
 
+@front_door
 def load_case(place: str | os.PathLike[str], rig: str | None = None) -> Case | PlantCase:
     """Read a case as `flexlink diagnose` does (docs/case_files.md, docs/simulators.md).
 

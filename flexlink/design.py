@@ -14,17 +14,16 @@ from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import (
     ClosedLoopTrajectory as LoopRun,
     LinearMachine,
-    step_metrics,
 )
 from control_design.analysis.multivariable_certificate import MultivariableCertificate
 from control_design.controllers import c_code
 from control_design.controllers.controller import Controller
 from control_design.convex import youla
 from control_design.convex.convex_options import YoulaOptions
-from control_design.plants import plant_set
+from control_design.plants.foreign_systems import state_space
 from control_design.plants.guards import Guard
 from control_design.plants.multivariable import MultivariablePlant, ResponseBall
-from control_design.plants.transfer import of_polynomials
+from control_design.plants.plant_set import UncertainPlant
 from control_design.plants.weights import RationalWeight
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
@@ -33,11 +32,8 @@ from control_design.synthesis.multivariable import MultivariableResult
 from control_design.synthesis.order_search import Progress
 from control_design.synthesis.synthesis_options import MultivariableOptions, SynthesisOptions
 from control_design.synthesis.synthesis_result import SynthesisResult
-from flexlink.keywords import WrongArgumentError, options_of, refuse_rate
-from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.frequency_fit import FrfIdentification
-from ident.response_uncertainty import Uncertainty
-from ident.uncertainty.matrix_response import MatrixPosterior
+from flexlink.keywords import front_door, options_of
+from ident.data.keywords import WrongArgumentError
 
 __all__ = [
     "Certificate",
@@ -67,121 +63,10 @@ __all__ = [
 ]
 
 
-def state_space(system: Any, what: str = "the system", *, several: bool = False) -> control.StateSpace:
-    """A system of python-control (ss, tf, zpk) or scipy.signal (dlti), or anything with `to_control()`, as a
-    discrete `control.StateSpace` with one input and one output (several: any number, of a state space).
-
-    what: its name in a refusal. Raises WrongArgumentError (a ValueError) for a system in continuous time or
-    without a sampling time, with several inputs or outputs, or with more zeros than poles; for a measured
-    response (frd), which has no poles; and for anything else.
-    """
-    if hasattr(system, "to_control"):
-        system = system.to_control()
-    if isinstance(system, control.FrequencyResponseData):
-        raise WrongArgumentError(
-            f"{what} is a frequency response (frd), which has no poles: identify it with "
-            "flexlink.identify_frf, or give a model beside it, UncertainPlant(model, uncertainty=frd)"
-        )
-    if type(system).__module__.startswith("scipy.signal") and hasattr(system, "to_ss"):
-        own = system.to_ss()
-        system = control.ss(own.A, own.B, own.C, own.D, own.dt or 0, remove_useless_states=False)
-    if isinstance(system, (MatrixPosterior, MultivariablePlant)):
-        raise WrongArgumentError(
-            f"{what} is a {type(system).__name__}, of several inputs and outputs: use "
-            "flexlink.synthesise_multivariable and flexlink.certify_multivariable"
-        )
-    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
-        raise WrongArgumentError(
-            f"{what} is a {type(system).__name__}; expected a discrete system of python-control: "
-            "control.ss(A, B, C, D, dt_s) or control.tf(num, den, dt_s)"
-        )
-    _checked(system, what, several=several and isinstance(system, control.StateSpace))
-    if isinstance(system, control.StateSpace):
-        return system
-    try:
-        return of_polynomials(system.num[0][0], system.den[0][0], system.dt)
-    except ValueError as error:
-        raise WrongArgumentError(f"{what} {error}") from None
+step_metrics = front_door(closed_loop.step_metrics)
 
 
-def measured_response(system: control.FrequencyResponseData, what: str = "the frd") -> FrequencyUncertainty:
-    """An frd of python-control as a response without uncertainty; refused as in `state_space`."""
-    _checked(system, what)
-    order = np.argsort(system.omega, kind="stable")
-    omega, centre = np.asarray(system.omega)[order], np.asarray(system.frdata[0, 0])[order]
-    return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), float(system.dt))
-
-
-def _checked(system: Any, what: str, *, several: bool = False) -> None:
-    """Refuses another number of signals than one (unless several), and a system without a sampling time."""
-    if not several and (system.ninputs, system.noutputs) != (1, 1):
-        raise WrongArgumentError(
-            f"{what} has {system.ninputs} inputs and {system.noutputs} outputs; take one channel: "
-            "system[output, input], as system[0, 0]; or design for all with "
-            "flexlink.synthesise_multivariable(flexlink.MultivariablePlant(name, system), ...)"
-        )
-    measured = isinstance(system, control.FrequencyResponseData)
-    if system.dt == 0 and not isinstance(system.dt, bool):
-        mend = (
-            "state the sampling time of the records: control.frd(response, omega, dt_s)"
-            if measured
-            else "sample it: control.sample_system(system, dt_s, 'zoh')"
-        )
-        raise WrongArgumentError(f"{what} is in continuous time, flexlink works in discrete time: {mend}")
-    refuse_rate(system.dt)
-    if system.dt is None or system.dt is True:
-        raise WrongArgumentError(
-            f"{what} has no sampling time in seconds (dt = {system.dt}), which discrete time needs: "
-            "state it, system.dt = dt_s"
-        )
-
-
-class UncertainPlant(plant_set.UncertainPlant):
-    """A nominal state space and the ellipses around its response, for which a controller is designed.
-
-    plant : Uncertainty, or a discrete system of python-control (ss, tf), or a model with `to_control()`
-        An `Uncertainty` has its own ellipses, the result of `identify_frf` those of its posterior; anything
-        else is exact unless you give `uncertainty`.
-    uncertainty : as in `control_design.UncertainPlant`, or a `control.frd` (measured response, exact).
-
-    Other arguments as in `control_design.UncertainPlant`.
-
-    Examples
-    --------
-    >>> import control
-    >>> flexlink.UncertainPlant(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01), name="motor")
-    UncertainPlant 'motor': 1 state, dt = 0.01 s, no integrator, response taken as exact
-    >>> flexlink.UncertainPlant(control.tf([0.1], [1.0, 0.5]), name="motor")
-    Traceback (most recent call last):
-    flexlink.keywords.WrongArgumentError: plant 'motor' is in continuous time, flexlink works in discrete ...
-    """
-
-    def __init__(
-        self,
-        plant: Any = None,
-        *,
-        name: str = "plant",
-        uncertainty: Any = None,
-        nominal: Any = None,
-        **more: Any,
-    ) -> None:
-        given = plant if nominal is None else nominal
-        if nominal is not None and uncertainty is None and isinstance(plant, control.FrequencyResponseData):
-            uncertainty = plant
-        if isinstance(uncertainty, control.FrequencyResponseData):
-            uncertainty = measured_response(uncertainty, f"the response of plant {name!r}")
-        if uncertainty is None and isinstance(given, Uncertainty):
-            uncertainty = given
-        if uncertainty is None and isinstance(given, FrfIdentification):
-            uncertainty = given.posterior
-        super().__init__(
-            name=name,
-            nominal=state_space(given, f"plant {name!r}"),
-            uncertainty=uncertainty,
-            **more,
-        )
-
-
+@front_door
 def synthesise(
     plants: Any,
     specification: Specification,
@@ -205,6 +90,7 @@ def synthesise(
     >>> designed.outcome.name, designed.controller.order
     ('MET_ON_GRID', 2)
     """
+    _refuse_requirements(settings)
     return synthesis.synthesise(
         _several(plants),
         specification,
@@ -216,6 +102,7 @@ def synthesise(
     )
 
 
+@front_door
 def synthesise_jointly(
     plants: Any,
     specification: Specification,
@@ -242,6 +129,7 @@ def synthesise_jointly(
     >>> found.reached, found.unstable
     (True, (0,))
     """
+    _refuse_requirements(settings)
     return joint_synthesis.synthesise_jointly(
         _several(plants),
         specification,
@@ -255,6 +143,7 @@ def synthesise_jointly(
     )
 
 
+@front_door
 def youla_bracket(
     plants: Any, specification: Specification, options: YoulaOptions | None = None, **settings: Any
 ) -> youla.YoulaBracket:
@@ -273,6 +162,7 @@ def youla_bracket(
     return youla.youla_bracket(_several(plants), specification, options_of(YoulaOptions, options, settings))
 
 
+@front_door
 def certify(
     controller: Any,
     plants: Any = None,
@@ -321,6 +211,7 @@ def certify(
     )
 
 
+@front_door
 def synthesise_multivariable(
     plants: MultivariablePlant | Sequence[MultivariablePlant],
     specification: MultivariableSpecification,
@@ -333,6 +224,7 @@ def synthesise_multivariable(
     return multivariable.synthesise_multivariable(plants, specification, chosen)
 
 
+@front_door
 def certify_multivariable(
     controller: Any,
     plants: MultivariablePlant | Sequence[MultivariablePlant],
@@ -354,6 +246,7 @@ def certify_multivariable(
     )
 
 
+@front_door
 def c_source(controller: Any, prefix: str = "controller", number: c_code.Number = "double") -> str:
     """C99 source of a controller; `control_design.c_source`.
 
@@ -364,14 +257,29 @@ def c_source(controller: Any, prefix: str = "controller", number: c_code.Number 
     return c_code.c_source(_as_controller(given, 1), prefix, number)
 
 
-def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **more: Any) -> LoopRun:
+@front_door
+def simulate_loop(
+    controller: Any,
+    machine: Any,
+    reference: npt.ArrayLike,
+    *,
+    measured_index: int = 0,
+    hub_torque_Nm: npt.ArrayLike | None = None,
+    input_disturbance: npt.ArrayLike | None = None,
+    output_disturbance: npt.ArrayLike | None = None,
+    measurement_step: float = 0.0,
+    command_step: float = 0.0,
+    clip: float = np.inf,
+) -> LoopRun:
     """Simulate the closed loop with limits and delay; arguments as in `control_design.simulate`.
 
     controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
     of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system
-    or an `UncertainPlant` (its nominal) as well. more: `hub_torque_Nm`, `input_disturbance`,
-    `output_disturbance` (T,), and the quantisation steps `measurement_step`, `command_step`. Raises
-    ValueError where sampling times or lengths do not match.
+    or an `UncertainPlant` (its nominal) as well. reference: (T,) in units of the measured signal.
+    hub_torque_Nm, input_disturbance, output_disturbance: (T,) from outside. measurement_step, command_step:
+    quantisation of the two signals, 0 for none. measured_index: which signal of the machine is fed back.
+    clip: limit of the command of the converter, both signs. Raises ValueError where sampling times or lengths
+    do not match.
 
     Examples
     --------
@@ -380,7 +288,7 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
     >>> abs(flexlink.step_metrics(run).steady_error) < 1e-3
     True
     """
-    if isinstance(machine, plant_set.UncertainPlant):
+    if isinstance(machine, UncertainPlant):
         machine = machine.nominal
     if isinstance(machine, control.lti.LTI):
         machine = LinearMachine(state_space(machine, "the machine"))
@@ -389,7 +297,29 @@ def simulate_loop(controller: Any, machine: Any, reference: npt.ArrayLike, **mor
             f"the machine is a {type(machine).__name__}; expected flexlink.SampledArm(rig, effects, rng), a "
             "linear system or an UncertainPlant"
         )
-    return closed_loop.simulate(_as_controller(controller, 1), machine, reference, **more)
+    return closed_loop.simulate(
+        _as_controller(controller, 1),
+        machine,
+        reference,
+        measured_index=measured_index,
+        hub_torque_Nm=hub_torque_Nm,
+        input_disturbance=input_disturbance,
+        output_disturbance=output_disturbance,
+        measurement_step=measurement_step,
+        command_step=command_step,
+        clip=clip,
+    )
+
+
+def _refuse_requirements(settings: dict[str, Any]) -> None:
+    """Refuse what belongs into the specification, in one line that says so (WrongArgumentError)."""
+    for name in settings:
+        key = "controller_order" if name == "order" else name
+        if key in Specification.model_fields:
+            raise WrongArgumentError(
+                f"synthesise: {name} is a requirement: flexlink.Specification({key}=...), no setting of the "
+                "synthesis"
+            )
 
 
 def _as_controller(system: Any, delay_samples: int, *, several: bool = False) -> Controller:
@@ -402,12 +332,12 @@ def _as_controller(system: Any, delay_samples: int, *, several: bool = False) ->
     )
 
 
-def _several(plants: Any) -> tuple[plant_set.UncertainPlant, ...]:
+def _several(plants: Any) -> tuple[UncertainPlant, ...]:
     """One plant or a list of them, each an `UncertainPlant` or what makes one."""
     several = list(plants) if isinstance(plants, Sequence) and not isinstance(plants, str) else [plants]
     return tuple(
         each
-        if isinstance(each, plant_set.UncertainPlant)
+        if isinstance(each, UncertainPlant)
         else UncertainPlant(each, name="plant" if len(several) == 1 else f"plant {k + 1}")
         for k, each in enumerate(several)
     )

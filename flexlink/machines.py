@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from flexlink.models import Record
+from flexlink.keywords import front_door
+from ident.data.keywords import refuse_rate
+from ident.data.record import Record
 from ident.data.shown import Shown
-from plant import simulation
+from plant import excitation, modal, presets, simulation
 from plant.effects import Effect, parse_effect
-from plant.excitation import multisine, prbs
-from plant.modal import linear_arm
-from plant.presets import paper_link
+from plant.plan import SUBSTEP_S
 from plant.rig import Rig
 from plant.simulation import SampledArm
 
@@ -30,6 +30,11 @@ __all__ = [
     "prbs",
     "simulate",
 ]
+
+linear_arm = front_door(modal.linear_arm)
+multisine = front_door(excitation.multisine)
+paper_link = front_door(presets.paper_link)
+prbs = front_door(excitation.prbs)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -51,6 +56,7 @@ class Simulation(Shown, simulation.Trajectory):
         )  # fmt: skip
 
 
+@front_door
 def effect(name: str, **parameters: Any) -> Effect:
     """An effect that a rig file does not describe: friction, backlash, delay, ... (`plant.EFFECTS`).
 
@@ -64,20 +70,26 @@ def effect(name: str, **parameters: Any) -> Effect:
     return parse_effect({"name": name, **parameters})
 
 
+@front_door
 def simulate(
     rig: Rig,
     voltage_V: npt.ArrayLike,
     effects: Effect | Sequence[Effect] = (),
     *,
     rng: np.random.Generator | int | None = None,
-    **settings: Any,
+    dt_s: float | None = None,
+    hub_torque_Nm: npt.ArrayLike | None = None,
+    tip_force_N: npt.ArrayLike | None = None,
+    n_modes: int | None = None,
+    substep_s: float = SUBSTEP_S,
 ) -> Simulation:
     """Drive a machine from rest with a held voltage (T,).
 
     effects: one or several of `effect`. rng: a generator or the seed of one, for the sensor noise; without it
-    there is none. settings: `dt_s` (default: the rig's), `hub_torque_Nm` and `tip_force_N` (T,) from outside,
-    `n_modes`, `substep_s` (longest step where the machine is not linear), as in `plant.simulate`. Raises
-    ValueError for a signal that is not (T,) or not finite, or an effect given twice.
+    there is none. dt_s: sampling time, s (default: the rig's). hub_torque_Nm, tip_force_N: (T,) from outside.
+    n_modes: of the link (default: those that the sampling time shows). substep_s: longest step, s, where the
+    machine is not linear. Raises ValueError for a signal that is not (T,) or not finite, or an effect given
+    twice.
 
     Examples
     --------
@@ -87,11 +99,17 @@ def simulate(
     >>> arm.record("tip_m").output.shape
     (500, 1)
     """
-    found = simulation.simulate(
+    if dt_s is not None:
+        refuse_rate(dt_s)
+    trajectory = simulation.simulate(
         rig,
         voltage_V,
         (effects,) if isinstance(effects, Effect) else effects,
         rng=None if rng is None else np.random.default_rng(rng),
-        **settings,
+        dt_s=dt_s,
+        hub_torque_Nm=hub_torque_Nm,
+        tip_force_N=tip_force_N,
+        n_modes=n_modes,
+        substep_s=substep_s,
     )
-    return Simulation(**{each.name: getattr(found, each.name) for each in fields(found)})
+    return Simulation(**{field.name: getattr(trajectory, field.name) for field in fields(trajectory)})

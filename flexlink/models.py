@@ -4,33 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, Self
+from time import perf_counter
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from flexlink.keywords import one_line, options_of
-from ident import response_uncertainty, several_outputs
-from ident.basis.functions import basis_response, regressor
+from flexlink.keywords import front_door, options_of
+from ident import frequency_fit, response_uncertainty, several_outputs
+from ident.basis import functions
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
 from ident.basis.poles import Poles
-from ident.data.foreign_files import distinct
+from ident.data import nonparametric, signal_filter
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.frf_records import FrfRepeats
-from ident.data.nonparametric import empirical_frf
-from ident.data.record import Record as PlainRecord, in_one_unit
-from ident.data.signal_filter import band_limited
-from ident.data.table import Table
-from ident.data.units import refuse_step
-from ident.frequency_fit import FrfIdentification, identify_frf
+from ident.data.record import Record, in_one_unit
+from ident.frequency_fit import FrfIdentification
 from ident.identification import Identification, MimoIdentification
 from ident.one_input import identify as identify_records
 from ident.response_uncertainty import Uncertainty
 from ident.search.error_surface import ErrorSurface, error_surface as surface_of
-from ident.uncertainty import matrix_response
-from ident.uncertainty.pole_intervals import pole_intervals
+from ident.uncertainty import matrix_response, pole_intervals as intervals
 
 __all__ = [
     "EmbeddingOptions",
@@ -55,201 +50,16 @@ __all__ = [
     "uncertainty",
 ]
 
-
-class Record(PlainRecord):
-    """One uniformly sampled experiment, from arrays, pandas columns or (with `from_file`) a file.
-
-    u, y : (T,) or (T, n), or a pandas column or table
-        Input and output, one row per sample; `input` and `output` are accepted, too. Names of pandas columns
-        become signal names; the default is u and y (u1, u2, ... if several).
-    dt_s : float. Sampling time in seconds.
-    reference : as y, optional. Closed-loop reference.
-
-    input_names, output_names, reference_names : a name or several.
-
-    u may be a time response of python-control (`control.forced_response`): its inputs, outputs and times. The
-    other arguments are the attributes of `ident.Record`. Raises ValueError where shapes do not fit;
-    nothing is transposed to make them.
-
-    Examples
-    --------
-    >>> import numpy as np, pandas as pd, flexlink
-    >>> flexlink.Record(u=np.ones(4), y=np.arange(4.0), dt_s=0.01)
-    Record 'record': 4 samples, every 0.01 s, 0.04 s in all
-      u -> y
-    >>> log = pd.DataFrame({"voltage_V": [1.0, 1.0, 1.0], "angle_rad": [0.0, 0.1, 0.3]})
-    >>> flexlink.Record(u=log["voltage_V"], y=log["angle_rad"], dt_s=0.01, name="first try")
-    Record 'first try': 3 samples, every 0.01 s, 0.03 s in all
-      voltage_V -> angle_rad
-    >>> flexlink.Record(u=np.ones((1, 4)), y=np.arange(4.0), dt_s=0.01)
-    Traceback (most recent call last):
-    ValueError: u has 1 samples of 4 signals; expected one row per sample
-    """
-
-    def __init__(
-        self,
-        u: Any = None,
-        y: Any = None,
-        dt_s: float | None = None,
-        *,
-        name: str = "record",
-        reference: Any = None,
-        input: Any = None,  # noqa: A002 (the attribute's name)
-        output: Any = None,
-        input_names: str | Sequence[str] = (),
-        output_names: str | Sequence[str] = (),
-        reference_names: str | Sequence[str] = (),
-        **more: Any,
-    ) -> None:
-        if y is None and all(hasattr(u, part) for part in ("time", "inputs", "outputs")):
-            u, y, dt_s = _time_response(u, dt_s)
-        if dt_s is None:
-            raise ValueError("a record needs dt_s, the sampling time in seconds")
-        if isinstance(dt_s, bool) or not isinstance(dt_s, (int, float, np.integer, np.floating)):
-            raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
-        u, y = (_either(*pair) for pair in (("u", u, "input", input), ("y", y, "output", output)))
-        # Columns of pandas have to have the same rows: nothing is put in line by its index.
-        indices = [getattr(one, "index", None) for one in (u, y, reference)]
-        rows: list[Any] = [index for index in indices if hasattr(index, "equals")]
-        if any(not index.equals(rows[0]) for index in rows):
-            raise ValueError(
-                "u and y have rows of different index; put them in line first: "
-                "u, y = u.align(y, join='inner')"
-            )
-        inputs, input_names = _signals("u", u, input_names)
-        outputs, output_names = _signals("y", y, output_names)
-        if reference is not None:
-            reference, reference_names = _signals("r", reference, reference_names)
-        super().__init__(
-            name=name,
-            input=inputs,
-            output=outputs,
-            dt_s=dt_s,
-            input_names=tuple(input_names),
-            output_names=tuple(output_names),
-            reference=reference,
-            reference_names=_listed(reference_names),
-            **more,
-        )
-        refuse_step(self.label, self.dt_s, self.output, self.time_column)
-
-    @classmethod
-    @one_line
-    def from_file(cls, path: Any, inputs: Any, outputs: Any, *, references: Any = (), **more: Any) -> Self:
-        """Columns of a log file, as `ident.Record.from_file`; a single name may stand by itself."""
-        named = _listed(inputs), _listed(outputs)
-        return super().from_file(path, *named, references=_listed(references), **more)
-
-    @classmethod
-    @one_line
-    def from_table(
-        cls,
-        table: Any,
-        input: str | Sequence[str],  # noqa: A002 (as in the command line)
-        output: str | Sequence[str],
-        *,
-        time: str | None = None,
-        **more: Any,
-    ) -> Record:
-        """Columns of a `pandas.DataFrame`, checked like those of a file.
-
-        time: column of numbers (unit from its name, else seconds) or of date-times. Default: the index, if it
-        holds times; otherwise give dt_s. Other arguments as in `from_file`.
-
-        Examples
-        --------
-        >>> import pandas as pd
-        >>> log = pd.DataFrame({"t_ms": [0, 5, 10, 15], "u_V": [1.0, 1, 0, 0], "hub_rad": [0, 0.1, 0.2, 0.2]})
-        >>> flexlink.Record.from_table(log, "u_V", "hub_rad", time="t_ms")
-        Record 'table': 4 samples, every 0.005 s, 0.02 s in all
-          u_V -> hub_rad
-          time column 't_ms' in ms
-        >>> log.index = pd.date_range("2024-03-01", periods=4, freq="5ms")
-        >>> flexlink.Record.from_table(log, "u_V", "hub_rad").dt_s
-        0.005
-        """
-        names = distinct([str(name) for name in table.columns])
-        columns = {name: table.iloc[:, k].to_numpy() for k, name in enumerate(names)}
-        if time is None and "dt_s" not in more:
-            columns["index"], time = table.index.to_numpy(), "index"
-            if columns["index"].dtype.kind not in "mM":
-                raise ValueError("give time, the name of a column, or dt_s: the table's index holds no times")
-        return cls.from_file(Table(Path("table"), columns), input, output, time=time, **more)
+band_limited = front_door(signal_filter.band_limited)
+basis_response = front_door(functions.basis_response)
+empirical_frf = front_door(nonparametric.empirical_frf)
+pole_intervals = front_door(intervals.pole_intervals)
+regressor = front_door(functions.regressor)
 
 
-def _listed(names: str | Sequence[str]) -> tuple[str, ...]:
-    """One name or several."""
-    return (names,) if isinstance(names, str) else tuple(names)
-
-
-def _time_response(response: Any, dt_s: float | None) -> tuple[Any, Any, float]:
-    """Input (T, n), output (T, n) and sampling time of a `control.TimeResponseData` (a row per signal)."""
-    time = np.asarray(response.time, dtype=np.float64)
-    step = float(time[-1] - time[0]) / max(time.size - 1, 1)
-    if not step > 0 or not np.allclose(np.diff(time), step, rtol=0, atol=1e-6 * step):
-        raise ValueError("the time response is not evenly sampled: give control.forced_response even times")
-    if dt_s is not None and not np.isclose(dt_s, step, rtol=1e-6, atol=0):
-        raise ValueError(
-            f"dt_s is {dt_s:.6g} s, the times of the response are {step:.6g} s apart: leave dt_s out"
-        )
-    signals = [np.atleast_2d(np.asarray(part)) for part in (response.inputs, response.outputs)]
-    if response.inputs is None or any(part.ndim != 2 for part in signals):
-        raise ValueError(
-            "the time response needs one input signal per row: control.forced_response(system, T, U)"
-        )
-    return signals[0].T, signals[1].T, step if dt_s is None else dt_s
-
-
-def _either(short: str, first: Any, long: str, second: Any) -> Any:
-    if (first is None) == (second is None):
-        raise ValueError(f"give {short} (or, under its long name, {long}), once")
-    return second if first is None else first
-
-
-def _signals(
-    default: str, values: Any, names: str | Sequence[str]
-) -> tuple[npt.NDArray[np.float64], Sequence[str]]:
-    """(T, n) and n names, from a vector, a table or their pandas forms."""
-    names = _listed(names)
-    if not names:  # pandas: a column has a name, a table has columns
-        named = getattr(values, "columns", None)
-        names = [str(c) for c in named] if named is not None else [str(getattr(values, "name", None) or "")]
-    signals = _real(default, values)
-    if signals.ndim == 1:
-        signals = signals[:, None]
-    if signals.ndim != 2:
-        raise ValueError(f"{default} must be (T,) or (T, n); got shape {signals.shape}")
-    if signals.shape[1] > max(signals.shape[0], 1):
-        raise ValueError(
-            f"{default} has {signals.shape[0]} samples of {signals.shape[1]} signals; "
-            "expected one row per sample"
-        )
-    if not any(names):
-        count = signals.shape[1]
-        names = [default] if count == 1 else [f"{default}{i + 1}" for i in range(count)]
-    return signals, names
-
-
-def _real(name: str, values: Any) -> npt.NDArray[np.float64]:
-    """As doubles, where nothing is lost."""
-    found = np.asarray(values)
-    if found.dtype.kind == "c":
-        raise ValueError(
-            f"{name} holds complex numbers; expected real ones: give {name}.real if that is meant"
-        )
-    if np.ma.is_masked(values):
-        row = int(np.argwhere(np.ma.getmaskarray(values))[0][0])
-        raise ValueError(f"{name} has no value at index {row} (masked); expected a number in every row")
-    if found.dtype.kind not in "fiubO":
-        raise ValueError(f"{name} holds {found.dtype}; expected real numbers")
-    try:
-        return np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} holds what is no number; expected real numbers") from None
-
-
+@front_door
 def identify(
-    records: PlainRecord | Sequence[PlainRecord], options: IdentOptions | None = None, **settings: Any
+    records: Record | Sequence[Record], options: IdentOptions | None = None, **settings: Any
 ) -> Identification:
     """Identify a model of one input and one output; the data choose the order unless you give it.
 
@@ -265,12 +75,51 @@ def identify(
     used, chosen = _records(records), options_of(IdentOptions, options, settings) or IdentOptions()
     if "noise" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"noise": "auto"})
+    begin = perf_counter()
     found = identify_records(used, chosen)
-    return replace(found, records=used, order_given=chosen.n_pairs is not None)
+    fit_s = perf_counter() - begin
+    return replace(found, records=used, order_given=chosen.n_pairs is not None, fit_s=fit_s)
 
 
+@front_door
+def identify_frf(
+    response: FrequencyUncertainty,
+    options: IdentOptions | None = None,
+    embedding: EmbeddingOptions | None = None,
+    *,
+    shared_gain_std: float = 0.0,
+    **settings: Any,
+) -> FrfIdentification:
+    """Fit a GOBF model to a measured frequency response, each frequency weighted by its covariance.
+
+    Parameters
+    ----------
+    response : FrequencyUncertainty
+        (F,) frequencies in rad/s with a covariance at each; their errors are independent.
+    options : IdentOptions, optional
+        Or its fields as settings: `n_real=0, n_pairs=1`.
+    embedding : EmbeddingOptions, optional
+        Of the posterior.
+    shared_gain_std : float
+        Standard deviation of a gain error that all frequencies share, relative to 1.
+
+    Returns
+    -------
+    FrfIdentification
+        The model, its posterior, and what the data say of them; `ident.frequency_fit.identify_frf`.
+
+    Raises
+    ------
+    ValueError
+        A response that holds too little, or options that do not go together.
+    """
+    chosen = options_of(IdentOptions, options, settings)
+    return frequency_fit.identify_frf(response, chosen, embedding, shared_gain_std=shared_gain_std)
+
+
+@front_door
 def identify_mimo(
-    records: PlainRecord | Sequence[PlainRecord],
+    records: Record | Sequence[Record],
     options: IdentOptions | None = None,
     *,
     free_shapes: bool = False,
@@ -288,16 +137,18 @@ def identify_mimo(
     return replace(found, records=used)
 
 
+@front_door
 def matrix_posterior(
-    records: PlainRecord | Sequence[PlainRecord], identification: MimoIdentification, *, level: float = 0.95
+    records: Record | Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
 ) -> matrix_response.MatrixPosterior:
     """Uncertainty of a matrix response: balls that hold it with probability `level` at every frequency."""
     return matrix_response.matrix_posterior(_records(records), identification, level=level)
 
 
+@front_door
 def uncertainty(
     identification: Identification,
-    records: PlainRecord | Sequence[PlainRecord] | EmbeddingOptions | None = None,
+    records: Record | Sequence[Record] | EmbeddingOptions | None = None,
     options: EmbeddingOptions | None = None,
     **settings: Any,
 ) -> Uncertainty:
@@ -332,17 +183,23 @@ def uncertainty(
     return response_uncertainty.uncertainty(used, identification, chosen)
 
 
+@front_door
 def error_surface(
     identification: Identification,
-    records: PlainRecord | Sequence[PlainRecord] | None = None,
-    **settings: Any,
+    records: Record | Sequence[Record] | None = None,
+    *,
+    pair: int = 0,
+    coordinates: Literal["raw", "log"] = "log",
+    first: npt.ArrayLike | None = None,
+    second: npt.ArrayLike | None = None,
+    n_points: int = 61,
 ) -> ErrorSurface:
     """Mean square residual with one pole pair of an identified model moved over a grid, its others frozen.
 
-    records: those of the identification, taken from it if it came from `flexlink.identify`. settings: `pair`
-    (number of the pole pair, 0), `coordinates` ("log": omega and zeta, "raw": beta and gamma), `first` and
-    `second` (grids), `n_points` of each grid (61). Raises ValueError if there is no such pair or a grid
-    leaves the stable pairs.
+    records: those of the identification, taken from it if it came from `flexlink.identify`. pair: number of
+    the pole pair, from 0. coordinates: "log" (omega in rad/s and zeta) or "raw" (beta and gamma). first,
+    second: grids of these; without them n_points of each around the identified pair. Raises ValueError if
+    there is no such pair or a grid leaves the stable pairs.
 
     Examples
     --------
@@ -353,9 +210,16 @@ def error_surface(
     (('omega_rad_s', 'zeta'), True)
     """
     used = _records_of(identification, records)
-    for name in {"first", "second"} & set(settings):
-        settings[name] = np.asarray(settings[name], dtype=np.float64)
-    return surface_of(used, identification.model, identification.structure, **settings)
+    return surface_of(
+        used,
+        identification.model,
+        identification.structure,
+        pair=pair,
+        coordinates=coordinates,
+        first=None if first is None else np.asarray(first, dtype=np.float64),
+        second=None if second is None else np.asarray(second, dtype=np.float64),
+        n_points=n_points,
+    )
 
 
 _ELSEWHERE = {
@@ -364,10 +228,10 @@ _ELSEWHERE = {
 }
 
 
-def _records(records: Any) -> tuple[PlainRecord, ...]:
+def _records(records: Any) -> tuple[Record, ...]:
     """One record or several."""
-    used = (records,) if isinstance(records, PlainRecord) else records
-    if isinstance(used, (str, np.ndarray)) or not all(isinstance(each, PlainRecord) for each in used):
+    used = (records,) if isinstance(records, Record) else records
+    if isinstance(used, (str, np.ndarray)) or not all(isinstance(each, Record) for each in used):
         raise ValueError(
             f"expected a flexlink.Record or several, got {type(records).__name__}: "
             "flexlink.Record(u=u, y=y, dt_s=dt_s)"
@@ -375,7 +239,7 @@ def _records(records: Any) -> tuple[PlainRecord, ...]:
     return tuple(in_one_unit(used))
 
 
-def _records_of(identification: Any, records: Any) -> tuple[PlainRecord, ...]:
+def _records_of(identification: Any, records: Any) -> tuple[Record, ...]:
     """These records or those of the identification, of one input and one output."""
     model = getattr(identification, "model", None)
     if isinstance(identification, FrfIdentification):

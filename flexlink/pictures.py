@@ -13,10 +13,12 @@ import numpy.typing as npt
 from control_design.analysis.certificate import Certificate
 from control_design.analysis.closed_loop import ClosedLoopTrajectory
 from control_design.controllers.controller import Controller
+from control_design.plants.foreign_systems import measured_response, state_space
 from control_design.plants.plant_set import UncertainPlant, frequency_response
 from control_design.synthesis.synthesis_result import SynthesisResult
 from diagnosis.answer import Diagnosis
-from flexlink.design import measured_response, state_space
+from flexlink.comparison import Comparison
+from flexlink.keywords import front_door
 from flexlink.machines import Simulation
 from ident.basis.model import GobfModel
 from ident.data.frequency_uncertainty import FrequencyUncertainty
@@ -29,7 +31,7 @@ from ident.uncertainty import ResponsePosterior
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["bode", "compare", "nichols", "nyquist", "plot", "step"]
+__all__ = ["bode", "nichols", "nyquist", "plot", "step"]
 
 
 @singledispatch
@@ -54,32 +56,8 @@ def unknown(what: str, result: object, of: Any) -> str:
     return f"no {what} of {type(result).__name__}; there is one of {', '.join(known)}"
 
 
+@front_door
 def bode(
-    result: Any, *, ax: Any = None, dB: bool = False, Hz: bool = False, omega_rad_s: Any = None
-) -> Figure:
-    """Gain, phase and size of the ellipses of one response: an identification, a model, an uncertainty, a
-    measured response, an uncertain plant, a controller, a discrete system of python-control (ss, tf, frd), or
-    the loop of a design or a certificate.
-
-    ax: three axes to draw on (two: without the ellipses' size) in place of a new figure. dB, Hz: gain in dB,
-    frequency in Hz. omega_rad_s (F,): frequencies; a measured response has its own.
-
-    Examples
-    --------
-    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
-    >>> [axes.get_ylabel() for axes in flexlink.bode(found).axes[:3]]
-    ['gain [as logged]', 'phase [deg]', 'ellipse / gain [%]']
-    """
-    from workflow.figures.bode import draw_bode, draw_comparison
-
-    found, model = as_response(result, omega_rad_s), getattr(result, "model", result)
-    name = f"{getattr(model, 'input_name', 'u')} to {getattr(model, 'output_name', 'y')}"
-    if ax is not None and np.size(ax) < 3:
-        return _figure(draw_comparison({name: found}, dB=dB, Hz=Hz), ax)
-    return _figure(draw_bode(found, name, "as logged", dB=dB, Hz=Hz), ax)
-
-
-def compare(
     *results: Any,
     names: str | Sequence[str] = (),
     ax: Any = None,
@@ -87,30 +65,66 @@ def compare(
     Hz: bool = False,
     omega_rad_s: Any = None,
 ) -> Figure:
-    """Several responses on one plot, each as for `bode`; ellipses as bands where there are any.
+    """Draw gain and phase of one response, or of several on one plot; ellipses are bands.
 
-    names: of the curves, in the same order; one may stand by itself. ax: two axes, gain and phase. dB, Hz,
-    omega_rad_s: as of `bode`. Raises ValueError for another number of names or axes, TypeError for what has
-    no response.
+    Parameters
+    ----------
+    results : object
+        Each an identification, a model, an uncertainty, a measured response, an uncertain plant, a
+        controller, a discrete system of python-control (ss, tf, frd), or the loop of a design or a
+        certificate.
+    names : str or sequence of str
+        Of the curves, in the same order; one may stand by itself.
+    ax : axes of matplotlib, optional
+        Two of them, gain and phase; of one response a third shows the size of its ellipses.
+    dB, Hz : bool
+        Gain in dB, frequency in Hz.
+    omega_rad_s : (F,) array, optional
+        Frequencies; a measured response has its own.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ValueError
+        Another number of names or axes.
+    TypeError
+        What has no response.
 
     Examples
     --------
     >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> [axes.get_ylabel() for axes in flexlink.bode(found).axes[:3]]
+    ['gain [as logged]', 'phase [deg]', 'ellipse / gain [%]']
     >>> rough = flexlink.identify(example_record(), n_pairs=0, n_real=2)
-    >>> figure = flexlink.compare(found, rough, names=["one mode", "two lags"], dB=True)
+    >>> figure = flexlink.bode(found, rough, names=["one mode", "two lags"], dB=True)
     >>> [text.get_text() for text in figure.legends[0].get_texts()]
     ['one mode', 'two lags']
     """
-    from workflow.figures.bode import draw_comparison
+    from workflow.figures.bode import draw_bode, draw_comparison
 
-    given = [names] if isinstance(names, str) else list(names)
-    chosen = given or [f"{k + 1}: {type(result).__name__}" for k, result in enumerate(results)]
-    if not results or len(chosen) != len(results):
-        raise ValueError(f"expected a name for each response; got {len(results)} and {len(chosen)} names")
-    found = (as_response(result, omega_rad_s) for result in results)
-    return _figure(draw_comparison(dict(zip(chosen, found, strict=True)), dB=dB, Hz=Hz), ax)
+    given_names = [names] if isinstance(names, str) else list(names)
+    if not results or (given_names and len(given_names) != len(results)):
+        raise ValueError(
+            f"expected a name for each response; got {len(results)} responses and {len(given_names)} names"
+        )
+    if len(results) == 1 and not given_names:
+        response = as_response(results[0], omega_rad_s)
+        model = getattr(results[0], "model", results[0])
+        channel = f"{getattr(model, 'input_name', 'u')} to {getattr(model, 'output_name', 'y')}"
+        if ax is None or np.size(ax) == 3:
+            return _figure(draw_bode(response, channel, "as logged", dB=dB, Hz=Hz), ax)
+        given_names = [channel]
+    curve_names = given_names or [f"{k}: {type(result).__name__}" for k, result in enumerate(results, 1)]
+    responses = {
+        name: as_response(result, omega_rad_s) for name, result in zip(curve_names, results, strict=True)
+    }
+    return _figure(draw_comparison(responses, dB=dB, Hz=Hz), ax)
 
 
+@front_door
 def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
     """Nyquist curve of a loop with its ellipses: of a design or a certificate, or of a plant with a
     controller, each as for `bode`. ax: axes to draw on.
@@ -127,6 +141,7 @@ def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
     return _figure(draw_alone(draw_nyquist, _loop_of(loop, controller, omega_rad_s)), ax)
 
 
+@front_door
 def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
     """The same on a Nichols chart: gain [dB] over phase, with lines of constant closed-loop gain and phase.
 
@@ -142,6 +157,7 @@ def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
     return _figure(draw_alone(draw_nichols, _loop_of(loop, controller, omega_rad_s)), ax)
 
 
+@front_door
 def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = None) -> Figure:
     """Step response of a plant or model as it is, or of its loop with a controller; of a design's or a
     certificate's nominal loop. A loop has a second panel with its command.
@@ -248,12 +264,15 @@ def _record(record: Record) -> Figure:
 @plot.register(Simulation)
 def _simulation(simulation: Simulation) -> Figure:
     outputs = np.column_stack([simulation.hub_angle_rad, simulation.tip_m])
-    return _record(
-        Record(
-            "simulated", simulation.voltage_V[:, None], outputs, simulation.dt_s, ("voltage_V",),
-            ("hub_angle_rad", "tip_m"),
-        )
-    )  # fmt: skip
+    record = Record(
+        simulation.voltage_V,
+        outputs,
+        simulation.dt_s,
+        name="simulated",
+        input_names="voltage_V",
+        output_names=("hub_angle_rad", "tip_m"),
+    )
+    return _record(record)
 
 
 @plot.register(Identification)
@@ -265,7 +284,7 @@ def _poles(found: Identification) -> Figure:
 
 @plot.register(FrfIdentification)
 def _fitted_response(found: FrfIdentification) -> Figure:
-    return compare(found.response, found.model, names=("measured", "fitted"), omega_rad_s=found.omega_rad_s)
+    return bode(found.response, found.model, names=("measured", "fitted"), omega_rad_s=found.omega_rad_s)
 
 
 for kind in (GobfModel, ResponsePosterior, FrequencyUncertainty):
@@ -299,6 +318,11 @@ def _surface(surface: ErrorSurface) -> Figure:
     from workflow.figures.pole_search import draw_surface
 
     return _figure(draw_surface(surface))
+
+
+@plot.register(Comparison)
+def _comparison(found: Comparison) -> Figure:
+    return found.plot()
 
 
 @plot.register(Diagnosis)

@@ -13,6 +13,7 @@ from control_design.analysis.multivariable_certificate import MultivariableCerti
 from control_design.convex.youla import YoulaBracket
 from control_design.synthesis.synthesis_result import SynthesisResult
 from diagnosis.answer import Diagnosis
+from flexlink.comparison import Comparison
 from flexlink.machines import Simulation
 from flexlink.pictures import as_response, unknown
 from ident.basis.model import GobfModel
@@ -153,6 +154,7 @@ def _facts(summary: RunSummary) -> pd.DataFrame:
 
 # Those whose rows are there already.
 table.register(Simulation, lambda found: pd.DataFrame(vars(found)))
+table.register(Comparison, lambda found: found.table())
 table.register(Identification, lambda found: _model(found.model))
 table.register(MimoIdentification, lambda found: _modes(found.model.poles, found.model.dt_s))
 table.register(YoulaBracket, lambda found: pd.DataFrame([vars(plant) for plant in found.plants]))

@@ -127,6 +127,11 @@ class FrfIdentification(Shown):
         """
         return float(np.mean(self.distance <= 1.0))
 
+    @property
+    def own_uncertainty(self) -> ResponsePosterior:
+        """The posterior of the response, which a plant made of this fit takes over."""
+        return self.posterior
+
     def to_control(self) -> Any:
         """The model as `control.StateSpace`; ImportError without python-control."""
         return self.model.to_control()

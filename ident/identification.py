@@ -69,6 +69,8 @@ class FittedRecords(Shown):
         What it was made from; not stored.
     order_given : bool
         Nobody left the order to the data; not stored.
+    fit_s : float
+        Seconds that the fit took, nan where nobody measured; not stored.
 
     Raises
     ------
@@ -95,6 +97,7 @@ class FittedRecords(Shown):
     advise: Callable[[], Sequence[Finding]] = field(default=tuple)
     records: tuple[Record, ...] = field(default=(), compare=False, metadata=NOT_STORED)
     order_given: bool = field(default=False, compare=False, metadata=NOT_STORED)
+    fit_s: float = field(default=np.nan, compare=False, metadata=NOT_STORED)
 
     def __post_init__(self) -> None:
         """Make arrays read-only; raise ValueError where numbers of records differ or sums are negative."""

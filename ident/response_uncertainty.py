@@ -169,6 +169,11 @@ class Uncertainty(ResponsePosterior):
         relative_size = at_modes.ellipse(SHOWN_LEVEL).semi_major / np.abs(at_modes.centre)
         return list(zip(at_modes.omega_rad_s.tolist(), relative_size.tolist(), strict=True))
 
+    @property
+    def own_uncertainty(self) -> Uncertainty:
+        """These ellipses themselves, which a plant made of them takes over."""
+        return self
+
     def to_control(self) -> object:
         """`nominal` as `control.StateSpace`, without the ellipses; ImportError without python-control."""
         return self.nominal().to_control()

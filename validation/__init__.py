@@ -1,1 +1,1 @@
-"""Checks of the product from outside: blind protocol, the paper redrawn, comparators, example plants."""
+"""Checks of the product from outside: blind protocol, the paper redrawn, example plants."""

@@ -195,7 +195,7 @@ def flexible_link(scenario: Scenario = "A") -> UncertainPlant:
     )
     fast = control.tf2ss(control.tf(np.real(np.poly([zeros[0]])), np.real(np.poly(poles[2:])), _DT_S))
     nominal = control.series(slow, fast)
-    return UncertainPlant(f"flexible link {scenario}", nominal, LinkUncertainty(scenario))
+    return UncertainPlant(nominal, name=f"flexible link {scenario}", uncertainty=LinkUncertainty(scenario))
 
 
 def flexible_link_specification(order: int) -> Specification:

@@ -22,6 +22,7 @@ from control_design.controllers.law import Law
 from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
+from ident.data.keywords import clear_constructor
 
 if TYPE_CHECKING:
     import control
@@ -32,6 +33,7 @@ else:
     Limit = float | tuple[float | None, ...] | None
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class Controller(Law):
     """Controller u = K (r - y) of Y errors and U commands: x+ = A x + B e + M (u_limited - u), u = C x + D e.

@@ -21,6 +21,7 @@ from control_design.plants.plant_set import NominalPlant, delayed, matrix_respon
 from control_design.plants.scaled_bound import conjugate
 from control_design.plants.weights import RationalWeight
 from ident.data.arrays import lock
+from ident.data.keywords import clear_constructor
 
 if TYPE_CHECKING:
     import control
@@ -79,6 +80,7 @@ class IdentifiedMatrix(Protocol):
         ...
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class ResponseBall:
     """Responses G + Lo Delta Li with |Delta|_F <= radius at every frequency; `of` makes a ball of an
@@ -182,6 +184,7 @@ class ResponseBall:
         return self.radius**2 * conjugate(values) @ values
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class MultivariablePlant(NominalPlant):
     """Plant with U inputs and Y outputs and its uncertainty, under the law u = -K y.

@@ -18,6 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from control_design.plants.ellipses import Complex, Ellipses, EvaluableUncertainty, Real, ResponseSet
+from control_design.plants.foreign_systems import is_measured, measured_response, state_space
+from ident.data.keywords import clear_constructor
 from ident.data.shown import Shown
 
 if TYPE_CHECKING:
@@ -354,18 +356,22 @@ def modes_of(poles_z: Complex, dt_s: float, *, zeta_below: float = 0.4) -> tuple
     return tuple(sorted(modes, key=lambda mode: mode.omega_rad_s))
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@clear_constructor
+@dataclass(frozen=True, eq=False, repr=False, init=False)
 class UncertainPlant(NominalPlant, Shown):
     """A plant from its input to its measured output, with ellipses: one for each load or operating point.
 
     Parameters
     ----------
+    plant : object
+        Discrete, one input and one output: of python-control (ss, tf), scipy (dlti), or anything with
+        `to_control()`. A result of `flexlink.uncertainty` has its own ellipses, one of `identify_frf` those
+        of its posterior; anything else is exact unless `uncertainty` is given. The state space that is made
+        of it is kept as `nominal`, which is accepted in its place.
     name : str
         Not empty; errors and tables name the plant by it.
-    nominal : control.StateSpace
-        Discrete, one input and one output.
     uncertainty : object or None
-        Of the measured output, see `PlantChannel`.
+        Of the measured output, see `PlantChannel`; a `control.frd` is a measured response, taken as exact.
     integrators : int or None
         Poles at z = 1, 0 to 2; None: counted. A number that contradicts the nominal is refused.
     performance : PlantChannel or None
@@ -378,7 +384,16 @@ class UncertainPlant(NominalPlant, Shown):
     ------
     ValueError
         For an empty name, a wrong number of integrators, an undamped mode, a performance channel of another
-        sampling period, or what `PlantChannel` refuses.
+        sampling period, or what `state_space` and `PlantChannel` refuse.
+
+    Examples
+    --------
+    >>> import control
+    >>> flexlink.UncertainPlant(control.ss([[0.9]], [[1.0]], [[0.1]], [[0.0]], 0.01), name="motor")
+    UncertainPlant 'motor': 1 state, dt = 0.01 s, no integrator, response taken as exact
+    >>> flexlink.UncertainPlant(control.tf([0.1], [1.0, 0.5]), name="motor")
+    Traceback (most recent call last):
+    ident.data.keywords.WrongArgumentError: plant 'motor' is in continuous time, flexlink works in ...
     """
 
     name: str
@@ -388,7 +403,40 @@ class UncertainPlant(NominalPlant, Shown):
     performance: PlantChannel | None = None
     level: float = 0.95
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        plant: Any = None,
+        *,
+        name: str = "plant",
+        uncertainty: Any = None,
+        nominal: Any = None,
+        integrators: int | None = None,
+        performance: PlantChannel | None = None,
+        level: float = 0.95,
+    ) -> None:
+        """Take nominal and uncertainty from what is given, and check the parts against one another."""
+        system = plant if nominal is None else nominal
+        # A measured response has no poles: beside a nominal model it is what must hold on the machine.
+        if nominal is not None and uncertainty is None and is_measured(plant):
+            uncertainty = plant
+        if is_measured(uncertainty):
+            uncertainty = measured_response(uncertainty, f"the response of plant {name!r}")
+        if uncertainty is None:
+            uncertainty = getattr(system, "own_uncertainty", None)
+        values = {
+            "name": name,
+            "nominal": state_space(system, f"plant {name!r}"),
+            "uncertainty": uncertainty,
+            "integrators": integrators,
+            "performance": performance,
+            "level": level,
+        }
+        # Fields of a frozen class are set through `object`.
+        for key, value in values.items():
+            object.__setattr__(self, key, value)
+        self._refuse_misfits()
+
+    def _refuse_misfits(self) -> None:
         """Check the parts against one another and count the integrators.
 
         Raises the ValueError that the class names.

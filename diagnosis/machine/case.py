@@ -13,12 +13,14 @@ import scipy
 from diagnosis.machine.machine_protocol import Real, RecordedCase, Role, check_record
 from diagnosis.machine.quantisation_grid import grid_step
 from ident.data.arrays import lock
+from ident.data.keywords import clear_constructor
 from plant.rig import Output, Rig
 
 if TYPE_CHECKING:
     from diagnosis.machine.flexible_arm import FlexibleArm
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """One record of a flexible link.
@@ -120,6 +122,7 @@ class Experiment:
         )
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Case(RecordedCase[Experiment]):
     """A rig as its maker knows it, and records of the machine.

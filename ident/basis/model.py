@@ -28,7 +28,8 @@ from ident.basis.functions import (
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.shown import Shown
+from ident.data.keywords import clear_constructor, refuse_rate
+from ident.data.shown import Shown, front_door
 
 # Most integrators, and most samples of delay, that a model may have. Each is a state, so a damaged file that
 # says 10^9 would fill the memory. Arms have at most 3 integrators and tens of samples; 2000 would do as well.
@@ -42,6 +43,7 @@ _NYQUIST_ROUNDING = 1e-12
 _LARGEST_ZERO = 1e4
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class GobfModel(Shown):
     r"""A linear model of one input and one output on generalised orthonormal basis functions (GOBF).
@@ -112,6 +114,7 @@ class GobfModel(Shown):
             raise ValueError("the coefficients and the direct term must be finite")
         if not (np.isfinite(self.dt_s) and self.dt_s > 0):
             raise ValueError(f"dt_s must be positive; got {self.dt_s}")
+        refuse_rate(self.dt_s)
         stage_counts = (self.integrators, self.input_delay_samples)
         if not all(0 <= count <= _MOST_STAGES for count in stage_counts):
             raise ValueError(
@@ -269,7 +272,7 @@ class GobfModel(Shown):
 
         Another suffix, or a path that cannot be written, is refused by the function that writes it.
         """
-        self.front.shown.save(self, Path(path))
+        front_door("shown").save(self, Path(path))
 
     def simulate(self, u: RealArray) -> RealArray:
         """Output (T,) for the input u (T,) or (T, 1), from rest, in units of the output; from a NaN on NaN.

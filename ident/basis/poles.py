@@ -15,8 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ident.data.arrays import ComplexArray, RealArray, lock
+from ident.data.keywords import clear_constructor
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class Poles:
     """Discrete-time poles inside the unit circle, in the order of their basis functions.

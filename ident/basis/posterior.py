@@ -115,6 +115,16 @@ def _delays(z: ComplexArray, most: int) -> ComplexArray:
     return powers
 
 
+def _misfit(omega: RealArray, nyquist_rad_s: float) -> str:
+    """What of frequencies is no (F,) array from 0 to Nyquist, in words: their shape, or the first outside."""
+    if omega.ndim == 0:
+        return f"a number: give [{omega:g}]"
+    if omega.ndim > 1:
+        return f"shape {omega.shape}"
+    is_inside = (omega >= 0) & (omega <= nyquist_rad_s)
+    return f"{omega[np.argmin(is_inside)]:g}"
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ResponsePosterior(Shown):
     """Gaussian coefficients of G(z) = [sum a_i L_i(z) + d + sum h_k z^-k] (z / (z - 1))^integrators z^-delay.
@@ -206,9 +216,14 @@ class ResponsePosterior(Shown):
         is_below = omega <= nyquist * (1 + _NYQUIST_ROUNDING)
         is_positive = omega >= 0
         if omega.ndim != 1 or not np.all(is_positive & is_below):
-            raise ValueError(f"omega (F,) is in rad/s, from 0 to pi / dt_s = {nyquist:.6g}")
+            raise ValueError(
+                f"omega (F,) is in rad/s, from 0 to pi / dt_s = {nyquist:.6g}; got {_misfit(omega, nyquist)}"
+            )
         if self.integrators and not np.all(omega > 0):
-            raise ValueError("the response of an integrator has no value at omega = 0")
+            raise ValueError(
+                "the response of an integrator has no value at omega = 0: expected frequencies above 0, up "
+                f"to pi / dt_s = {nyquist:.6g} rad/s"
+            )
 
         # Basis, direct term and taps, side by side; then the factor that they share.
         z = np.exp(1j * omega * self.dt_s)

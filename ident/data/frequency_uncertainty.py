@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ident.data.arrays import BoolArray, ComplexArray, RealArray, lock, readonly
 from ident.data.ellipses import EllipseAxes, chi2_radius, ellipse_distance, relative_deficit, standard_axes
+from ident.data.keywords import clear_constructor
 from ident.data.record_files import read_table
 from ident.data.response_columns import read_response
 from ident.data.table import LARGEST
@@ -34,6 +35,7 @@ FREQUENCIES = 400
 CROSS_COLUMN = "covariance_real_imag"
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class FrequencyUncertainty:
     """A frequency response G(e^{j omega dt}) ~ N(centre, covariance) over (Re, Im), frequency by frequency.

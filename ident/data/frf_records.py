@@ -21,6 +21,7 @@ import numpy as np
 from ident.data.arrays import BoolArray, ComplexArray, IntArray, RealArray, factor_matrices, lock
 from ident.data.ellipses import hotelling_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
+from ident.data.keywords import clear_constructor
 from ident.data.record_files import read_table
 from ident.data.response_columns import has_response, read_response
 
@@ -36,6 +37,7 @@ RAYLEIGH_MEDIAN = 1.1774
 SPREAD_COLUMNS = ("covariance_real_imag", "variance_imag", "variance_real")
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False)
 class FrfRepeats:
     """Measured points of a frequency response; points of equal frequency are repeats.

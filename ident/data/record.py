@@ -14,15 +14,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from os import PathLike
+from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from ident.data.arrays import RealArray, readonly
 from ident.data.finding import Finding, FindingKind, finding
-from ident.data.foreign_files import as_typed, shown
+from ident.data.foreign_files import as_typed, distinct, shown
+from ident.data.keywords import clear_call, clear_constructor
 from ident.data.record_files import read_table
 from ident.data.shown import Shown
+from ident.data.signals import (
+    is_time_response,
+    listed,
+    of_time_response,
+    once,
+    refuse_other_rows,
+    signals_of,
+)
 from ident.data.table import LARGEST, Table
 from ident.data.text_numbers import is_bookkept, number
 from ident.data.time_grid import CoarseGrid, Repair, TimeGrid, clock_doubts, sampling_time
@@ -41,9 +51,28 @@ SAME_DT = 1e-9
 BEYOND_PERIOD = 1e-6
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+@clear_constructor
+@dataclass(frozen=True, eq=False, repr=False, init=False)
 class Record(Shown):
     """One uniformly sampled experiment: T samples of U inputs, Y outputs and R references.
+
+    Made of arrays, pandas columns, a time response of python-control, or (with `from_file`, `from_table`) of
+    a log.
+
+    Parameters
+    ----------
+    u, y : array-like, shape (T,) or (T, n), or a pandas column or table
+        Input and output, one row per sample; `input` and `output` are accepted, too. Names of pandas columns
+        become signal names; the default is u and y (u1, u2, ... if several). u may be a time response of
+        python-control (`control.forced_response`): its inputs, outputs and times.
+    dt_s : float
+        Sampling time, s.
+    reference : as y, optional
+        Set points of a closed loop.
+    input_names, output_names, reference_names : str or sequence of str
+        A single name may stand by itself.
+
+    The others are the attributes below.
 
     Attributes
     ----------
@@ -80,8 +109,22 @@ class Record(Shown):
     Raises
     ------
     ValueError
-        A shape or a name does not fit, dt_s is not positive, or a sample is not finite or above 1e100 (names
-        the first one).
+        A shape or a name does not fit (nothing is transposed to make it fit), dt_s is not positive or no
+        machine's, or a sample is not finite or above 1e100 (names the first one).
+
+    Examples
+    --------
+    >>> import numpy as np, pandas as pd, flexlink
+    >>> flexlink.Record(u=np.ones(4), y=np.arange(4.0), dt_s=0.01)
+    Record 'record': 4 samples, every 0.01 s, 0.04 s in all
+      u -> y
+    >>> log = pd.DataFrame({"voltage_V": [1.0, 1.0, 1.0], "angle_rad": [0.0, 0.1, 0.3]})
+    >>> flexlink.Record(u=log["voltage_V"], y=log["angle_rad"], dt_s=0.01, name="first try")
+    Record 'first try': 3 samples, every 0.01 s, 0.03 s in all
+      voltage_V -> angle_rad
+    >>> flexlink.Record(u=np.ones((1, 4)), y=np.arange(4.0), dt_s=0.01)
+    Traceback (most recent call last):
+    ValueError: u has 1 samples of 4 signals; expected one row per sample
     """
 
     name: str
@@ -101,11 +144,68 @@ class Record(Shown):
     notes: tuple[Finding, ...] = ()
     own_units: Mapping[str, str] = field(default_factory=dict, metadata={"since": 2})
 
-    def __post_init__(self) -> None:
-        """Lock the arrays and check that everything fits together. Raises ValueError as the class says."""
-        # Fields of a frozen class are set through `object`. Names may come as lists.
-        for key in ("input_names", "output_names", "reference_names", "input_units", "output_units"):
-            object.__setattr__(self, key, tuple(getattr(self, key)))
+    def __init__(
+        self,
+        u: Any = None,
+        y: Any = None,
+        dt_s: float | None = None,
+        *,
+        name: str = "record",
+        input: Any = None,  # noqa: A002 (the attribute's name)
+        output: Any = None,
+        reference: Any = None,
+        input_names: str | Sequence[str] = (),
+        output_names: str | Sequence[str] = (),
+        reference_names: str | Sequence[str] = (),
+        input_units: Sequence[str] = (),
+        output_units: Sequence[str] = (),
+        source: str = "",
+        time_column: TimeColumn | None = None,
+        repair: Repair | None = None,
+        cut: int = 0,
+        notes: Sequence[Finding] = (),
+        own_units: Mapping[str, str] | None = None,
+    ) -> None:
+        """Take the signals, lock them, and check that everything fits together (ValueError)."""
+        if y is None and is_time_response(u):
+            u, y, dt_s = of_time_response(u, dt_s)
+        if dt_s is None:
+            raise ValueError("a record needs dt_s, the sampling time in seconds")
+        if isinstance(dt_s, bool) or not isinstance(dt_s, (int, float, np.integer, np.floating)):
+            raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
+        u = once("u", u, "input", input)
+        y = once("y", y, "output", output)
+        refuse_other_rows(u, y, reference)
+        inputs, input_names = signals_of("u", u, input_names)
+        outputs, output_names = signals_of("y", y, output_names)
+        if reference is not None:
+            reference, reference_names = signals_of("r", reference, reference_names)
+        values = {
+            "name": name,
+            "input": inputs,
+            "output": outputs,
+            "dt_s": dt_s,
+            "input_names": tuple(input_names),
+            "output_names": tuple(output_names),
+            "reference": reference,
+            "reference_names": listed(reference_names),
+            "input_units": tuple(input_units),
+            "output_units": tuple(output_units),
+            "source": source,
+            "time_column": time_column,
+            "repair": repair,
+            "cut": cut,
+            "notes": tuple(notes),
+            "own_units": {} if own_units is None else own_units,
+        }
+        # Fields of a frozen class are set through `object`.
+        for key, value in values.items():
+            object.__setattr__(self, key, value)
+        self._refuse_misfits()
+        refuse_step(self.label, self.dt_s, self.output, self.time_column)
+
+    def _refuse_misfits(self) -> None:
+        """Lock the arrays and check them against names, units and one another. Raises ValueError."""
         if not (np.isfinite(self.dt_s) and self.dt_s > 0):
             raise ValueError(f"{self.label}: dt_s must be a positive number of seconds; got {self.dt_s}")
         self._check("input", self.input_names)
@@ -303,16 +403,17 @@ class Record(Shown):
         return replace(self, input=change(self.input), output=change(self.output), reference=reference)
 
     @classmethod
+    @clear_call
     def from_file(
         cls,
         path: str | PathLike[str] | Table,
-        inputs: Sequence[str],
-        outputs: Sequence[str],
+        inputs: str | Sequence[str],
+        outputs: str | Sequence[str],
         *,
         time: str | None = None,
         dt_s: float | None = None,
         time_unit: str | None = None,
-        references: Sequence[str] = (),
+        references: str | Sequence[str] = (),
         name: str | None = None,
         scale: Mapping[str, float] | None = None,
         offset: Mapping[str, float] | None = None,
@@ -329,8 +430,8 @@ class Record(Shown):
         ----------
         path : path-like or Table
             The file, or a table that was read before; formats: `ident.data.record_files`.
-        inputs, outputs, references : sequence of str
-            Names of columns.
+        inputs, outputs, references : str or sequence of str
+            Names of columns; a single one may stand by itself.
         time : str, optional
             The column of time stamps. The sampling time comes from it, from `dt_s`, or from both if they
             agree.
@@ -367,6 +468,9 @@ class Record(Shown):
         table = path if isinstance(path, Table) else read_table(path)
         table = _one_run(table.with_decimal(decimal), time, run)
         label = str(table.path)
+        inputs = listed(inputs)
+        outputs = listed(outputs)
+        references = listed(references)
         _refuse_roles(table, inputs, outputs, references, time, time_unit)
         scale = scale or {}
         offset = offset or {}
@@ -486,6 +590,58 @@ class Record(Shown):
             own_units=own_units,
         )
 
+    @classmethod
+    @clear_call
+    def from_table(
+        cls,
+        table: Any,
+        input: str | Sequence[str],  # noqa: A002 (as in the command line)
+        output: str | Sequence[str],
+        *,
+        time: str | None = None,
+        **more: Any,
+    ) -> Self:
+        """Columns of a `pandas.DataFrame`, checked like those of a file.
+
+        Parameters
+        ----------
+        table : pandas.DataFrame
+            A row per sample.
+        input, output : str or sequence of str
+            Names of columns.
+        time : str, optional
+            Column of numbers (unit from its name, else seconds) or of date-times. Default: the index, if it
+            holds times; otherwise give dt_s.
+
+        The others as in `from_file`.
+
+        Raises
+        ------
+        ValueError
+            As `from_file`; and where neither time nor dt_s is given and the index holds no times.
+
+        Examples
+        --------
+        >>> import pandas as pd
+        >>> log = pd.DataFrame({"t_ms": [0, 5, 10, 15], "u_V": [1.0, 1, 0, 0], "hub_rad": [0, 0.1, 0.2, 0.2]})
+        >>> flexlink.Record.from_table(log, "u_V", "hub_rad", time="t_ms")
+        Record 'table': 4 samples, every 0.005 s, 0.02 s in all
+          u_V -> hub_rad
+          time column 't_ms' in ms
+        >>> log.index = pd.date_range("2024-03-01", periods=4, freq="5ms")
+        >>> flexlink.Record.from_table(log, "u_V", "hub_rad").dt_s
+        0.005
+        """
+        names = distinct([str(name) for name in table.columns])
+        columns = {name: table.iloc[:, k].to_numpy() for k, name in enumerate(names)}
+        if time is None and "dt_s" not in more:
+            index = table.index.to_numpy()
+            if index.dtype.kind not in "mM":
+                raise ValueError("give time, the name of a column, or dt_s: the table's index holds no times")
+            columns["index"] = index
+            time = "index"
+        return cls.from_file(Table(Path("table"), columns), input, output, time=time, **more)
+
 
 def _one_run(table: Table, time: str | None, run: int | None) -> Table:
     """Return a table, or the chosen run of it where time starts again.
@@ -513,15 +669,10 @@ def _refuse_roles(
 ) -> None:
     """Raise ValueError where the names of columns, or of the time column, do not go together.
 
-    A string is no list of names, no column is two things, a unit of time needs a time column, and a table
+    No column is two things, a unit of time needs a time column, and a table
     whose columns have rows of their own needs one, too. That the columns are there is not asked here but by
     `Table.columns`.
     """
-    for key, names in (("inputs", inputs), ("outputs", outputs), ("references", references)):
-        if isinstance(names, str):
-            raise ValueError(
-                f"{table.path}: {key} must be a list of column names; got the single string {names!r}"
-            )
     if time in (*inputs, *outputs, *references):
         raise ValueError(f"{table.path}: column {time!r} is named as time and as a signal; expected two")
     if time is None and time_unit is not None:

@@ -24,6 +24,16 @@ else:
 # an unknown one: half, so that a letter too few or exchanged is seen in words of three letters.
 _LEAST_LIKENESS = 0.5
 
+# What other tools call things, with the keys that say them here. The first keys that are all known count.
+_USUAL_NAMES = {
+    "order": (("n_real", "n_pairs"), ("controller_order",)),
+    "nx": (("n_real", "n_pairs"), ("controller_order",)),
+    "delay": (("input_delay_samples",), ("computational_delay_samples",)),
+    "nk": (("input_delay_samples",),),
+    "Ts": (("dt_s",), ("controller_dt_s",)),
+    "fs": (("dt_s",), ("controller_dt_s",)),
+}
+
 
 class _Fields(ModelMetaclass):
     """Metaclass of settings: `help` lists what a reader sets, and nothing of pydantic's."""
@@ -109,7 +119,9 @@ def _encloses_another(detail: ErrorDetails, details: Sequence[ErrorDetails]) -> 
 
 
 def meant(word: str, known: Sequence[str], what: str) -> str:
-    """What to write in place of a word that nobody knows: the known one that looks like it, else all.
+    """What to write in place of a word that nobody knows: what other tools mean by it, or a word like it.
+
+    Where there is neither, all that is known.
 
     Without known words: the list in the answer is empty.
 
@@ -122,6 +134,9 @@ def meant(word: str, known: Sequence[str], what: str) -> str:
     what : str
         What these are, in the plural: 'keys'.
     """
+    for keys in _USUAL_NAMES.get(word, ()):
+        if set(keys) <= set(known):
+            return f"did you mean {' and '.join(keys)}?"
     close = difflib.get_close_matches(word, known, n=1, cutoff=_LEAST_LIKENESS)
     return f"did you mean {close[0]}?" if close else f"known {what}: {', '.join(known)}"
 

@@ -46,14 +46,18 @@ def random_stable(rng: np.random.Generator, n: int, dt_s: float) -> control.Stat
 
 def uncertain_hub(relative_std: float, **more: Any) -> UncertainPlant:
     """`hub_arm` in discs."""
-    return UncertainPlant("hub", hub_arm(), RelativeDisc(hub_arm(), relative_std, 60.0), **more)
+    return UncertainPlant(
+        hub_arm(), name="hub", uncertainty=RelativeDisc(hub_arm(), relative_std, 60.0), **more
+    )
 
 
 def uncertain_lag(std: float, level: float = 0.95) -> UncertainPlant:
     """G = (1 + std x) 0.02/(z - 0.98), x ~ N(0, 1); its ellipses hold |x| below the radius of the level."""
     poles, scale = Poles(np.array([0.98]), np.zeros(0, complex)), 0.02 / np.sqrt(1 - 0.98**2)
     posterior = ResponsePosterior(poles, np.array([scale]), np.array([[scale * std]]), 0.005)
-    return UncertainPlant("lag", control.ss([[0.98]], [[1.0]], [[0.02]], 0, 0.005), posterior, level=level)
+    return UncertainPlant(
+        control.ss([[0.98]], [[1.0]], [[0.02]], 0, 0.005), name="lag", uncertainty=posterior, level=level
+    )
 
 
 def notched(corners_rad: Any, dt_s: float) -> tuple[np.ndarray, np.ndarray]:

@@ -226,7 +226,7 @@ def test_a_gain_that_hunts_is_found_out():
     law = _law("companion, roll-off 3", computational_delay_samples=1)
     hunting = replace(law, anti_windup_gain=_old_gain(law))
     assert np.max(np.abs(np.linalg.eigvals(law.A - hunting.anti_windup_gain @ law.C))) < 1
-    plant = UncertainPlant("motor", _MOTOR)
+    plant = UncertainPlant(_MOTOR, name="motor")
     specification = flexlink.Specification(modulus_margin=0.2, controller_order=4)
     found = flexlink.certify(hunting, plant, specification)
     assert not found.certified
@@ -245,7 +245,7 @@ def test_a_certificate_without_limits_says_nothing_of_them():
     specification = flexlink.Specification(
         modulus_margin=0.2, controller_order=4, computational_delay_samples=0
     )
-    found = flexlink.certify(law, UncertainPlant("motor", _MOTOR), specification)
+    found = flexlink.certify(law, UncertainPlant(_MOTOR, name="motor"), specification)
     assert found.limited == ()
     assert not any("limited" in item.requirement for item in found.items)
 
@@ -253,19 +253,19 @@ def test_a_certificate_without_limits_says_nothing_of_them():
 def test_what_cannot_be_said_is_not_said():
     law = Controller.proportional(5.0, 1e-3, input_limit=1.0, computational_delay_samples=0)
     falling = control.ss([[1.001]], [[1e-3]], [[1.0]], 0, 1e-3)
-    loop = limited_loop(law, UncertainPlant("inverted", falling))
+    loop = limited_loop(law, UncertainPlant(falling, name="inverted"))
     assert loop.obstacle.name == "PLANT_UNSTABLE"
     assert loop.steps == ()
     assert loop.ends
     unstable = replace(law, D=-law.D)
-    assert limited_loop(unstable, UncertainPlant("motor", _MOTOR)).obstacle.name == "LOOP_UNSTABLE"
+    assert limited_loop(unstable, UncertainPlant(_MOTOR, name="motor")).obstacle.name == "LOOP_UNSTABLE"
     differentiator = Controller([[0.9]], [[1.0]], [[-0.1]], [[1.0]], 1e-3, input_limit=1.0)
     assert limited_controller(differentiator).obstacle.name == "ENDS_UNKNOWN"
 
 
 def test_only_a_rate_limit_is_looked_at_too():
     law = _law("companion, roll-off 3", input_limit=None, rate_limit=5.0)
-    alone, loop = limited_loops(law, [UncertainPlant("motor", _MOTOR)])
+    alone, loop = limited_loops(law, [UncertainPlant(_MOTOR, name="motor")])
     assert len(alone.steps) == 3
     assert len(loop.steps) == 1
     assert alone.ends

@@ -26,7 +26,7 @@ def lag(seconds: float, name: str = "lag", gain: float = 1.0) -> UncertainPlant:
     """First order, sampled at 20 Hz, with 5 % around it."""
     nominal = control.sample_system(control.ss(control.tf([gain], [seconds, 1.0])), 0.05)
     discs = StatedDiscs(nominal, RationalWeight(numerator=(0.05,), denominator=(1.0,)), "multiplicative")
-    return UncertainPlant(name, nominal, discs)
+    return UncertainPlant(nominal, name=name, uncertainty=discs)
 
 
 @cache
@@ -150,7 +150,7 @@ def resonance(seed: int) -> tuple[UncertainPlant, Specification]:
         delay_margin_s=0.6 / bandwidth_rad_s,
         controller_order="auto",
     )
-    return UncertainPlant("arm", nominal, discs), asked
+    return UncertainPlant(nominal, name="arm", uncertainty=discs), asked
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ _FEW = SynthesisOptions(starts=1, grid_points=40, mode_points=0, dense_points=80
 def _inertia(delay_samples: int = 0) -> UncertainPlant:
     arm = control.c2d(control.ss(control.tf([1.0], [1.0, 0.5, 0.0])), _DT)
     late = control.ss(control.tf([1.0], [1.0] + [0.0] * delay_samples, _DT))
-    return UncertainPlant("arm", arm * late if delay_samples else arm)
+    return UncertainPlant(arm * late if delay_samples else arm, name="arm")
 
 
 def _asked(**change) -> Specification:

@@ -45,7 +45,9 @@ def _controller(a: float, b: float, c: float, d: float, delay: int = 1) -> Contr
 
 def _arm(relative_std: float = 0.05, integrators: int = 1) -> UncertainPlant:
     system = hub_arm(integrators=integrators)
-    return UncertainPlant("arm", system, RationalDisc(system, integrators, relative_std, 60.0))
+    return UncertainPlant(
+        system, name="arm", uncertainty=RationalDisc(system, integrators, relative_std, 60.0)
+    )
 
 
 def _sampled(controller: Controller, plant: UncertainPlant, spec: Specification, n: int) -> dict[str, float]:
@@ -102,7 +104,9 @@ def test_damping_of_the_mode_is_bounded_for_both_channels(separate):
     tip = tip_acceleration()
     performance = PlantChannel(tip, RationalDisc(tip, 0, 0.03, 60.0)) if separate else None
     system = hub_arm()
-    plant = UncertainPlant("arm", system, RationalDisc(system, 1, 0.05, 60.0), performance=performance)
+    plant = UncertainPlant(
+        system, name="arm", uncertainty=RationalDisc(system, 1, 0.05, 60.0), performance=performance
+    )
     spec = Specification(modulus_margin=0.4, mode_peak_ratio=0.5)
     controller = _controller(0.0, 0.0, 0.0, 1.0)
     certificate = certify(controller, [plant], spec)
@@ -138,7 +142,7 @@ def test_posterior_loops_never_exceed_their_bounds(seed, unstable):
     rng = np.random.default_rng(seed)
     posterior = _random_posterior(rng, unstable)
     system = random_stable(rng, 2, _DT)  # poles of the loop for the count: any stable system will do
-    plant = UncertainPlant("posterior", system, posterior)
+    plant = UncertainPlant(system, name="posterior", uncertainty=posterior)
     raw = Controller([[0.9]], [[1.0]], [[rng.standard_normal()]], [[3 * rng.standard_normal()]], _DT)
     omega = np.geomspace(1e-2, plant.nyquist_rad_s, 3000)
     # Largest loop gain of any member below 1: stable, and the worst case anywhere from far to near -1.
@@ -179,7 +183,7 @@ def test_a_resonance_the_grid_does_not_know_is_found_by_the_bounds():
             return centre, stacked([*columns, needle, needle.scaled(1j)])
 
     system = hub_arm()
-    plant = UncertainPlant("arm", system, Needle(system, 1, 0.02, 60.0))
+    plant = UncertainPlant(system, name="arm", uncertainty=Needle(system, 1, 0.02, 60.0))
     controller = _controller(0.0, 0.0, 0.0, 0.3)
     certificate = certify(controller, [plant], Specification(modulus_margin=0.3))
     assert certificate.plants[0].worst_margins.modulus > 0.3
@@ -196,9 +200,9 @@ def test_what_cannot_be_bounded_says_so_and_stands_on_the_grid():
     system = hub_arm()
     spec = Specification(modulus_margin=0.3)
     controller = _controller(0.0, 0.0, 0.0, 0.3)
-    unknown = UncertainPlant("unknown", system, RelativeDisc(system, 0.02, 60.0))
+    unknown = UncertainPlant(system, name="unknown", uncertainty=RelativeDisc(system, 0.02, 60.0))
     own = np.geomspace(0.5, 200.0, 400)
-    measured = UncertainPlant("frf", system, RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
+    measured = UncertainPlant(system, name="frf", uncertainty=RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
     certificate = certify(controller, [unknown, measured], spec, between_own_points="nothing")
     assert certificate.certified
     assert certificate.gamma_bound is None
@@ -220,7 +224,7 @@ def test_an_expansion_that_is_not_that_of_the_ellipses_is_refused(of_centre, of_
             return centre.scaled(of_centre), generators.scaled(of_generators)
 
     system = hub_arm()
-    plant = UncertainPlant("wrong", system, Wrong(system, 1, 0.02, 60.0))
+    plant = UncertainPlant(system, name="wrong", uncertainty=Wrong(system, 1, 0.02, 60.0))
     certificate = certify(_controller(0.0, 0.0, 0.0, 0.3), [plant], Specification(modulus_margin=0.3))
     proof = certificate.plants[0].all_frequencies
     assert not proof.possible
@@ -230,7 +234,7 @@ def test_an_expansion_that_is_not_that_of_the_ellipses_is_refused(of_centre, of_
 
 def test_exact_plants_are_bounded_and_unstable_loops_are_refuted():
     system = hub_arm()
-    plant, spec = UncertainPlant("exact", system), Specification(modulus_margin=0.3)
+    plant, spec = UncertainPlant(system, name="exact"), Specification(modulus_margin=0.3)
     certificate = certify(_controller(0.0, 0.0, 0.0, 0.3), [plant], spec)
     assert certificate.plants[0].all_frequencies.proved
     sensitivity = control.feedback(1, control.series(system, control.ss(0, 1, 0.3, 0, _DT)))

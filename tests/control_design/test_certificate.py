@@ -54,9 +54,9 @@ def test_worst_sensitivity_bounds_every_sampled_plant_and_is_reached():
 
 def test_every_requirement_is_listed_with_its_number():
     plant = UncertainPlant(
-        "arm",
         hub_arm(),
-        RelativeDisc(hub_arm(), 0.02, 60.0),
+        name="arm",
+        uncertainty=RelativeDisc(hub_arm(), 0.02, 60.0),
         performance=PlantChannel(tip_acceleration(), RelativeDisc(tip_acceleration(), 0.02, 60.0)),
     )
     spec = Specification(
@@ -111,20 +111,22 @@ def damping_of_a_mode(asked_ratio):
 def test_uncertainty_on_its_own_grid_is_named():
     own = np.geomspace(0.5, 200.0, 800)
     record: ResponseRecord = RelativeDisc(hub_arm(), 0.02, 60.0).at(own, 0.95)
-    certificate = certify(gain(0.3), [UncertainPlant("frf", hub_arm(), record)], Specification())
+    certificate = certify(
+        gain(0.3), [UncertainPlant(hub_arm(), name="frf", uncertainty=record)], Specification()
+    )
     assert certificate.plants[0].own_grid_rad_s == (0.5, 200.0)
     assert certificate.certified
 
 
 def test_no_uncertainty_is_said_and_mismatches_are_refused():
-    bare = UncertainPlant("bare", hub_arm())
+    bare = UncertainPlant(hub_arm(), name="bare")
     certificate = certify(gain(0.3), [bare], Specification())
     assert not certificate.plants[0].stated
     with pytest.raises(ValueError, match="0 samples of computational delay"):
         certify(gain(0.3, delay=0), [bare], Specification())
     with pytest.raises(ValueError, match="at least one plant"):
         certify(gain(0.3), [], Specification())
-    slow = UncertainPlant("slow", hub_arm(0.01))
+    slow = UncertainPlant(hub_arm(0.01), name="slow")
     with pytest.raises(ValueError, match="differ in dt_s"):
         certify(gain(0.3), [slow], Specification())
 

@@ -136,7 +136,7 @@ def test_weights_as_rational_functions_are_those_of_the_specification(integrator
         # a zero of the weight at 2/dt, which s = (2/dt) (z - 1)/(z + 1) sends to infinity
         Specification(sensitivity_weight=RationalWeight(numerator=(-0.5, 200.0), denominator=(1.0, 0.1))),
     ]
-    plant = UncertainPlant("any", control.ss(1.0 if integrators else 0.5, 1, 1, 0, _DT))
+    plant = UncertainPlant(control.ss(1.0 if integrators else 0.5, 1, 1, 0, _DT), name="any")
     for specification in specifications:
         weight = specification.tracking_weight(plant)
         tracking = RationalResponse.from_weight(weight, _DT)

@@ -81,7 +81,7 @@ def test_certificate_uses_the_calibrated_level_and_says_so():
 def test_performance_channel_and_several_plants_are_drawn_together():
     system, tip = hub_arm(), tip_acceleration()
     measured, performed = (GaussianGain(g, n, 0.05) for g, n in ((system, 1), (tip, 0)))
-    arm = UncertainPlant("arm", system, measured, performance=PlantChannel(tip, performed))
+    arm = UncertainPlant(system, name="arm", uncertainty=measured, performance=PlantChannel(tip, performed))
     spec = Specification(modulus_margin=0.3, mode_peak_ratio=0.9)
     controller = gain(0.3)
     one = joint_coverage(controller, [arm], spec, rng=np.random.default_rng(3), draws=3000)
@@ -89,7 +89,7 @@ def test_performance_channel_and_several_plants_are_drawn_together():
     # binomial, both sides: 0.56 %; four of it
     assert np.mean(fresh <= one.gamma) == pytest.approx(0.95, abs=0.023)
     # The damping weight rules: gamma is W4 |Gp| |S| at the peak, Gp drawn apart from G.
-    exact = UncertainPlant("exact", system, performance=PlantChannel(tip))
+    exact = UncertainPlant(system, name="exact", performance=PlantChannel(tip))
     centre, *_ = SampledLoop(controller, exact, spec).gamma(np.random.default_rng(0), 1)
     assert one.gamma > centre[0]
     # Twice the same plant, drawn independently: P(max <= q) = P(gamma <= q)^2, so the quantile moves up.
@@ -120,7 +120,7 @@ class GaussianGain:
 def test_what_cannot_be_drawn_from_is_refused():
     rng = np.random.default_rng(0)
     measured = RelativeDisc(hub_arm(), 0.02, 60.0).at(np.geomspace(0.5, 200.0, 200), 0.95)
-    plant = UncertainPlant("frf", hub_arm(), measured)
+    plant = UncertainPlant(hub_arm(), name="frf", uncertainty=measured)
     lag = uncertain_lag(0.1)
     with pytest.raises(ValueError, match="needs posterior samples"):
         joint_coverage(gain(0.3), [plant], Specification(), rng=rng)

@@ -38,7 +38,7 @@ def test_winding_of_random_loops_is_that_of_their_poles():
     seen = set()
     for _ in range(40):
         plant = control_design.UncertainPlant(
-            "random", random_stable(rng, 4, _DT) * 10 ** rng.uniform(-1.5, 0.5)
+            random_stable(rng, 4, _DT) * 10 ** rng.uniform(-1.5, 0.5), name="random"
         )
         grid = checked_grid(plant, plant.modes, 1200, 400)
         stable, _ = winds(frequency_response(plant.nominal, grid)[None], integrators=0, unstable_poles=0)
@@ -49,7 +49,7 @@ def test_winding_of_random_loops_is_that_of_their_poles():
 
 
 def test_a_guard_is_kept_stable_and_costs_no_weight():
-    plant = control_design.UncertainPlant("lag", _lag())
+    plant = control_design.UncertainPlant(_lag(), name="lag")
     free = control_design.synthesise([plant], _FAST, _QUICK, rng=np.random.default_rng(1))
     # The gain at which the free design is just unstable, by bisection on its poles.
     low, high = 1.0, 100.0

@@ -31,7 +31,7 @@ def _response(system: control.StateSpace, omega_rad_s: Any) -> Any:
 
 def _certified(system: control.StateSpace, gain: float, *, delay: int = 0, relative: float = 0.0) -> Any:
     discs = RationalWeight(numerator=(relative or 1.0,), denominator=(1.0,))
-    plant = UncertainPlant("plant", system, StatedDiscs(system, discs) if relative else None)
+    plant = UncertainPlant(system, name="plant", uncertainty=StatedDiscs(system, discs) if relative else None)
     controller = Controller.proportional(gain, system.dt, computational_delay_samples=delay)
     spec = Specification(modulus_margin=0.1, computational_delay_samples=delay)
     return certify(controller, [plant], spec, n_dense=1500)
@@ -91,7 +91,7 @@ def test_a_narrow_resonance_of_the_controller_is_seen_between_measured_points():
     system = _system([], [0.9], 0.05)
     response = np.ravel(control.frequency_response(system, own).complex)
     measured = ResponseRecord(own, response, 1e-8 * np.ones((60, 1, 1)) * np.eye(2), 0.95)
-    plant = UncertainPlant("measured", system, measured)
+    plant = UncertainPlant(system, name="measured", uncertainty=measured)
     pole = (1 - 2e-7) * np.exp(1j * _DT * 0.5 * (own[20] + own[21]))
     spec = Specification(modulus_margin=0.3, computational_delay_samples=0)
     peaks = []
@@ -129,7 +129,7 @@ def test_units_of_time_input_and_output_do_not_matter(time, input_unit, output_u
         base = _system([0.2], [0.995, 0.97 * np.exp(0.3j), 0.97 * np.exp(-0.3j)], 0.002, _DT * t)
         system = control.ss(base.A, base.B / u, base.C * y, 0, _DT * t)
         discs = RationalWeight(numerator=(0.1,), denominator=(1.0,))
-        plant = UncertainPlant("plant", system, StatedDiscs(system, discs))
+        plant = UncertainPlant(system, name="plant", uncertainty=StatedDiscs(system, discs))
         k = _system([0.99], [1.0], 1.2 * u / y, _DT * t)
         spec = Specification(
             modulus_margin=0.3, bandwidth_rad_s=0.2 / t, effort_limit=5.0 * u / y, integrator=True,
@@ -167,7 +167,7 @@ def test_units_do_not_matter_to_a_design():
             modulus_margin=0.4, bandwidth_rad_s=0.5 / t, effort_limit=5.0 / g, integrator=True,
             controller_order=3,
         )  # fmt: skip
-        plant = UncertainPlant("plant", system, StatedDiscs(system, discs))
+        plant = UncertainPlant(system, name="plant", uncertainty=StatedDiscs(system, discs))
         return synthesise([plant], spec, options, rng=np.random.default_rng(3)).gamma
 
     in_other_units = [gamma(1e6, 1e-6), gamma(1e-6, 1e6)]

@@ -77,7 +77,9 @@ def test_it_is_designed_for_checked_and_proved_between_grid_points():
 
 
 def test_slopes_and_curvature_of_its_rows_are_derivatives():
-    plant = UncertainPlant("tip", tip_acceleration(), RelativeDisc(tip_acceleration(), 0.03, 60.0))
+    plant = UncertainPlant(
+        tip_acceleration(), name="tip", uncertainty=RelativeDisc(tip_acceleration(), 0.03, 60.0)
+    )
     problem = Problem((plant,), Specification(controller_order=2), SynthesisOptions())
     cascade = Cascade(("second_order",), problem.dt_s, problem.scale_rad_s)
     x = np.array([0.03, 0.04, 0.05, 0.3, 0.4])

@@ -40,7 +40,7 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
     """One design with the peak halved lies below all three published points: damping 0.05 and more at less
     than the cost published for 0.015."""
     link = flexible_link("A")
-    plant = control_design.UncertainPlant("link without ellipses", link.nominal)
+    plant = control_design.UncertainPlant(link.nominal, name="link without ellipses")
     specification = flexible_link_specification(6).model_copy(update={"mode_peak_ratio": 0.5})
     result = control_design.synthesise(
         [plant], specification, control_design.SynthesisOptions(starts=2), rng=np.random.default_rng(1)

@@ -24,7 +24,7 @@ _MODEL = RationalWeight(numerator=(1.0,), denominator=(0.25, 1.0, 1.0))
 
 def _hub_loop(relative_std=0.05):
     nominal = hub_arm()
-    plant = UncertainPlant("hub", nominal, RelativeDisc(nominal, relative_std, 30.0))
+    plant = UncertainPlant(nominal, name="hub", uncertainty=RelativeDisc(nominal, relative_std, 30.0))
     return Controller.proportional(0.05, 0.005), plant
 
 
@@ -50,7 +50,7 @@ def test_worst_error_is_the_maximum_over_the_boundary(seed):
 def test_constant_filter_of_an_exact_plant_agrees_with_a_scan():
     # Gain 9 on 0.05 z/(z - 0.95): T = 0.45 z/(1.45 z - 0.95).
     dt = 0.01
-    plant = UncertainPlant("lag", control.ss(control.tf([0.05, 0], [1, -0.95], dt)))
+    plant = UncertainPlant(control.ss(control.tf([0.05, 0], [1, -0.95], dt)), name="lag")
     controller = Controller.proportional(9.0, dt, computational_delay_samples=0)
     model = RationalWeight(numerator=(1.0,), denominator=(1 / 40, 1.0))
     got = design_reference_filter(

@@ -28,12 +28,12 @@ def _gain(problem: Problem, gain: float) -> tuple[Cascade, np.ndarray]:
 
 
 def test_a_good_loop_has_nothing_to_name():
-    problem = _problem([UncertainPlant("lag", _LAG, RelativeDisc(_LAG, 0.1, 60.0))])
+    problem = _problem([UncertainPlant(_LAG, name="lag", uncertainty=RelativeDisc(_LAG, 0.1, 60.0))])
     assert what_destabilises(problem, *_gain(problem, 1.0)) == ()
 
 
 def test_an_unstable_nominal_loop_is_named_by_its_fastest_growing_pole():
-    problem = _problem([UncertainPlant("lag", _LAG), UncertainPlant("double", 2 * _LAG)])
+    problem = _problem([UncertainPlant(_LAG, name="lag"), UncertainPlant(2 * _LAG, name="double")])
     # z = a - k b with a = e^-0.01, b = 1 - a: k = 210 puts one pole at -1.1 for "lag", at -3.2 for "double"
     found = what_destabilises(problem, *_gain(problem, 210.0))
     assert [(point.plant, point.weight) for point in found] == [("double", NOMINAL), ("lag", NOMINAL)]
@@ -43,7 +43,7 @@ def test_an_unstable_nominal_loop_is_named_by_its_fastest_growing_pole():
 
 def test_an_ellipse_over_minus_one_is_named_where_it_lies_deepest():
     """A disc of relative radius r reaches -1 where r |T| >= 1; T of lag and gain falls with frequency."""
-    plant = UncertainPlant("vague", _LAG, RelativeDisc(_LAG, 0.5, 1e6))  # r = 0.5 * 2.448
+    plant = UncertainPlant(_LAG, name="vague", uncertainty=RelativeDisc(_LAG, 0.5, 1e6))  # r = 0.5 * 2.448
     problem = _problem([plant])
     found = what_destabilises(problem, *_gain(problem, 20.0))
     assert {point.weight for point in found} == {ROBUST}
@@ -54,7 +54,7 @@ def test_an_ellipse_over_minus_one_is_named_where_it_lies_deepest():
 
 def test_the_delay_that_destabilises_is_named_beyond_a_loop_that_is_stable_without_it():
     """|L| = 1 near 20 rad/s with a phase margin of about pi/2: 0.08 s. Asked: ten times that."""
-    plant = UncertainPlant("lag", _LAG, RelativeDisc(_LAG, 0.2, 1e6))
+    plant = UncertainPlant(_LAG, name="lag", uncertainty=RelativeDisc(_LAG, 0.2, 1e6))
     problem = _problem([plant], delay_margin_s=0.8)
     found = what_destabilises(problem, *_gain(problem, 20.0))
     assert {point.weight for point in found} == {DELAYED}
@@ -65,7 +65,7 @@ def test_a_controller_that_rings_is_named_by_its_own_pair():
     specification = Specification(
         controller_order=2, controller_damping=0.5, computational_delay_samples=0, modulus_margin=0.3
     )
-    problem = Problem((UncertainPlant("lag", _LAG),), specification, SynthesisOptions(dense_points=1000))
+    problem = Problem((UncertainPlant(_LAG, name="lag"),), specification, SynthesisOptions(dense_points=1000))
     cascade = Cascade(("second_order",), problem.dt_s, problem.scale_rad_s)
     corner, damping = 3.0, 0.1
     pair = [np.log(2 * damping * corner), 2 * np.log(corner)]

@@ -11,7 +11,7 @@ from .plants import hub_arm, tip_acceleration
 
 
 def test_bandwidth_means_minus_three_decibels():
-    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 0.001))
+    lag = UncertainPlant(control.ss(0.9, 0.1, 1, 0, 0.001), name="lag")
     for integrator in (False, True):
         spec = Specification(bandwidth_rad_s=3.0, modulus_margin=0.5, integrator=integrator)
         # At s = j bandwidth the weight is sqrt 2 up to the tiny low-frequency floor.
@@ -25,7 +25,7 @@ def test_bandwidth_means_minus_three_decibels():
 
 def test_effort_limit_and_rolloff():
     spec = Specification(effort_limit=4.0, effort_rolloff_rad_s=10.0)
-    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 1e-5))
+    lag = UncertainPlant(control.ss(0.9, 0.1, 1, 0, 1e-5), name="lag")
     omega = np.array([0.01, 10.0, 100.0])
     limit = 1 / spec.magnitude(lag, omega, LoopFunction.EFFORT)
     np.testing.assert_allclose(limit, [4, 4 / np.sqrt(2), 4 / np.sqrt(101)], rtol=0.05)
@@ -33,7 +33,7 @@ def test_effort_limit_and_rolloff():
 
 
 def test_damping_weight_is_relative_to_the_open_loop_peak():
-    plant = UncertainPlant("arm", hub_arm())
+    plant = UncertainPlant(hub_arm(), name="arm")
     spec = Specification(mode_peak_ratio=0.25)
     weight = spec.magnitude(plant, np.array([5.0, 16.0, 100.0]), LoopFunction.DISTURBANCE)
     omega = np.linspace(16 / 1.5, 24, 20_001)
@@ -68,15 +68,15 @@ def test_bandwidth_beyond_the_right_half_plane_zero_says_by_how_much():
 )
 def test_contradictions_with_the_plant(fields, message):
     with pytest.raises(SpecificationError, match=message) as caught:
-        Specification(**fields).check_against([UncertainPlant("arm", hub_arm())])
+        Specification(**fields).check_against([UncertainPlant(hub_arm(), name="arm")])
     assert "\n" not in str(caught.value)
 
 
 def test_integrator_against_a_zero_at_one_and_damping_without_mode():
-    plant = UncertainPlant("acceleration", tip_acceleration())
+    plant = UncertainPlant(tip_acceleration(), name="acceleration")
     with pytest.raises(SpecificationError, match="zero at z = 1"):
         Specification(integrator=True).check_against([plant])
-    lag = UncertainPlant("lag", control.ss(0.9, 0.1, 1, 0, 0.01))
+    lag = UncertainPlant(control.ss(0.9, 0.1, 1, 0, 0.01), name="lag")
     with pytest.raises(SpecificationError, match="no lightly damped mode"):
         Specification(mode_peak_ratio=0.5).check_against([lag])
     with pytest.raises(SpecificationError, match="no plant"):
@@ -124,7 +124,7 @@ def test_weights_are_the_formulas_of_their_words(slow_poles):
         bandwidth_rad_s=3.0, integrator=True, modulus_margin=0.4, effort_limit=5.0, effort_rolloff_rad_s=40.0
     )
     poles = np.exp(-0.05 * np.array([*slow_poles, 100.0]))
-    plant = UncertainPlant("arm", control.ss(control.zpk([], poles, 1.0, 0.05)))
+    plant = UncertainPlant(control.ss(control.zpk([], poles, 1.0, 0.05)), name="arm")
     corner = 3.0 * np.sqrt(2 - 0.4**2)
     expected = (0.4 * s + corner) / s
     for pole in slow_poles:  # 7 rad/s lies above a fifth of the corner

@@ -44,7 +44,7 @@ def test_nyquist_count_and_poles_agree_over_random_loops():
         if trial % 7 == 0:  # integrator in the controller
             k = control.series(k, control.ss(1, dt, 1, 1, dt))
         k = k * float(10 ** rng.uniform(-3, 0.5) * rng.choice([-1, 1]))
-        plant, controller = UncertainPlant("random", g), _controller(k, trial % 2)
+        plant, controller = UncertainPlant(g, name="random"), _controller(k, trial % 2)
         radius = np.max(np.abs(closed_loop_poles(controller, plant)))
         if abs(radius - 1) < 1e-6:
             continue
@@ -119,7 +119,7 @@ _DT = 0.005
 def _link(*modes: tuple[float, float]) -> UncertainPlant:
     """Sum of modes (rad/s, damping ratio) of unit static gain, each."""
     parts = [control.tf([w * w], [1.0, 2 * zeta * w, w * w]) for w, zeta in modes]
-    return UncertainPlant("link", control.ss(sum(parts[1:], parts[0])).sample(_DT))
+    return UncertainPlant(control.ss(sum(parts[1:], parts[0])).sample(_DT), name="link")
 
 
 def _lead(gain: float, corner: float = 400.0, delay: int = 0) -> Controller:

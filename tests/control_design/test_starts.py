@@ -30,7 +30,9 @@ def reaction_arm() -> control.StateSpace:
 
 
 def _plant(relative_std: float = 0.02) -> UncertainPlant:
-    return UncertainPlant("reaction arm", reaction_arm(), RelativeDisc(reaction_arm(), relative_std, 200.0))
+    return UncertainPlant(
+        reaction_arm(), name="reaction arm", uncertainty=RelativeDisc(reaction_arm(), relative_std, 200.0)
+    )
 
 
 def _damping(order: int, ratio: float = 0.3) -> Specification:

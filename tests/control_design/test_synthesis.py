@@ -72,7 +72,7 @@ def test_same_seed_same_controller():
 def integrating_arm(integrators):
     """Plant, result and certificate of an arm that integrates, under integral action."""
     system = hub_arm(integrators=integrators)
-    plant = UncertainPlant("arm", system, RelativeDisc(system, 0.03, 60.0))
+    plant = UncertainPlant(system, name="arm", uncertainty=RelativeDisc(system, 0.03, 60.0))
     specification = Specification(
         bandwidth_rad_s=2.0, integrator=True, modulus_margin=0.45, effort_limit=60.0,
         effort_rolloff_rad_s=100.0, controller_order=5, input_limit=10.0,
@@ -117,7 +117,10 @@ def test_active_damping_through_the_tip_without_tracking():
 
 def test_two_plants_are_met_by_one_controller():
     heavy = hub_arm() * 0.6
-    plants = [uncertain_hub(0.03), UncertainPlant("heavy", heavy, RelativeDisc(heavy, 0.03, 60.0))]
+    plants = [
+        uncertain_hub(0.03),
+        UncertainPlant(heavy, name="heavy", uncertainty=RelativeDisc(heavy, 0.03, 60.0)),
+    ]
     specification = Specification(bandwidth_rad_s=2.0, effort_limit=60.0, controller_order=3)
     _, certificate = _certified(plants, specification, _QUICK, 4)
     assert certificate.certified
@@ -150,7 +153,7 @@ def test_without_a_stable_design_the_unstable_pole_is_named():
     system = control.ss(control.zpk([1.02], [1.05, 0.5], 1.0, dt=0.01))
     specification = Specification(modulus_margin=0.3, controller_order=2)
     result = synthesise(
-        [UncertainPlant("unruly", system)], specification, _FRUITLESS, rng=np.random.default_rng(1)
+        [UncertainPlant(system, name="unruly")], specification, _FRUITLESS, rng=np.random.default_rng(1)
     )
     assert result.outcome is Outcome.NOT_CONVERGED
     first = result.blocking[0]
@@ -206,7 +209,7 @@ def test_a_controller_has_no_resonance_between_the_points_of_a_measured_response
     """Sixty points from .5 to 200 rad/s are 10 % apart: what is narrower than half of that lies between."""
     system = hub_arm()
     own = np.geomspace(0.5, 200.0, 60)
-    measured = UncertainPlant("frf", system, RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
+    measured = UncertainPlant(system, name="frf", uncertainty=RelativeDisc(system, 0.02, 60.0).at(own, 0.95))
     wish = Specification(modulus_margin=0.4, bandwidth_rad_s=2.0, controller_order=4)
     quick = SynthesisOptions(
         starts=1, sufficient_gamma=0.0, grid_points=60, mode_points=30, exchange_rounds=1, dense_points=800
@@ -226,7 +229,7 @@ def _plant(numerator: Any, denominator: Any, dt_s: float, delay: int = 0) -> Unc
     if delay:
         system = control.series(system, control.ss(control.tf([1], [1] + [0] * delay, dt_s)))
     five_percent = RationalWeight(numerator=(0.05,), denominator=(1.0,))
-    return UncertainPlant("unstable", system, StatedDiscs(system, five_percent))
+    return UncertainPlant(system, name="unstable", uncertainty=StatedDiscs(system, five_percent))
 
 
 @pytest.mark.parametrize(

@@ -38,7 +38,7 @@ class UntoldBelow:
 def axis(below_rad_s: float) -> UncertainPlant:
     """1 / (s + 1), told from a frequency on."""
     system = control.ss(control.tf([1.0], [1.0, 1.0]).sample(DT_S))
-    return UncertainPlant("axis", system, UntoldBelow(system, below_rad_s))
+    return UncertainPlant(system, name="axis", uncertainty=UntoldBelow(system, below_rad_s))
 
 
 ASKED = Specification(bandwidth_rad_s=5.0, lowest_bandwidth_rad_s=0.1, integrator=True)

@@ -20,7 +20,7 @@ def test_an_identified_model_with_integrator_and_its_posterior_are_an_uncertain_
     mean = np.array([0.002, 1e-4, 2e-4])
     model = GobfModel(poles, mean, dt, integrators=1)
     posterior = ResponsePosterior(poles, mean, 0.02 * np.diag(mean), dt, integrators=1)
-    plant = control_design.UncertainPlant("identified", model.to_control(), posterior)
+    plant = control_design.UncertainPlant(model.to_control(), name="identified", uncertainty=posterior)
     assert plant.n_integrators == 1
     omega = np.geomspace(1e-3, np.pi / dt, 50)
     ellipses = plant.at(omega)
@@ -39,13 +39,15 @@ def test_dense_grids_see_the_peak_of_a_mode_that_only_the_ellipses_have(zeta):
     pair = np.exp(omega * dt * (-zeta + 1j * np.sqrt(1 - zeta**2)))
     mean = np.array([0.01, 1e-3 * np.sqrt(zeta), 0.0])
     seen = ResponsePosterior(Poles(np.array([0.96]), np.array([pair])), mean, 0.02 * np.diag(mean), dt)
-    lag = control_design.UncertainPlant("lag", control.ss([[0.96]], [[1.0]], [[0.01]], 0, dt), seen)
+    lag = control_design.UncertainPlant(
+        control.ss([[0.96]], [[1.0]], [[0.01]], 0, dt), name="lag", uncertainty=seen
+    )
     fine = omega * (1 + 5 * zeta * np.linspace(-1, 1, 4001))
     for grid in (programme_grid(lag, (), GridOptions(), dense=True), checked_grid(lag, (), 1000, 100)):
         near = grid[np.abs(grid / omega - 1) < 5 * zeta]
         # Of 20 points by sinh over 20 half bandwidths one is within .2 of the peak: 2 % lower.
         assert np.max(np.abs(lag.at(near).centre)) > 0.98 * np.max(np.abs(lag.at(fine).centre))
-    bare = control_design.UncertainPlant("lag", lag.nominal)
+    bare = control_design.UncertainPlant(lag.nominal, name="lag")
     sizes = [programme_grid(p, (), GridOptions(), dense=d).size for d in (False, True) for p in (lag, bare)]
     assert (sizes[0] - sizes[1], sizes[2] > sizes[3]) == (0, zeta < 0.001)
 

@@ -23,7 +23,7 @@ def _spec(**changes):
 
 
 def _plant(numerator, denominator, **more):
-    return UncertainPlant("small", control.ss(control.tf(numerator, denominator, _DT_S)), **more)
+    return UncertainPlant(control.ss(control.tf(numerator, denominator, _DT_S)), name="small", **more)
 
 
 @pytest.mark.parametrize("integrators", [1, 2])
@@ -87,7 +87,7 @@ def test_gain_margin_bound_of_relative_discs():
     for radius, possible in ((0.7 / a, True), (1.1 / a, False)):
         system = control.ss(control.tf([1.0], [1.0, -a], _DT_S))
         quantile = np.sqrt(-2 * np.log(0.05))
-        plant = UncertainPlant("discs", system, RelativeDisc(system, radius / quantile, 1e9))
+        plant = UncertainPlant(system, name="discs", uncertainty=RelativeDisc(system, radius / quantile, 1e9))
         spec = Specification(effort_limit=1e3, modulus_margin=0.01, computational_delay_samples=0)
         bracket = youla_bracket(plant, spec, _SMALL)
         assert np.isfinite(bracket.enclosing) == possible, radius
@@ -95,7 +95,7 @@ def test_gain_margin_bound_of_relative_discs():
 
 def test_integrating_plant_with_delay_is_ordered_and_finite():
     plant = hub_arm()
-    arm = UncertainPlant("hub", plant, RelativeDisc(plant, 0.02, 30.0))
+    arm = UncertainPlant(plant, name="hub", uncertainty=RelativeDisc(plant, 0.02, 30.0))
     spec = Specification(bandwidth_rad_s=3.0, effort_limit=20.0, modulus_margin=0.4)
     bracket = youla_bracket(arm, spec, _SMALL.model_copy(update={"real_poles": 10, "grid_points": 80}))
     assert bracket.inscribed <= bracket.ellipse <= bracket.enclosing < 2.0
@@ -124,7 +124,7 @@ def test_the_bound_of_an_unstable_plant_is_at_most_what_a_low_order_reaches(
     )
     spec = Specification(bandwidth_rad_s=asked[0], modulus_margin=asked[1])
     options = YoulaOptions(grid_points=120, dense_points=2000)
-    found = youla_bracket(UncertainPlant("unstable", system, discs), spec, options)
+    found = youla_bracket(UncertainPlant(system, name="unstable", uncertainty=discs), spec, options)
     assert 0.9 * reached < found.floor <= 1.001 * reached
 
 

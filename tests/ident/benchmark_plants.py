@@ -44,7 +44,7 @@ def run(system, u):
 
 
 def as_record(u, y, name="test", dt_s=DT_S):
-    return Record(name, u[:, None], y[:, None], dt_s, ("u",), ("y",))
+    return Record(u[:, None], y[:, None], dt_s, name=name)
 
 
 def _truth(system, u, snr_db, rng, name):

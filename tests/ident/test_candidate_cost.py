@@ -20,7 +20,9 @@ def several_records(n_inputs):
     rng = np.random.default_rng(0)
     names = tuple("abc"[:n_inputs])
     return [
-        Record("r", rng.normal(size=(n, n_inputs)), 1 + rng.normal(size=(n, 1)), 0.005, names, ("y",))
+        Record(
+            rng.normal(size=(n, n_inputs)), 1 + rng.normal(size=(n, 1)), 0.005, name="r", input_names=names
+        )
         for n in (150, 90, 33)
     ]
 

@@ -29,9 +29,7 @@ def log(rng, noise=0.3, n=3000):
     closed = np.polyadd(A, GAIN * np.asarray(B))
     y = signal.lfilter(B, closed, r) + signal.lfilter(A, closed, e)
     u = r - GAIN * y
-    return Record(
-        "log", u[:, None], y[:, None], DT, ("u",), ("y",), reference=r[:, None], reference_names=("r",)
-    )
+    return Record(u[:, None], y[:, None], DT, name="log", reference=r[:, None])
 
 
 def test_two_stage_is_free_of_the_direct_method_s_bias():
@@ -92,7 +90,7 @@ def test_a_known_controller_tells_the_reference():
     for k in range(1, 500):
         y[k] = 0.9 * y[k - 1] + 0.05 * u[k - 1] + noise[k]
         u[k] = u[k - 1] + num[0] * (r[k] - y[k]) + num[1] * (r[k - 1] - y[k - 1])
-    record = Record("log", u[:, None], y[:, None], DT, ("u",), ("y",))
+    record = Record(u[:, None], y[:, None], DT, name="log")
     found = with_controller(record, num, den)
     np.testing.assert_allclose(found.reference[:, 0], np.convolve(r, num)[1:500], atol=1e-9)
     np.testing.assert_array_equal(found.input, record.input[1:])
@@ -143,6 +141,6 @@ def test_ellipses_hold_the_plant_in_a_loop_with_noise(kind):
 
 def test_records_without_reference_are_refused():
     record = log(np.random.default_rng(4), n=100)
-    bare = Record("b", record.input, record.output, DT, ("u",), ("y",))
+    bare = Record(record.input, record.output, DT, name="b")
     with pytest.raises(ValueError, match=r"'b'.*reference"):
         two_stage([bare], OPTIONS)

@@ -40,7 +40,16 @@ def log(seed: int, noise: float, colour: float, moves=(1.0, 1.0), samples: int =
         y[t] = PLANT.C @ x + v[t]
         u[t] = law.C @ k + law.D @ (r[t] - y[t])
         k, x = law.A @ k + law.B @ (r[t] - y[t]), PLANT.A @ x + PLANT.B @ u[t]
-    return Record(f"seed {seed}", u, y, DT_S, *NAMES, reference=r, reference_names=("r1", "r2"))
+    return Record(
+        u,
+        y,
+        DT_S,
+        name=f"seed {seed}",
+        input_names=NAMES[0],
+        output_names=NAMES[1],
+        reference=r,
+        reference_names=("r1", "r2"),
+    )
 
 
 def opened(item: Record) -> list[Record]:
@@ -88,7 +97,7 @@ def test_balls_hold_the_response_in_a_loop_but_not_around_a_direct_fit():
 @pytest.mark.slow
 def test_records_of_the_open_loop_stay_as_they_are():
     item = log(0, 0.03, 0.0, samples=1500)
-    free = Record("free", item.input, item.output, DT_S, *NAMES)
+    free = Record(item.input, item.output, DT_S, name="free", input_names=NAMES[0], output_names=NAMES[1])
     stages = two_stage_several([free, item], KNOWN)
     np.testing.assert_array_equal(stages.records[0].input, free.input)
     np.testing.assert_array_equal(stages.records[0].output, free.output)

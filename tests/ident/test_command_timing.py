@@ -56,7 +56,7 @@ def fast_log(rows, averaged=False, n=6000, seed=5):
     if averaged:
         u = np.convolve(u, np.full(rows, 1 / rows))[: u.size]
     every = slice(0, None, rows)
-    return Record("log", u[every, None], y[every, None], STEP_S, ("u",), ("y",))
+    return Record(u[every, None], y[every, None], STEP_S, name="log")
 
 
 @pytest.mark.parametrize(("rows", "averaged"), [(2, False), (5, False), (4, True)])
@@ -112,7 +112,7 @@ def test_every_row_is_used_of_a_command_that_repeats_and_was_made_by_no_law():
     """A held random command: of an experiment that may have been taken for a loop."""
     rng = np.random.default_rng(3)
     command = np.repeat(rng.standard_normal(300), 8)[:, None]
-    record = Record("held", command, np.cumsum(command, axis=0) * 1e-3, STEP_S, ("u",), ("y",))
+    record = Record(command, np.cumsum(command, axis=0) * 1e-3, STEP_S, name="held")
     timing = timing_of([record], in_loop=True)
     assert timing.source is TimingSource.REPEATS
     assert timing.known
@@ -147,9 +147,7 @@ def test_a_command_logged_several_times_is_used_at_the_rows_where_it_changes():
     fine = np.arange(rows * slow.n_samples) / rows
     output = np.interp(fine, np.arange(slow.n_samples), slow.output[:, 0])[:, None]
     reference = np.repeat(slow.reference, rows, axis=0)
-    log = Record(
-        "fast", command, output, 0.001 / rows, ("u",), ("y",), reference=reference, reference_names=("r",)
-    )
+    log = Record(command, output, 0.001 / rows, name="fast", reference=reference)
     log = log.slice(1, log.n_samples)
     timing = timing_of([log], in_loop=True)
     assert timing.source is TimingSource.REPEATS
@@ -177,14 +175,11 @@ def faster_log(rows, *, late=0, seed=11):
     slow = loop_log(*pid(), seed=seed)
     fine = np.arange(rows * slow.n_samples) / rows
     log = Record(
-        "fast",
         np.repeat(slow.input, rows, axis=0),
         np.interp(fine, np.arange(slow.n_samples), slow.output[:, 0])[:, None],
         0.001 / rows,
-        ("u",),
-        ("y",),
+        name="fast",
         reference=np.repeat(slow.reference, rows, axis=0),
-        reference_names=("r",),
     )
     return log.slice(late, log.n_samples)
 
@@ -309,10 +304,7 @@ def test_a_record_that_was_not_seen_is_used_from_the_row_at_which_its_command_ch
     rng = np.random.default_rng(first)
     seen = np.repeat(rng.standard_normal(200), 4)
     unseen = np.repeat(rng.standard_normal(200), 4)[(4 - first) % 4 :]
-    records = [
-        Record("log", u[:, None], np.cumsum(u)[:, None] * 1e-3, STEP_S, ("u",), ("y",))
-        for u in (seen, unseen)
-    ]
+    records = [Record(u[:, None], np.cumsum(u)[:, None] * 1e-3, STEP_S, name="log") for u in (seen, unseen)]
     timing = CommandTiming(
         TimingSource.REPEATS, STEP_S, period_s=4 * STEP_S, rows_per_command=4, first_row=(0,)
     )

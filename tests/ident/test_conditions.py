@@ -56,7 +56,7 @@ def records_of_two_plants(rng, n=600):
     for gain in (0.9, 1.0, 1.1, 1.2):
         u = rng.standard_normal(n)
         y = gain * signal.lfilter([0.0, 0.3], [1.0, -0.9], u) + 0.01 * rng.standard_normal(n)
-        records.append(Record(f"g{gain}", u[:, None], y[:, None], DT, ("u",), ("y",)))
+        records.append(Record(u[:, None], y[:, None], DT, name=f"g{gain}"))
     return records
 
 
@@ -84,14 +84,12 @@ def swept_repeats(rng):
     level = np.where(time < 600, 0.02, 0.2)
     return [
         Record(
-            f"{k}",
             u[:, None],
             (signal.lfilter([0.0, 0.3], [1.0, -0.9], u) + distorted + level * rng.standard_normal(1200))[
                 :, None
             ],
             DT,
-            ("u",),
-            ("y",),
+            name=f"{k}",
         )
         for k in range(3)
     ]

@@ -40,7 +40,7 @@ def measured(plant, delay, kind, seed, *, n=2000, noise=0.02, noise_pole=0.0, ra
     y = signal.lfilter(np.concatenate([np.zeros(delay), b.ravel()]), a, u)
     e = signal.lfilter([np.sqrt(1 - noise_pole**2)], [1, -noise_pole], rng.standard_normal(n))
     y = y + noise * y.std() * e
-    return Record(f"{plant} {delay}", u[:, None], y[:, None], DT, ("u",), ("y",))
+    return Record(u[:, None], y[:, None], DT, name=f"{plant} {delay}")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_a_fraction_of_a_sample_names_both_neighbours():
     a = np.exp(-38 * DT / over)
     y = signal.lfilter([0, 1 - a], [1, -a], fine)[::over]
     y = y + 0.01 * y.std() * rng.standard_normal(n)
-    found = identify([Record("fraction", u[:, None], y[:, None], DT, ("u",), ("y",))])
+    found = identify([Record(u[:, None], y[:, None], DT, name="fraction")])
     said = only(found.verdicts, FindingKind.DEAD_TIME)
     assert (said["delay"], said["partial"]) == (13, True)
     assert np.max(found.model.poles.real) == pytest.approx(np.exp(-38 * DT), abs=1e-3)
@@ -138,7 +138,7 @@ def test_a_stated_delay_is_kept_and_judged():
 
 def test_no_delay_is_sought_in_a_closed_loop():
     record = measured("first", 14, "prbs", 6)
-    looped = Record("loop", record.input, record.output, DT, ("u",), ("y",), record.input, ("r",))
+    looped = Record(record.input, record.output, DT, name="loop", reference=record.input)
     assert identify([looped]).model.input_delay_samples == 0
 
 
@@ -146,7 +146,7 @@ def test_poles_in_place_of_a_direct_term_are_told():
     rng = np.random.default_rng(7)
     u = excitation("prbs", 2000, rng)
     y = signal.lfilter([0.5, 0.1], [1, -0.9], u) + 0.02 * rng.standard_normal(2000)
-    record = Record("direct", u[:, None], y[:, None], DT, ("u",), ("y",))
+    record = Record(u[:, None], y[:, None], DT, name="direct")
     assert FindingKind.ANSWERS_AT_ONCE in kinds(identify([record]).warnings)
     with_it = identify([record], IdentOptions(feedthrough=True))
     assert with_it.model.order == 1

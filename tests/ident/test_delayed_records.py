@@ -43,11 +43,11 @@ def measured(kind, delay, offset, seed, *, n=1500, noise_pole=0.0, size=500.0):
     if kind != "integrator":
         y = y + offset * num.sum() / den.sum()
     u = move + (0 if kind == "integrator" else offset)
-    return Record("log", u[BEFORE:, None], y[BEFORE:, None], DT, ("u",), ("y",))
+    return Record(u[BEFORE:, None], y[BEFORE:, None], DT, name="log")
 
 
 def less(record, value):
-    return Record("log", record.input - value, record.output, DT, ("u",), ("y",))
+    return Record(record.input - value, record.output, DT, name="log")
 
 
 def truth(kind, delay):
@@ -136,7 +136,7 @@ def test_friction_leaves_the_rows_out_that_answer_to_no_recorded_input():
         speed = a * speed + (1 - a) * slip if abs(drive) > 0.5 or speed else 0.0
         y[k] = y[k - 1] + 0.01 * speed
     y += 1e-5 * rng.standard_normal(u.size)
-    record = Record("shaft", u[:, None], y[:, None], 0.01, ("u",), ("y",))
+    record = Record(u[:, None], y[:, None], 0.01, name="shaft")
     options = IdentOptions(integrators=1, input_delay_samples=delay, n_real=1, n_pairs=0)
     found = fit_friction([record], options)
     assert found.residual(record).size == u.size - delay

@@ -17,7 +17,7 @@ PLAN = ExperimentPlan(
 
 
 def record(u, y, name="r"):
-    return Record(name, u[:, None], y[:, None], DT, ("u",), ("y",))
+    return Record(u[:, None], y[:, None], DT, name=name)
 
 
 def records_of(rng, system, plan=PLAN):

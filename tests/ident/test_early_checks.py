@@ -45,7 +45,7 @@ def looped(seed=0, noise=1e-3, limit=np.inf, gain=0.5):
 def record(signals, **changed):
     signals = signals | changed
     of_loop = {"reference": signals["r"][:, None], "reference_names": ("r",)} if "r" in signals else {}
-    return Record("log", signals["u"][:, None], signals["y"][:, None], DT_S, ("u",), ("y",), **of_loop)
+    return Record(signals["u"][:, None], signals["y"][:, None], DT_S, name="log", **of_loop)
 
 
 def complaint(*records, loop=False, order=0):
@@ -217,9 +217,8 @@ def test_a_reference_that_was_logged_as_the_output_is_told_however_late(late, wh
     digits = [float(f"{value:.6g}") for value in output]
     command = rng.standard_normal(3000)
     record = Record(
-        "log", command[:, None], np.array(digits)[:, None], 0.002, ("u",), ("y",),
-        reference=reference[:, None], reference_names=("r",),
-    )  # fmt: skip
+        command[:, None], np.array(digits)[:, None], 0.002, name="log", reference=reference[:, None]
+    )
     assert f"'y' is the reference column 'r' again, {when}" in copied_column([record])
     # A servo that follows to a thousandth is none.
     near = replace(record, output=record.output * (1 + 1e-3 * rng.standard_normal((3000, 1))))

@@ -87,7 +87,11 @@ def test_a_damped_mode_that_nobody_asked_for_is_inside(hidden, measured):
         y = signal.lfilter(numerator, known, u) + size * unseen + 0.05 * rng.standard_normal(n)
         truth = np.polyval(numerator, z) / np.polyval(known, z) + size * z / np.polyval(unknown, z)
         model = GobfModel(Poles(np.zeros(0), np.array([slow])), np.zeros(2), DT)
-        ellipses = tangent([Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], model, order_given)
+        ellipses = tangent(
+            [Record(u[:, None], y[:, None], DT, name="")],
+            model,
+            order_given,
+        )
         hits.append(ellipses.at(omega).contains(truth))
     assert np.mean(hits) > measured - 0.03
 
@@ -103,7 +107,10 @@ def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
         y = signal.lfilter([0, 0.1], np.poly([pole, np.conj(pole)]).real, u)
         fast = np.argsort(np.argsort(np.abs(np.gradient(y)))) * 8 // n
         y = y * (1 + share * (fast >= 4)) + 0.01 * rng.standard_normal(n)
-        records, nothing = [Record("", u[:, None], y[:, None], DT, ("u",), ("y",))], np.zeros((n, 0))
+        records, nothing = (
+            [Record(u[:, None], y[:, None], DT, name="")],
+            np.zeros((n, 0)),
+        )
         beside = [Beside(nothing, nothing)]
         found = [tangent_beside(records, model, beside, classes=given).response for given in ([], [fast])]
         widths.append([np.median(one.at(OMEGA).ellipse(0.95).semi_major) for one in found])
@@ -205,7 +212,7 @@ def test_whole_path_equals_dense_formulas(structure):
         # A resonance that the two real poles cannot follow, so that the kernel has something to explain.
         late = [0.0] * delay + [0.0, 0.2]
         y = signal.lfilter(late, [1.0, -0.6, 0.4], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
-        records.append(Record("r", u, y, DT, ("u",), ("y",)))
+        records.append(Record(u, y, DT, name="r"))
     model = GobfModel(Poles(poles), np.zeros(2), DT, integrators=integrators, input_delay_samples=delay)
     options = EmbeddingOptions(fir_length=length, feedthrough=direct, prior_missed_mode=0.0)
 
@@ -241,7 +248,7 @@ def test_whole_path_equals_dense_formulas(structure):
 def test_initial_state_and_offset_do_not_disturb_the_estimate():
     arm = random_arm(np.random.default_rng(6), n_samples=3000)
     tail = arm.record.slice(700, 3000)
-    lifted = Record("tail", tail.input, tail.output + 5.0, DT, ("u",), ("y",))
+    lifted = Record(tail.input, tail.output + 5.0, DT, name="tail")
     model = arm.model()
     with_nuisance = tangent([lifted], model).at(OMEGA)
     without = tangent([lifted], model, EmbeddingOptions(estimate_initial_state=False, estimate_offset=False))
@@ -258,7 +265,7 @@ def test_bad_input_is_refused():
         tangent([arm.record], GobfModel(model.poles, np.zeros(8), 2 * DT))
     with pytest.raises(ValueError, match=r"400 .*fir_length"):
         tangent([arm.record], model, EmbeddingOptions(fir_length=400))
-    wide = Record("w", np.zeros((50, 2)), np.zeros((50, 1)), DT, ("a", "b"), ("y",))
+    wide = Record(np.zeros((50, 2)), np.zeros((50, 1)), DT, name="w", input_names=("a", "b"))
     with pytest.raises(ValueError, match=r"record 'w'.*'a', 'b'"):
         tangent([wide], model)
     short = tangent([arm.record], model)

@@ -150,7 +150,7 @@ def test_response_at_zero_and_nyquist_counts_once(plant):
 
 def test_control_design_takes_model_and_posterior(noisy):
     found = noisy[None]
-    uncertain = UncertainPlant("from a response", found.model.to_control(), found.posterior)
+    uncertain = UncertainPlant(found.model.to_control(), name="from a response", uncertainty=found.posterior)
     np.testing.assert_allclose(
         uncertain.at(OMEGA).centre, found.posterior.centre(OMEGA), rtol=1e-9, atol=1e-15
     )

@@ -53,14 +53,21 @@ def recorded(torque_Nm: float, seed: int, output: int = 0, *, independent: bool 
         else:
             measured = simulate(RIG, voltage, [parse_effect(effect) for effect in effects], rng=rng).output
         signals = voltage[:, None], measured[:, [output]]
-        records.append(Record(name, *signals, RIG.sampling.dt_s, ("voltage_V",), ("y",)))
+        records.append(Record(*signals, RIG.sampling.dt_s, name=name, input_names=("voltage_V",)))
     return records
 
 
 def rubbed(name: str, voltage: RealArray, effect: Effect, rng: np.random.Generator) -> Record:
     """Hub angle of the arm with one effect."""
     y = simulate(RIG, voltage, [effect], rng=rng).output[:, :1]
-    return Record(name, voltage[:, None], y, RIG.sampling.dt_s, ("voltage_V",), ("hub_angle_rad",))
+    return Record(
+        voltage[:, None],
+        y,
+        RIG.sampling.dt_s,
+        name=name,
+        input_names=("voltage_V",),
+        output_names=("hub_angle_rad",),
+    )
 
 
 def true_response(omega_rad_s: RealArray) -> ComplexArray:
@@ -113,7 +120,16 @@ def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
         u = multisine(lines, 1000, rms_V, rng, periods=2, draws=20)
         y = simulate(rig_of(source), u, parse_effects(source.effects), rng=rng).output
         y = quantised(y, source.encoder_step_rad)
-        records.append(Record(f"record {k}", u[:, None], y, 0.005, ("voltage_V",), OUTPUT_NAMES))
+        records.append(
+            Record(
+                u[:, None],
+                y,
+                0.005,
+                name=f"record {k}",
+                input_names=("voltage_V",),
+                output_names=OUTPUT_NAMES,
+            )
+        )
     options = OPTIONS.model_copy(update={"input_delay_samples": 1})
     found = dry.fit_friction([record.siso("voltage_V", "hub_angle_rad") for record in records], options)
     assert found.level == pytest.approx(0.1 * VOLTS_PER_NM, rel=0.003)
@@ -432,7 +448,14 @@ def test_an_observer_follows_what_a_free_run_does_not_explain():
     phases, turn = np.random.default_rng(1).uniform(0, 2 * np.pi, 99), 2 * np.pi * np.arange(1000) / 1000
     volts = 0.424 * np.cos(np.outer(turn, np.arange(1, 100)) + phases).sum(axis=1)
     angle = plant.run(through, volts, 0.0, np.zeros(volts.size))["y"]
-    record = Record("log", volts[:, None], angle[:, None], 1e-3, ("motor_V",), ("angle_rad",))
+    record = Record(
+        volts[:, None],
+        angle[:, None],
+        1e-3,
+        name="log",
+        input_names=("motor_V",),
+        output_names=("angle_rad",),
+    )
     found = dry.fit_friction([record], IdentOptions(integrators=1))
     assert found.observed
     assert found.law.level == pytest.approx(2.9e-3 / 0.02, rel=0.05)

@@ -61,7 +61,7 @@ def rubbing_arm(delay: int, lag: float, noise: float, level: float = 0.3, steps:
             free = speed + h * (force - 0.02 * speed) / 0.01
             speed = np.sign(free) * max(abs(free) - h * level / 0.01, 0.0)
             place += h * speed
-    return Record("log", command[:, None], position[:, None], DT_S, ("u",), ("y",))
+    return Record(command[:, None], position[:, None], DT_S, name="log")
 
 
 @cache
@@ -205,7 +205,7 @@ def test_a_damping_that_may_be_anything_is_varied_within_its_limits() -> None:
 
 def test_thinned_logs_take_the_position_later_by_the_dead_time() -> None:
     command = np.arange(20.0)
-    record = Record("log", command[:, None], 100 + command[:, None], DT_S, ("u",), ("y",))
+    record = Record(command[:, None], 100 + command[:, None], DT_S, name="log")
     whole = replace(logs(), records=(record,))
     (thin,) = whole.thinned(4, 3).records
     assert thin.dt_s == 4 * DT_S
@@ -315,7 +315,7 @@ def test_an_arm_without_a_pole_is_refused():
 def test_rows_of_a_reading_are_those_of_a_moving_shaft() -> None:
     """A sensor of one count a millisecond, read ten times as often; it stands still for a third of it."""
     counts = np.concatenate([np.repeat(np.arange(200), 10), np.full(1000, 200)])
-    record = Record("log", counts[:, None] * 0.01, counts[:, None] * 0.1, 1e-4, ("u",), ("y",))
+    record = Record(counts[:, None] * 0.01, counts[:, None] * 0.1, 1e-4, name="log")
     assert LoopLogs.of([record]).rows_of_a_reading == 10
     assert logs().rows_of_a_reading == 1
 
@@ -345,7 +345,7 @@ def test_a_dead_time_of_five_samples_is_found_from_none() -> None:
     one = drafted("late", 1, 21)
     got, begin = one.record(0, one.rng(0))
     signals = got["u"][begin:, None], got["y"][begin:, None]
-    record = Record("log", *signals, one.plant.dt_s, ("u",), ("y",))
+    record = Record(*signals, one.plant.dt_s, name="log")
     stated, _ = simplest(LoopLogs.of([record]), IdentOptions(integrators=1))
     assert stated.input_delay_samples == one.plant.delay == 5
 

@@ -41,7 +41,7 @@ def logged(one: Machine, log: int, *, reference: bool = True) -> Record:
     got, begin = played(one.kind, one.seed, log)
     signals = got["u"][begin:, None], got["y"][begin:, None]
     kept = {"reference": got["r"][begin:, None], "reference_names": ("r",)} if reference else {}
-    return Record(f"log {log}", *signals, one.plant.dt_s, ("u",), ("y",), **kept)
+    return Record(*signals, one.plant.dt_s, name=f"log {log}", **kept)
 
 
 def levels_of(one: Machine) -> float:
@@ -113,9 +113,7 @@ def test_friction_is_in_its_interval_in_a_log_of_every_few_rows(
         got, begin = slower.record(log, slower.rng(log))
         rows_kept = slice(begin, begin + 6000)
         signals = [got[name][rows_kept, None] for name in "uyr"]
-        whole = Record(
-            f"log {log}", *signals[:2], one.plant.dt_s, ("u",), ("y",), signals[2], reference_names=("r",)
-        )
+        whole = Record(*signals[:2], one.plant.dt_s, name=f"log {log}", reference=signals[2])
         records.append(every(whole, rows))
     found = fit_friction(records, IdentOptions(integrators=1))
     assert abs(found.level - levels_of(slower)) < 2 * found.level_std
@@ -235,7 +233,7 @@ def test_a_command_that_nobody_closes_a_loop_around_is_none(seed: int) -> None:
     noise = rng.standard_normal(4000)
     for command in (binary, sines + 1e-3 * size * noise):
         got = one.plant.run(open_loop, command, 0.0, np.zeros(command.size))
-        record = Record("open", command[:, None], got["y"][:, None], one.plant.dt_s, ("u",), ("y",))
+        record = Record(command[:, None], got["y"][:, None], one.plant.dt_s, name="open")
         assert not recorded_in_loop([record])
     quick = size * np.sign(rng.standard_normal(4000))
     got = one.plant.run(open_loop, quick, 0.0, np.zeros(4000))
@@ -261,7 +259,7 @@ def test_an_arm_that_drifts_is_judged_in_windows() -> None:
     model = GobfModel(poles, np.array([0.1]), 0.01, integrators=1)
     command = np.sign(rng.standard_normal(400)).repeat(10)
     walk = 0.002 * np.cumsum(rng.standard_normal(4000))
-    record = Record("drifts", command[:, None], model.simulate(command + walk)[:, None], 0.01, ("u",), ("y",))
+    record = Record(command[:, None], model.simulate(command + walk)[:, None], 0.01, name="drifts")
     assert fit_on_fresh_data(model, record).fit_percent < 20
     windows = fit_in_windows(model, record)
     assert windows.fit_percent > 60

@@ -39,7 +39,9 @@ def records(n_inputs=1):
     """Two records of unequal length whose output has nothing to do with any model."""
     rng, names = np.random.default_rng(0), tuple("ab"[:n_inputs])
     return [
-        Record("test", rng.normal(size=(n, n_inputs)), 1 + rng.normal(size=(n, 1)), 0.005, names, ("y",))
+        Record(
+            rng.normal(size=(n, n_inputs)), 1 + rng.normal(size=(n, 1)), 0.005, name="test", input_names=names
+        )
         for n in (150, 90)
     ]
 

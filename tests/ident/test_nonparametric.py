@@ -18,7 +18,7 @@ def truth(omega):
 def record(u, y, r=None):
     reference = None if r is None else r[:, None]
     names = () if r is None else ("r",)
-    return Record("a", u[:, None], y[:, None], DT, ("u",), ("y",), reference=reference, reference_names=names)
+    return Record(u[:, None], y[:, None], DT, name="a", reference=reference, reference_names=names)
 
 
 def periodic_records(rng, n_records, noise, n=512):
@@ -79,7 +79,7 @@ def test_reference_as_instrument_removes_the_closed_loop_bias():
     records = closed_loop_records(np.random.default_rng(3), 40)
     options = {"half_width_lines": 8, "omega_min_rad_s": 2.0, "omega_max_rad_s": 150.0}
     by_reference = empirical_frf(records, **options)
-    bare = [Record(r.name, r.input, r.output, DT, ("u",), ("y",)) for r in records]
+    bare = [Record(r.input, r.output, DT, name=r.name) for r in records]
     direct = empirical_frf(bare, **options)
     g = truth(by_reference.omega_rad_s)
     weak = np.abs(g) < 0.3

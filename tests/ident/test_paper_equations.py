@@ -26,6 +26,7 @@ from ident.basis.model import GobfModel
 from ident.basis.options import Algorithm, IdentOptions
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
+from ident.comparators.polynomial_fits import arx
 from ident.fit.least_squares import fit
 from ident.fit.problem import CandidateCost
 from ident.fit.regression import prepare
@@ -43,7 +44,6 @@ from tests.ident import (
     test_pole_search,
 )
 from tests.ident.benchmark_plants import as_record
-from validation.comparators.comparators import arx
 
 DT_S = 0.005
 MIXED = Poles([0.5, 0.9, -0.3], [0.8 * np.exp(0.4j), 0.95 * np.exp(2.0j)])

@@ -116,9 +116,9 @@ def test_paths_that_are_not_there(tmp_path):
     assert "not a file" in complaint(tmp_path)
 
 
-def test_one_string_is_not_a_list_of_columns(good):
-    with pytest.raises(ValueError, match=f"inputs .*list.*'{U}'"):
-        Record.from_file(good, U, [Y], time=T)
+def test_one_column_may_be_named_by_itself(good):
+    record = Record.from_file(good, U, Y, time=T)
+    assert (record.input_names, record.output_names) == ((U,), (Y,))
 
 
 def test_a_statement_about_a_column_that_is_not_used_is_refused(good):
@@ -216,7 +216,7 @@ def test_siso_and_slice():
     ("change", "message"),
     [
         ({"dt_s": 0.0}, "dt_s .*0.0"),
-        ({"input": np.arange(8.0)}, r"input .*\(T, 2\).*\(8,\)"),
+        ({"input": np.arange(8.0)}, r"input .*\(T, 2\).*\(8, 1\)"),
         ({"output": np.zeros((3, 3))}, "output has 3 samples .*4"),
         ({"output": np.full((4, 3), np.inf)}, "output .*'c' is inf at index 0"),
         ({"output": np.full((4, 3), -1e200)}, r"output .*'c' is -1e\+200 at index 0"),

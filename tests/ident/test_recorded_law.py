@@ -27,14 +27,11 @@ def loop_log(numerator, denominator, *, rows=1, limit=50.0, decimals=4, n=4000, 
         u[k] = np.clip(numerator @ error - denominator[1:] @ own, -limit, limit)
     every = slice(0, None, rows)
     return Record(
-        "log",
         np.round(u[every, None], decimals),
         np.round(y[every, None], decimals + 2),
         DT * rows,
-        ("u",),
-        ("y",),
+        name="log",
         reference=np.round(r[every, None], decimals + 2),
-        reference_names=("r",),
     )
 
 

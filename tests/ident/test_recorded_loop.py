@@ -59,16 +59,7 @@ def log(seed=1, gain=150.0, law=1.0, friction=0.0, drift=0.0, step=0.0, offset=0
         stop = free[2] / b[2]
         x = free - b * np.clip(stop, -friction, friction)
     rows = slice(start, n)
-    names = ("u",), ("y",)
-    return Record(
-        "log",
-        u[rows, None],
-        y[rows, None],
-        DT,
-        *names,
-        reference=reference[rows, None],
-        reference_names=("r",),
-    )
+    return Record(u[rows, None], y[rows, None], DT, name="log", reference=reference[rows, None])
 
 
 def true_model(gain):
@@ -79,12 +70,10 @@ def true_model(gain):
     real = np.append(rest[rest.imag == 0].real, 0.0)
     poles = Poles(real, rest[rest.imag > 0])
     record = Record(
-        "impulse",
         np.eye(1, 400).T,
         signal.dlsim((a, b[:, None], np.eye(4)[:1], 0, DT), np.eye(1, 400)[0])[1],
         DT,
-        ("u",),
-        ("y",),
+        name="impulse",
     )
     linear = fit(
         prepare([record], Structure(integrators=1, estimate_offset=False, estimate_initial_state=False)),
@@ -155,4 +144,8 @@ def test_a_law_of_other_signals_and_a_direct_term_are_refused():
     with pytest.raises(ValueError, match="without a direct term"):
         fit_in_loop(direct, record, law)
     with pytest.raises(ValueError, match="one reference column"):
-        fit_in_loop(true_model(150.0), Record("log", record.input, record.output, DT, ("u",), ("y",)), law)
+        fit_in_loop(
+            true_model(150.0),
+            Record(record.input, record.output, DT, name="log"),
+            law,
+        )

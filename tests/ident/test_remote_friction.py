@@ -54,7 +54,7 @@ def logged(ratio, level, *, sensor, seed, duration_s=8.0):
     # An encoder of 20 bits.
     output = np.round(output / 6e-6) * 6e-6
     columns = command[:, None], output[:, None]
-    return Record("log", *columns, DT_S, ("u",), ("y",), reference[:, None], ("r",))
+    return Record(*columns, DT_S, name="log", reference=reference[:, None])
 
 
 def mode_of(ratio):

@@ -28,7 +28,7 @@ def recorded(system, amplitude, noise, rng, name):
     """One record of a sweep: run-to-run change of a loop as well as noise, which the loop colours."""
     r = amplitude * SWEEP
     y = signal.lfilter(*system, r) + noise * signal.lfilter([1], [1, -0.7], rng.standard_normal(r.size))
-    return Record(name, (r - y)[:, None], y[:, None], DT, ("u",), ("y",), r[:, None], ("r",))
+    return Record((r - y)[:, None], y[:, None], DT, name=name, reference=r[:, None])
 
 
 def experiments(systems, noise, rng, repeats=3):
@@ -82,7 +82,7 @@ def friction_loop(amplitude, rng):
             free = speed + h * (40 * u[k] - 6 * speed)
             speed = np.sign(free) * max(abs(free) - 8 * h, 0.0)
             angle += h * speed
-    return Record(f"{amplitude}", u[:, None], y[:, None], DT, ("u",), ("y",), r[:, None], ("r",))
+    return Record(u[:, None], y[:, None], DT, name=f"{amplitude}", reference=r[:, None])
 
 
 def test_dry_friction_is_named_by_a_gain_that_grows_with_amplitude():
@@ -104,5 +104,5 @@ def test_what_is_no_repeat_is_left_out_and_no_effect_is_said_so():
     (single,) = repeats_of(records[:4])  # the larger amplitude once
     assert len(single.rms) == 1
     assert single.amplitude_effects == ()
-    other = Record("other", rng.standard_normal((2400, 1)), records[0].output, DT, ("u",), ("y",))
+    other = Record(rng.standard_normal((2400, 1)), records[0].output, DT, name="other")
     assert repeats_of([records[0], other, records[3]]) == ()

@@ -46,10 +46,7 @@ def covariance(noise, n):
 def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(noise):
     rng = np.random.default_rng(3)
     sizes = (60, 45)
-    records = [
-        Record("r", rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, ("u",), ("y",))
-        for n in sizes
-    ]
+    records = [Record(rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, name="r") for n in sizes]
     structure = Structure(estimate_offset=True, estimate_initial_state=True)
     rows = EmbeddingRows(tuple(records), structure, Poles(np.array([0.8, 0.5])), 3, noise)
     reduced = reduce_regression(rows.blocks())
@@ -87,7 +84,7 @@ def test_residuals_and_what_the_fit_absorbs_equal_the_dense_ones(noise):
 def test_bias_of_the_estimating_equations_equals_the_dense_one(noise):
     rng = np.random.default_rng(5)
     n, order, start = 80, 5, 6
-    record = Record("r", rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, ("u",), ("y",))
+    record = Record(rng.standard_normal((n, 1)), rng.standard_normal((n, 1)), DT, name="r")
     structure = Structure(estimate_offset=True, estimate_initial_state=True)
     rows = EmbeddingRows((record,), structure, Poles(np.array([0.9, 0.6])), 3, noise)
     reduced = reduce_regression(rows.blocks())
@@ -157,7 +154,7 @@ def test_first_rows_are_dropped_where_their_covariance_is_nearly_singular():
     np.testing.assert_allclose(
         white[5:], signal.lfilter(NARROW.a_polynomial, [1.0], y, axis=0)[5:], rtol=1e-12
     )
-    record = Record("r", y[:, :1], y[:, 1:], DT, ("u",), ("y",))
+    record = Record(y[:, :1], y[:, 1:], DT, name="r")
     rows = EmbeddingRows((record,), Structure(), Poles(np.array([0.5])), 3, NARROW)
     (block,) = rows.blocks()
     assert block.output.size == block.kernel.shape[0] == len(block.nuisance) == 25

@@ -30,7 +30,7 @@ def record(input_scale, output_scale, time_scale, delay):
     y = signal.lfilter(np.concatenate([np.zeros(delay), [0, 0.05, 0.03]]), den, u)
     y = y + 0.03 * y.std() * signal.lfilter([1], [1, -0.5], rng.standard_normal(n))
     dt = 0.01 * time_scale
-    return Record("log", (input_scale * u)[:, None], (output_scale * y)[:, None], dt, ("u",), ("y",))
+    return Record((input_scale * u)[:, None], (output_scale * y)[:, None], dt, name="log")
 
 
 def answer(name, scales, delay):

@@ -53,7 +53,14 @@ def record(seed, n=3000, noise_std=0.05, system=None, start=None):
     u = rng.choice([-1.0, 1.0], (n, system[1].shape[1]))
     y = signal.dlsim((*system, DT_S), u, x0=start)[1][:, 0]
     names = tuple(f"motor_{i + 1}" for i in range(u.shape[1]))
-    return Record(f"seed {seed}", u, (y + noise_std * rng.normal(size=n))[:, None], DT_S, names, ("tip",))
+    return Record(
+        u,
+        (y + noise_std * rng.normal(size=n))[:, None],
+        DT_S,
+        name=f"seed {seed}",
+        input_names=names,
+        output_names=("tip",),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +156,7 @@ def test_integrators_and_delay_are_exact():
     u = rng.choice([-1.0, 1.0], (3000, 2))
     late = np.vstack([np.zeros((2, 2)), u[:-2]])
     y = signal.dlsim((A, B, C, D, DT_S), late)[1][:, 0] + 0.01 * rng.normal(size=3000)
-    item = Record("arm", u, y[:, None], DT_S, ("a", "b"), ("tip",))
+    item = Record(u, y[:, None], DT_S, name="arm", input_names=("a", "b"), output_names=("tip",))
     result = identify_mimo([item], IdentOptions(integrators=1, input_delay_samples=2, n_real=1, n_pairs=2))
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     truth = response((A, B, C, D)) * np.exp(-2j * OMEGA * DT_S)[:, None]
@@ -163,7 +170,7 @@ def test_one_motor_at_a_time_in_records_of_their_own():
         only = np.zeros((2000, 2))
         only[:, i] = record(i, n=2000).input[:, i]
         y = signal.dlsim((*sampled(), DT_S), only)[1] + 0.02 * np.random.default_rng(i).normal(size=(2000, 1))
-        items.append(Record(f"motor {i}", only, y, DT_S, ("a", "b"), ("tip",)))
+        items.append(Record(only, y, DT_S, name=f"motor {i}", input_names=("a", "b"), output_names=("tip",)))
     result = identify_mimo(items)
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     assert len(result.residuals) == 2
@@ -184,7 +191,7 @@ def test_a_model_is_locked_and_gives_its_channels(fitted):
 
 def test_refused_records_and_models_are_named_by_column_and_kind():
     good = record(0, n=300)
-    still = Record("still", good.input * [1, 0], good.output, DT_S, ("a", "b"), ("y",))
+    still = Record(good.input * [1, 0], good.output, DT_S, name="still", input_names=("a", "b"))
     with pytest.raises(ValueError, match=r"'still'.*'b'"):
         identify_mimo([still])
     with pytest.raises(ValueError, match="record"):
@@ -230,7 +237,7 @@ def test_uncertainty_is_that_of_all_unknowns_together():
         np.random.default_rng(3).normal(size=(2, 4)), np.array([0.5, -0.3]), DT_S, ("a", "b"), "y", 1, 1,
     )  # fmt: skip
     y = truth.simulate(u) + 0.1 * np.random.default_rng(4).normal(size=400)
-    item = Record("test", u, y[:, None], DT_S, ("a", "b"), ("y",))
+    item = Record(u, y[:, None], DT_S, name="test", input_names=("a", "b"))
     result = identify_mimo([item], options)
     (model,) = result.model.outputs
 
@@ -266,14 +273,18 @@ def test_advice_on_alike_inputs_and_coloured_residuals():
         [1.0], [1.0, -0.97], 0.05 * np.random.default_rng(1).normal(size=(1000, 1)), axis=0
     )
     options = IdentOptions(n_real=1, n_pairs=2)
-    result = identify_mimo([Record("alike", nearly, y + noise, DT_S, ("a", "b"), ("tip",))], options)
+    result = identify_mimo(
+        [Record(nearly, y + noise, DT_S, name="alike", input_names=("a", "b"), output_names=("tip",))],
+        options,
+    )
     assert {FindingKind.ALIKE_INPUTS, FindingKind.COLOURED_RESIDUAL} <= kinds(result.warnings)
 
 
 def _bands(*inputs):
     """Of every finding: inputs, rank, lowest and highest frequency [rad/s]; 10 ms, an output beside it."""
     records = [
-        Record("r", u, u[:, :1], 0.01, tuple(f"u{i}" for i in range(u.shape[1])), ("y",)) for u in inputs
+        Record(u, u[:, :1], 0.01, name="r", input_names=tuple(f"u{i}" for i in range(u.shape[1])))
+        for u in inputs
     ]
     found = [item.values for item in alike_inputs(records)]
     return [(v["inputs"], v["rank"], v["low_rad_s"], v["high_rad_s"]) for v in found]

@@ -38,7 +38,7 @@ def record(system, seed: int, samples: int = 3000, noise=NOISE) -> Record:
     y = dlsim((system.A, system.B, system.C, system.D, DT_S), u)[1]
     y = y + rng.multivariate_normal(np.zeros(system.noutputs), noise, len(y))
     names = (NAMES[0][: system.ninputs], NAMES[1][: system.noutputs])
-    return Record(f"seed {seed}", u, y, DT_S, *names)
+    return Record(u, y, DT_S, name=f"seed {seed}", input_names=names[0], output_names=names[1])
 
 
 def response(system, omega=OMEGA) -> np.ndarray:
@@ -142,15 +142,21 @@ def test_a_start_in_motion_is_estimated():
 
 
 def _twice(item: Record) -> Record:
-    return Record("x", item.input, item.output[:, [0, 0]], DT_S, *NAMES)
+    return Record(
+        item.input, item.output[:, [0, 0]], DT_S, name="x", input_names=NAMES[0], output_names=NAMES[1]
+    )
 
 
 def _still(item: Record) -> Record:
-    return Record("x", item.input, item.output * [1.0, 0.0], DT_S, *NAMES)
+    return Record(
+        item.input, item.output * [1.0, 0.0], DT_S, name="x", input_names=NAMES[0], output_names=NAMES[1]
+    )
 
 
 def _alike(item: Record) -> Record:
-    return Record("x", item.input[:, [0, 0]], item.output, DT_S, *NAMES)
+    return Record(
+        item.input[:, [0, 0]], item.output, DT_S, name="x", input_names=NAMES[0], output_names=NAMES[1]
+    )
 
 
 @pytest.mark.parametrize(
@@ -161,7 +167,16 @@ def _alike(item: Record) -> Record:
         (lambda item: [_alike(item)], {}, r"'x'.*u1.*u2"),
         # Samples, order, unknowns of the model, and how many samples would do.
         (lambda item: [item.slice(0, 14)], {"n_pairs": 2, "n_real": 1}, r"14\D+5\D+16\D+17"),
-        (lambda item: [item, Record("x", item.input, item.output, 2 * DT_S, *NAMES)], {}, "dt_s"),
+        (
+            lambda item: [
+                item,
+                Record(
+                    item.input, item.output, 2 * DT_S, name="x", input_names=NAMES[0], output_names=NAMES[1]
+                ),
+            ],
+            {},
+            "dt_s",
+        ),
         (lambda item: [item, item.only(0)], {}, r"\['y1'\].*\['y1', 'y2'\]"),
         (lambda item: [item], {"integrators": 2}, "integrators = 2"),
         (lambda item: [item], {"relative_degree": 2}, "relative_degree = 2"),

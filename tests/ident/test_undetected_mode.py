@@ -66,7 +66,7 @@ def setup(noise):
     for n in SIZES:
         u = rng.standard_normal((n, 1))
         y = signal.lfilter([0.0, 0.2], [1.0, -1.2, 0.8], u, axis=0) + 0.3 * rng.standard_normal((n, 1))
-        records.append(Record("r", u, y, DT, ("u",), ("y",)))
+        records.append(Record(u, y, DT, name="r"))
     structure = Structure(estimate_offset=True)
     rows = EmbeddingRows(tuple(records), structure, Poles(np.array(REAL), np.array([PAIR])), 6, noise)
     return records, rows

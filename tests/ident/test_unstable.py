@@ -48,10 +48,7 @@ def looped(plant, seed, n=3000, noise=1e-3, gains=(1.2, 0.08), push=0.0, limit=n
         rate = (error - (r[k - 1] - measured[k - 1])) / DT if k else 0.0
         u[k] = np.clip(gains[0] * error + gains[1] * rate, -limit, limit)
         pushed[k] += u[k]
-    return Record(
-        f"{seed}", u[:, None], measured[:, None], DT, ("u",), ("y",), reference=r[:, None],
-        reference_names=("r",),
-    )  # fmt: skip
+    return Record(u[:, None], measured[:, None], DT, name=f"{seed}", reference=r[:, None])  # fmt: skip
 
 
 def sampled(numerator, denominator, dt_s=DT):
@@ -288,7 +285,9 @@ def test_an_identified_pendulum_is_certified_between_all_frequencies():
     record = pendulum(300)
     model = identify([record], options()).model
     posterior = tangent([record], model, EmbeddingOptions(fir_length=20))
-    plant = UncertainPlant("pendulum", nominal_near(posterior, model.poles, OMEGA).to_control(), posterior)
+    plant = UncertainPlant(
+        nominal_near(posterior, model.poles, OMEGA).to_control(), name="pendulum", uncertainty=posterior
+    )
     assert plant.unstable_poles == 1
     # 1.2 e + .08 de/dt, the difference filtered over two samples.
     controller = Controller([[0.5]], [[0.5]], [[-4.0]], [[1.2 + 4.0]], DT, computational_delay_samples=0)

@@ -48,7 +48,7 @@ def test_fresh_fit_refuses_what_it_cannot_judge():
         fit_on_fresh_data(model(), as_record(u, u, dt_s=2 * DT))
     with pytest.raises(ValueError, match="constant"):
         fit_on_fresh_data(model(), as_record(u, np.ones(100), dt_s=DT))
-    two = Record("w", np.zeros((9, 2)), np.zeros((9, 1)), DT, ("a", "b"), ("y",))
+    two = Record(np.zeros((9, 2)), np.zeros((9, 1)), DT, name="w", input_names=("a", "b"))
     with pytest.raises(ValueError, match="one input"):
         fit_on_fresh_data(model(), two)
 

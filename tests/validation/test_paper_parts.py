@@ -5,7 +5,7 @@ import pytest
 import scipy.signal
 
 from ident import ErrorSurface, Record
-from validation.comparators.prediction_error import arx_polynomials
+from ident.comparators.prediction_error import arx_polynomials
 from validation.example_arms import paper_example
 from validation.paper import surface as paper
 from validation.paper.bounds import coverage_of
@@ -132,7 +132,7 @@ def test_instrumental_variables_are_exact_without_noise_and_unbiased_with():
 def test_output_error_from_usual_starts_finds_a_well_damped_plant():
     a, b, u, y = _driven(0.3)
     delayed = np.concatenate([[0.0], y[:-1]])  # the record's own delay of one sample
-    record = Record("driven", u[:, None], delayed[:, None], DT_S, ("u",), ("y",))
+    record = Record(u[:, None], delayed[:, None], DT_S, name="driven")
     model = usual_oe(record, 2, 2)
     np.testing.assert_allclose(model.f, a, atol=0.02)
     np.testing.assert_allclose(model.b, b, atol=0.05)

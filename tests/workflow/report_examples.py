@@ -69,8 +69,7 @@ def record(models: list[GobfModel], name: str, seed: int) -> Record:
     return Record(
         name=name, input=u[:, None], output=y, dt_s=DT_S, input_names=(models[0].input_name,),
         output_names=tuple(m.output_name for m in models), input_units=("V",),
-        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models),
-    )  # fmt: skip
+        output_units=tuple("rad" if "rad" in m.output_name else "m" for m in models))  # fmt: skip
 
 
 def identification(of: GobfModel, used: list[Record]) -> Identification:
@@ -122,9 +121,9 @@ def controller(gain: float = 1.5) -> Controller:
 def plant(*, performance: bool = True) -> UncertainPlant:
     hub, tip = model(), model("tip_m")
     return UncertainPlant(
-        "hub",
         hub.to_control(),
-        posterior(hub),
+        name="hub",
+        uncertainty=posterior(hub),
         performance=PlantChannel(tip.to_control(), posterior(tip)) if performance else None,
     )
 

@@ -174,7 +174,7 @@ def test_a_stated_controller_opens_the_loop(tmp_path):
     assert share_held(spread) > 0.9
     # Whatever form it has, it tells the reference behind its numerator: 8, or 8 (1 - 0.5/z).
     _, reference, u, y = noisy_loop(1)
-    record = Record("a", u[:, None], y[:, None], 0.01, ("u_A",), ("y_rad",))
+    record = Record(u[:, None], y[:, None], 0.01, name="a", input_names=("u_A",), output_names=("y_rad",))
     behind, less = GAIN * reference, GAIN * (reference[1:] - 0.5 * reference[:-1])
     plain = {"controller": {"numerator": [GAIN], "denominator": [1.0]}}
     for form, told in zip((plain, *stated), (behind, behind, less), strict=True):

@@ -228,7 +228,7 @@ def test_calibration_is_designed_for(monkeypatch):
 
     monkeypatch.setattr("workflow.tasks.design.synthesise_giving_way", plain)
     monkeypatch.setattr("workflow.tasks.design.synthesise_jointly", jointly)
-    exact = UncertainPlant("exact", example.model().to_control())
+    exact = UncertainPlant(example.model().to_control(), name="exact")
     options = CertificateOptions.model_validate({"calibrate": True})
     rng, how = np.random.default_rng(1), SynthesisOptions()
     jointly_said = task.find_design([example.plant()], spec(), how, options, rng).jointly
@@ -311,11 +311,11 @@ def test_words_of_sampled_responses():
 
 
 def test_what_cannot_be_drawn_says_why():
-    exact = UncertainPlant("exact", example.model().to_control())
+    exact = UncertainPlant(example.model().to_control(), name="exact")
     assert "nothing to draw" in str(task.undrawable([exact]))
     omega = np.array([1.0, 2.0, 5.0])
     measured = example.posterior(example.model()).at(omega, 0.95)
-    own = UncertainPlant("measured", example.model().to_control(), measured)
+    own = UncertainPlant(example.model().to_control(), name="measured", uncertainty=measured)
     assert "its own frequencies only" in str(task.undrawable([own]))
     assert task.undrawable([example.plant()]) is None
     found = task.certify_asked(

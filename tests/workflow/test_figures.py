@@ -115,7 +115,7 @@ def test_pictures_of_a_planned_experiment():
     )
     plan = plan_experiment(limits, seed=1, realisations=2)
     steady = np.tile(plan.voltages_V, 2)  # a gain of one, as it stands
-    records = [Record(str(k), u[:, None], u[:, None], 0.005, ("u",), ("y",)) for k, u in enumerate(steady[0])]
+    records = [Record(u[:, None], u[:, None], 0.005, name=str(k)) for k, u in enumerate(steady[0])]
     for picture in (draw_excitation(plan), draw_distortion(distortion_of(records), ("V", "rad"))):
         figure = figure_of(picture)
         has_titles_units_and_a_legend(figure)

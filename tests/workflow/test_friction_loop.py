@@ -179,8 +179,8 @@ def test_the_recorded_loop_stands_beside_the_new_one():
     reference = 0.2 * np.cumsum(rng.standard_normal(4000)) / 60
     made = FrictionLoop.of(lead(integral=0.02, computational_delay_samples=0), found)
     run = made.run(reference, rng)
-    signals, names = [run.command[:, None], run.measured[:, None]], [("u",), ("y",)]
-    record = Record("log", *signals, DT_S, *names, reference=reference[:, None], reference_names=("r",))
+    signals = [run.command[:, None], run.measured[:, None]]
+    record = Record(*signals, DT_S, name="log", reference=reference[:, None])
     step = np.append(0.0, np.full(400, 0.02))
     slower = FrictionLoop.of(lead(gain=9.0, integral=0.002), found)
     seen = beside_recorded(stage_of(found, [record]), slower, step)
@@ -369,7 +369,7 @@ def test_predicted_response_is_that_of_the_nonlinear_arm():
             angle.append(arm.measure()[0])
             arm.advance(u)
         noisy = np.array(angle) + 1e-4 * rng.standard_normal(voltage.size)
-        records.append(Record(name, voltage[:, None], noisy[:, None], DT_S, ("voltage_V",), ("y",)))
+        records.append(Record(voltage[:, None], noisy[:, None], DT_S, name=name, input_names=("voltage_V",)))
     options = IdentOptions(integrators=1, n_real=1, n_pairs=2, omega_min_rad_s=30.0, decay_min_per_s=1.0)
     found = replace(fit_friction(records, options), noise_std=0.0)
     law = Controller([[0.75]], [[1.0]], [[-3.5]], [[20.0]], DT_S)

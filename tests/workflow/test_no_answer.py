@@ -49,7 +49,7 @@ LITTLE = {
 def log(kind, seed):
     rng = np.random.default_rng(seed)
     u = excitation(rng)
-    return Record("log", u[:, None], (NOTHING | LITTLE)[kind](rng, u)[:, None], 0.005, ("u",), ("y",))
+    return Record(u[:, None], (NOTHING | LITTLE)[kind](rng, u)[:, None], 0.005, name="log")
 
 
 def identified(kind, seed, **options):
@@ -109,8 +109,8 @@ def test_a_validation_log_of_another_machine_is_told():
     rng = np.random.default_rng(4)
     u = excitation(rng)
     y = signal.lfilter([0, 0.1], [1, -0.9], u)
-    good = Record("good", u[:, None], (y + 0.02 * rng.standard_normal(N))[:, None], 0.005, ("u",), ("y",))
-    other = Record("other", excitation(rng)[:, None], good.output, 0.005, ("u",), ("y",))
+    good = Record(u[:, None], (y + 0.02 * rng.standard_normal(N))[:, None], 0.005, name="good")
+    other = Record(excitation(rng)[:, None], good.output, 0.005, name="other")
     found = identify_records([good], [good.slice(100, N), other], with_plot=False)
     told = [item for item in found.careful if item.kind is FindingKind.NO_ANSWER_THERE]
     assert [item.values["record"] for item in told] == [other.label]

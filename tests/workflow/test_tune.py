@@ -519,7 +519,7 @@ def test_a_plant_of_its_own_grid_has_curves_on_it(session):
         centre = nominal(np.exp(1j * omega * DT_S))
         covariance = 1e-6 * np.broadcast_to(np.eye(2), (40, 2, 2))
 
-    plant = UncertainPlant("known", control.ss(nominal), Known())
+    plant = UncertainPlant(control.ss(nominal), name="known", uncertainty=Known())
     gains = tuning._gains(session._last, plant, session.specification)
     assert len(gains[0]["x"]) == 40
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
+from ident.comparators.polynomial_fits import armax, arx, oe
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
 from ident.one_input import identify
-from validation.comparators.comparators import armax, arx, oe
 from validation.paper.machines import PaperMachine, Trial
 from validation.paper.settings import N_PAIRS, N_REAL, ORDER
 from validation.paper.usual_starts import usual_oe

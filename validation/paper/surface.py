@@ -103,7 +103,7 @@ def resonant_record(rng: np.random.Generator) -> Record:
     y = lfilter(numerator[0], denominator, signs)
     scale = np.sqrt(OUTPUT_VARIANCE) / np.std(y)
     noise = np.sqrt(OUTPUT_VARIANCE) * 10 ** (-SNR_DB / 20) * rng.standard_normal(y.size)
-    return Record("resonance", scale * signs[:, None], (scale * y + noise)[:, None], DT_S, ("u",), ("y",))
+    return Record(scale * signs[:, None], (scale * y + noise)[:, None], DT_S, name="resonance")
 
 
 def true_pair() -> Poles:

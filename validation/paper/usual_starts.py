@@ -1,6 +1,6 @@
 """OE from the usual starts: four-stage instrumental variables, and ARX.
 
-`validation.comparators.comparators.oe` starts from Steiglitz-McBride, which finds what these miss. The paper
+`ident.comparators.polynomial_fits.oe` starts from Steiglitz-McBride, which finds what these miss. The paper
 does not say how its toolbox started; its failures can only be judged from a start that is no better than
 usual.
 """
@@ -13,11 +13,11 @@ from scipy.signal import lfilter
 from ident.basis.autoregressive_noise import WHITE_NOISE, AutoregressiveNoise
 from ident.basis.noise_model import NoiseModel
 from ident.basis.structure import filter_input
+from ident.comparators.polynomial_model import PolynomialModel
+from ident.comparators.prediction_error import arx_polynomials, best_end, monic, shifted
+from ident.comparators.stable_sections import stabilised
 from ident.data.arrays import RealArray
 from ident.data.record import Record
-from validation.comparators.polynomial_model import PolynomialModel
-from validation.comparators.prediction_error import arx_polynomials, best_end, monic, shifted
-from validation.comparators.stable_sections import stabilised
 
 # The polynomial 1.
 _ONE = np.ones(1)
@@ -29,7 +29,7 @@ def usual_oe(record: Record, nb: int, nf: int) -> PolynomialModel:
     y = record.output[:, 0]
     starts = [arx_polynomials(u, y, nf, nb), instrumental_variables(u, y, nf, nb)]
     stable = [PolynomialModel(_ONE, b, _ONE, stabilised(a)) for a, b in starts]
-    return best_end(stable, u, y).of(record, 1)
+    return best_end(stable, u, y).of(record, 1, "OE")
 
 
 def instrumental_variables(u: RealArray, y: RealArray, na: int, nb: int) -> tuple[RealArray, RealArray]:

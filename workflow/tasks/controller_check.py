@@ -133,7 +133,7 @@ def _plant(name: str, both: control.StateSpace) -> UncertainPlant:
 
     hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
     try:
-        return UncertainPlant(name, hub, None, performance=PlantChannel(tip))
+        return UncertainPlant(hub, name=name, uncertainty=None, performance=PlantChannel(tip))
     except ValueError as error:
         raise NoControllerError(str(error)) from error
 

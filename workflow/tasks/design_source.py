@@ -186,7 +186,9 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
             identified = codec.from_arrays(IdentifiedPlant, document)
             name = identified.model.output_name
             nominal = identified.model.to_control()
-            plant = UncertainPlant(name, nominal, identified.posterior, level=identified.level)
+            plant = UncertainPlant(
+                nominal, name=name, uncertainty=identified.posterior, level=identified.level
+            )
             return DesignSource(plant, "model and posterior of flexlink identify")
         if document.get("format") == FORMAT:
             exported = read_model(path)
@@ -195,7 +197,7 @@ def load_source(path: Path, design: DesignFile) -> DesignSource:
             ellipses = exported.ellipses
             if ellipses is None:
                 return _stated(name, nominal, design, "exported model")
-            plant = UncertainPlant(name, nominal, ellipses, level=ellipses.level)
+            plant = UncertainPlant(nominal, name=name, uncertainty=ellipses, level=ellipses.level)
             return DesignSource(plant, "exported model with ellipses", _inside(ellipses, plant.nominal))
         nominal = read_state_space(path, document)
         _refuse_untold_integrators(path, nominal, design)
@@ -212,13 +214,13 @@ def _ending(path: Path) -> str:
 def _stated(name: str, nominal: control.StateSpace, design: DesignFile, origin: str) -> DesignSource:
     """A model that brings no ellipses: with the uncertainty of the design file, if it states one."""
     if design.uncertainty is None:
-        return DesignSource(UncertainPlant(name, nominal), origin, (NOTHING_STATED,))
+        return DesignSource(UncertainPlant(nominal, name=name), origin, (NOTHING_STATED,))
     weight = design.uncertainty.multiplicative or design.uncertainty.additive
     assert weight is not None
     with naming(f"{design.name} [uncertainty]"):
         relative = design.uncertainty.multiplicative is not None
         discs = StatedDiscs(nominal, weight, "multiplicative" if relative else "additive")
-    return DesignSource(UncertainPlant(name, nominal, discs), origin)
+    return DesignSource(UncertainPlant(nominal, name=name, uncertainty=discs), origin)
 
 
 def _refuse_untold_integrators(path: Path, nominal: control.StateSpace, design: DesignFile) -> None:
@@ -280,9 +282,11 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
                 return replace(_stated(path.stem, nominal, design, origin), remarks=remarks)
             remarks = tuple(words(item) for item in (*fitted.verdicts, *fitted.warnings))
             if about.ellipses == "fitted":
-                plant = UncertainPlant(path.stem, nominal, fitted.posterior, level=response.level)
+                plant = UncertainPlant(
+                    nominal, name=path.stem, uncertainty=fitted.posterior, level=response.level
+                )
                 return DesignSource(plant, "model fitted to a measured response", remarks)
-        plant = UncertainPlant(path.stem, nominal, response, level=response.level)
+        plant = UncertainPlant(nominal, name=path.stem, uncertainty=response, level=response.level)
     return DesignSource(plant, origin, (*remarks, *_inside(response, nominal)))
 
 

@@ -229,12 +229,12 @@ def from_reference(records: Sequence[Record], of: Literal["input", "output"]) ->
     """Records of the loop: its reference as the input, and the command or the motion as the output."""
     return [
         Record(
-            record.name,
             np.asarray(record.reference),
             getattr(record, of),
             record.dt_s,
-            record.reference_names,
-            record.input_names if of == "input" else record.output_names,
+            name=record.name,
+            input_names=record.reference_names,
+            output_names=record.input_names if of == "input" else record.output_names,
         )
         for record in records
     ]

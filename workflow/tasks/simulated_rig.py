@@ -149,12 +149,12 @@ def simulate_point(config: JointsConfig, source: TwoJointSource, point: Operatin
     lines = multisine_lines(period, source.dt_s, source.band_Hz)
     u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
     return Record(
-        point.name,
         u,
         machine.run(u),
         source.dt_s,
-        tuple(joint.input for joint in config.joints),
-        tuple(joint.output for joint in config.joints),
+        name=point.name,
+        input_names=tuple(joint.input for joint in config.joints),
+        output_names=tuple(joint.output for joint in config.joints),
         input_units=("V",) * 2,
         output_units=("rad",) * 2,
     )

@@ -6,10 +6,10 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
+from ident.comparators.polynomial_fits import PolynomialModel, armax, arx, oe
+from ident.comparators.prediction_error import prediction_errors, prediction_jacobian
+from ident.comparators.stable_sections import from_sections, sections_derivative, stabilised, to_sections
 from tests.ident.benchmark_plants import as_record, p1
-from validation.comparators.comparators import PolynomialModel, armax, arx, oe
-from validation.comparators.prediction_error import prediction_errors, prediction_jacobian
-from validation.comparators.stable_sections import from_sections, sections_derivative, stabilised, to_sections
 
 A = np.poly([0.9 * np.exp(0.5j), 0.9 * np.exp(-0.5j)]).real
 B = np.array([1.0, 0.5])

@@ -8,15 +8,15 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.signal import lfilter
 
-from ident.data.arrays import RealArray
-from validation.comparators.polynomial_model import PolynomialModel
-from validation.comparators.stable_sections import (
+from ident.comparators.polynomial_model import PolynomialModel
+from ident.comparators.stable_sections import (
     LARGEST,
     from_sections,
     sections_derivative,
     stabilised,
     to_sections,
 )
+from ident.data.arrays import RealArray
 
 _ONE = np.ones(1)
 _ITERATIONS = 100
@@ -63,7 +63,7 @@ def best_end(starts: Sequence[PolynomialModel], u: RealArray, y: RealArray) -> P
 def _minimise(start: PolynomialModel, u: RealArray, y: RealArray) -> tuple[PolynomialModel, float]:
     """Local minimum of the sum of squared prediction errors from a start, over stable C and F.
 
-    Levenberg-Marquardt in column-scaled coordinates (`validation.comparators.stable_sections` for C and F),
+    Levenberg-Marquardt in column-scaled coordinates (`ident.comparators.stable_sections` for C and F),
     with coordinates at a bound held there while the gradient points outwards: the fits of an integrator lie
     there, where a method that keeps inside its bounds crawls. Ends when the cost stands still, at the latest
     after 100 Jacobians. Returns the polynomials and their cost, never above that of the (stabilised) start.

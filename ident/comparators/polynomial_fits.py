@@ -1,4 +1,4 @@
-"""The methods the paper compares with (Figs. 3, 4, 6): ARX (FIR is its case na = 0), ARMAX and OE.
+"""The polynomial methods that GOBF models are compared with: ARX (FIR is its case na = 0), ARMAX and OE.
 
 All of them take one single-input single-output record; offsets are not estimated, so subtract means where a
 signal has one. `delay_samples` = 1 (the default) is a plant without direct term.
@@ -9,10 +9,8 @@ from __future__ import annotations
 import numpy as np
 
 from ident.basis.structure import filter_input
-from ident.data.arrays import RealArray
-from ident.data.record import Record
-from validation.comparators.polynomial_model import PolynomialModel
-from validation.comparators.prediction_error import (
+from ident.comparators.polynomial_model import PolynomialModel
+from ident.comparators.prediction_error import (
     arx_polynomials,
     best_end,
     monic,
@@ -20,7 +18,9 @@ from validation.comparators.prediction_error import (
     shifted,
     steiglitz_mcbride,
 )
-from validation.comparators.stable_sections import stabilised
+from ident.comparators.stable_sections import stabilised
+from ident.data.arrays import RealArray
+from ident.data.record import Record
 
 _ONE = np.ones(1)
 
@@ -33,7 +33,7 @@ def arx(record: Record, na: int, nb: int, *, delay_samples: int = 1) -> Polynomi
     """
     u, y = _signals(record, delay_samples, {"na": (na, 0), "nb": (nb, 1)})
     a, b = arx_polynomials(u, y, na, nb)
-    return PolynomialModel(a, b, _ONE, _ONE).of(record, delay_samples)
+    return PolynomialModel(a, b, _ONE, _ONE).of(record, delay_samples, "ARX")
 
 
 def oe(
@@ -50,7 +50,7 @@ def oe(
     if arx_start:
         a, b = arx_polynomials(u, y, nf, nb)
         starts.append(PolynomialModel(_ONE, b, _ONE, stabilised(a)))
-    return best_end(starts, u, y).of(record, delay_samples)
+    return best_end(starts, u, y).of(record, delay_samples, "OE")
 
 
 def armax(
@@ -74,7 +74,7 @@ def armax(
         shared = min(nc, na) + 1
         c[:shared] = found.f[:shared]
         starts.append(PolynomialModel(found.f, found.b, stabilised(c), _ONE))
-    return best_end(starts, u, y).of(record, delay_samples)
+    return best_end(starts, u, y).of(record, delay_samples, "ARMAX")
 
 
 def _two_stage(u: RealArray, y: RealArray, na: int, nb: int, nc: int) -> PolynomialModel:

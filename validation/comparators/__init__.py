@@ -1,1 +1,0 @@
-"""What identification is compared with: ARX, OE, ARMAX."""
