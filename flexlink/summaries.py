@@ -390,7 +390,7 @@ def _diagnosis_headline(result: Diagnosis, added: Sequence[str]) -> str:
 
 
 def _sizes(result: Diagnosis, effects: Sequence[str]) -> str:
-    from workflow.diagnose.words import times_noise
+    from workflow.describe.diagnosis_words import times_noise
 
     sizes = f"{times_noise(result.gap_before)} nominal"
     if result.deviations:
