@@ -32,16 +32,18 @@ from workflow.describe.diagnosis_words import (
     times_noise,
     value_words,
 )
-from workflow.describe.facts import Picture
-from workflow.describe.page import (
+from workflow.describe.facts import (
     Block,
-    FileText,
     FirstScreen,
     Page,
     PageSection,
+    Picture,
+    Remarks,
     Sketch,
     Table,
-    Warnings,
+    Text,
+    file_link,
+    file_text,
     link,
 )
 from workflow.describe.where import at_length, in_short
@@ -140,10 +142,13 @@ def rig_page(
     )
     first = FirstScreen(
         headline(view),
+        "plain",
         numbers(view),
         first_bullets(view, in_short(view.place, view.floor), advice),
-        (picture,),
-        _files_to_take(view, bool(effects_text)),
+        picture,
+        "findings",
+        "Findings",
+        below=_files_to_take(view, bool(effects_text)),
     )
     case_name = view.found.case.name
     sections = (
@@ -156,7 +161,7 @@ def rig_page(
             "unchecked",
             "What was not checked",
             "Not checked",
-            (Warnings(unchecked_of_rig(view, simulated_loop=check is not None)),),
+            (Remarks(unchecked_of_rig(view, simulated_loop=check is not None), "warning"),),
         ),
         _reproduce_section(view, provenance, rig_text, effects_text),
     )
@@ -203,9 +208,7 @@ def own_plant_page(
         f"{runs_away if answer.replays else ''}",
         (answer,),
     )
-    pictures: tuple[Block, ...] = (picture,)
-    if moving:
-        pictures += (Sketch(moving, _moving_caption(answer.models[-1])),)
+    sketches = (Sketch(moving, _moving_caption(answer.models[-1])),) if moving else ()
     sections = [*common_sections(view, ())]
     if can_show:
         whatever = (
@@ -213,20 +216,23 @@ def own_plant_page(
             "distinguish. Whether one is present is the answer above."
         )
         sections.insert(
-            0, PageSection("check", "What these records can tell", "Check", (whatever, *can_show))
+            0, PageSection("check", "What these records can tell", "Check", (Text(whatever), *can_show))
         )
     unchecked = (
         _ONLY_CANDIDATES,
         "" if answer.case.plant.settled else "Every record is assumed to start as the simulation does.",
         "" if answer.deviations else _NOMINAL_IS_EXACT,
     )
-    files = FileText("Parameters and effects to put into the simulation", numbers_text)
+    files = file_text("Parameters and effects to put into the simulation", numbers_text)
     sections.append(
-        PageSection("unchecked", "What was not checked", "Not checked", (Warnings(unchecked), files))
+        PageSection(
+            "unchecked", "What was not checked", "Not checked", (Remarks(unchecked, "warning"), files)
+        )
     )
-    return Page(
-        answer.case.name, FirstScreen(headline(view), numbers(view), bullets, pictures), tuple(sections)
+    first = FirstScreen(
+        headline(view), "plain", numbers(view), bullets, picture, "findings", "Findings", beside=sketches
     )
+    return Page(answer.case.name, first, tuple(sections))
 
 
 def _of_repaired_file(view: DiagnosisView, file: str) -> tuple[str, ...]:
@@ -237,7 +243,7 @@ def _of_repaired_file(view: DiagnosisView, file: str) -> tuple[str, ...]:
     replay = ", and what a replay of a delay needs" if has_delay else ""
     return (
         Markup("The repaired model is {}. Its first lines list what was changed{}.").format(
-            link(file, file), replay
+            file_link(file), replay
         ),
     )
 
@@ -267,7 +273,9 @@ def _files_to_take(view: DiagnosisView, has_effects: bool) -> tuple[Block, ...]:
         effects = names_words(change.id for change in view.found.repair)
         files += f" and {name}.effects.toml ({effects})"
     return (
-        Markup("<b>{}</b> {}. Both also stand under {}.").format(take, files, link("Reproduce", "#made")),
+        Text(
+            Markup("<b>{}</b> {}. Both also stand under {}.").format(take, files, link("made", "Reproduce"))
+        ),
     )
 
 
@@ -309,7 +317,7 @@ def _where_section(view: DiagnosisView) -> PageSection:
         "Where it lies",
         "Where",
         (
-            *at_length(place, view.floor, model),
+            *map(Text, at_length(place, view.floor, model)),
             Picture(
                 "gap_bands",
                 f"Size above {floor}, nominal parameters re-estimated. Pale: not significant.",
@@ -343,7 +351,7 @@ def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection
     for name in suspected:
         part = " and is part of the answer" if name in answer.combination else ""
         probability = probability_words(answer.presence(name))
-        blocks.append(f"You asked about {in_words(name)}: probability {probability}{part}.")
+        blocks.append(Text(f"You asked about {in_words(name)}: probability {probability}{part}."))
     blocks.append(
         Picture(
             "gap_probabilities",
@@ -352,7 +360,7 @@ def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection
         )
     )
     possible = presence_table(view)
-    if possible.lines:
+    if possible.rows:
         blocks.append(possible)
     # One answer that is accepted explains what the numbers above say already.
     if view.partial and (not answer.combination or len(view.partial) > 1):
@@ -364,7 +372,7 @@ def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection
             (_SUBSYSTEMS.get(name, name.replace("_", " ")), probability_words(probability))
             for name, probability in by_probability
         ]
-        blocks.append(Table.of(("subsystem", "probability"), lines, "The same, added up by subsystem."))
+        blocks.append(Table(("subsystem", "probability"), tuple(lines), "The same, added up by subsystem."))
     return PageSection("which", "Which effect, and how sure", "Which", tuple(blocks))
 
 
@@ -380,9 +388,9 @@ def presence_table(view: DiagnosisView) -> Table:
             bounds = f"{interval(effect.intervals[key], 5)}{remark}"
             lines.append((*of_effect, stated_name(key), value_words(key, value, 5), bounds))
             of_effect = ("", "", "")
-    return Table.of(
+    return Table(
         ("effect", "present", "explains", "parameter", "value", "95 % interval"),
-        lines,
+        tuple(lines),
         "Effects that the records do not exclude. Explains: share of the validation error.",
     )
 
@@ -390,7 +398,7 @@ def presence_table(view: DiagnosisView) -> Table:
 def _explained_section(view: DiagnosisView) -> PageSection:
     blocks: list[Block] = []
     carried = carried_table(view)
-    if carried.lines:
+    if carried.rows:
         blocks.append(carried)
     blocks += [left_table(view), experiments_table(view)]
     return PageSection("closure", "What the effects explain", "Explained", tuple(blocks))
@@ -410,7 +418,7 @@ def carried_table(view: DiagnosisView) -> Table:
             cells = (in_words(name), percentage(explained), f"{percentage(low)} to {percentage(high)}")
             significant = ("no" if name in answer.shares.small else "yes",) if answer.combination else ()
             lines.append((*cells, *significant))
-    return Table.of(head, lines, caption)
+    return Table(head, tuple(lines), caption)
 
 
 def left_table(view: DiagnosisView) -> Table:
@@ -436,7 +444,7 @@ def left_table(view: DiagnosisView) -> Table:
             cells += [percentage(shares.horizon_before[k]), percentage(shares.horizon_after[k])]
         lines.append(tuple(cells))
     models = [MODELS[model] for model in answer.models]
-    return Table.of(("output", *models, "sensor noise", *in_windows), lines, f"{caption}.")
+    return Table(("output", *models, "sensor noise", *in_windows), tuple(lines), f"{caption}.")
 
 
 def experiments_table(view: DiagnosisView) -> Table:
@@ -453,7 +461,7 @@ def experiments_table(view: DiagnosisView) -> Table:
         if view.rough
         else "Residual over noise, RMS."
     )
-    return Table.of(("experiment", "role", *(MODELS[model] for model in answer.models)), lines, caption)
+    return Table(("experiment", "role", *(MODELS[model] for model in answer.models)), tuple(lines), caption)
 
 
 def role_words(role: str) -> str:
@@ -463,11 +471,11 @@ def role_words(role: str) -> str:
 
 def _remains_section(view: DiagnosisView) -> PageSection:
     answer = view.shown
-    blocks: list[Block] = [*remaining_sentences(view)]
+    blocks: list[Block] = [Text(words) for words in remaining_sentences(view)]
     if answer.added:
         blocks += [
-            in_short(view.remains, view.floor),
-            *at_length(view.remains, view.floor, "the effects added"),
+            Text(in_short(view.remains, view.floor)),
+            *map(Text, at_length(view.remains, view.floor, "the effects added")),
             Picture(
                 "gap_dependences",
                 "What the remaining error depends on.",
@@ -502,7 +510,7 @@ def nominal_table(view: DiagnosisView) -> Table:
         if answer.added:
             cells.append(signed(without_effects[key]))
         lines.append(tuple(cells))
-    return Table.of(head, lines, "Values that have a tolerance.")
+    return Table(head, tuple(lines), "Values that have a tolerance.")
 
 
 # -- sections of a rig ---------------------------------------------------------------------------------------
@@ -522,9 +530,9 @@ def _next_section(view: DiagnosisView, proposed: ProposedExperiment) -> PageSect
         (" / ".join(pair.hypotheses), number(pair.standard_deviations), number(pair.log_bayes_factor))
         for pair in experiment.separations
     ]
-    table = Table.of(
+    table = Table(
         ("competing hypotheses", "apart by [standard deviations]", "expected log Bayes factor"),
-        lines,
+        tuple(lines),
         "Free parameters of both are fitted first.",
     )
     return PageSection("next", "The proposed experiment", "Next", (picture, table))
@@ -543,7 +551,7 @@ _NO_CHECK = {
 def controller_blocks(check: ControllerCheck | None, no_check: str) -> tuple[Block, ...]:
     """What the model error does to a controller, or why that is not known."""
     if check is None:
-        return (_NO_CHECK.get(no_check, f"No controller to compare: {no_check}."),)
+        return (Text(_NO_CHECK.get(no_check, f"No controller to compare: {no_check}.")),)
     nominal, nominal_reached, repaired, repaired_reached = check.runs
     trial = check.trial
     asked = check.specification
@@ -570,23 +578,24 @@ def controller_blocks(check: ControllerCheck | None, no_check: str) -> tuple[Blo
         )
         for run in check.runs
     ]
-    table = Table.of(
+    table = Table(
         ("designed on", "run on", "cost [s]", "modulus margin", "peak voltage [V]", "settles"),
-        lines,
+        tuple(lines),
         "Cost: integral of the squared tip error over the squared move. Specification: bandwidth "
         f"{number(asked.bandwidth_rad_s)} rad/s, modulus margin {number(asked.modulus_margin)}, effort "
         f"{number(asked.effort_limit)} V/rad, {order}. On the machine the "
         "margin is one over the largest measured sensitivity.",
     )
-    return (
+    with_nominal = (
         "Designed with the nominal parameters, the loop is predicted to have a cost of "
         f"{number(nominal.cost_s)} s and a modulus margin of {number(nominal.modulus_margin)}. Simulated on "
-        f"the repaired model it reaches {_reached(nominal_reached, nominal)}",
-        f"Designed on the repaired model: predicted {number(repaired.cost_s)} s and "
-        f"{number(repaired.modulus_margin)}, reached {_reached(repaired_reached, repaired)}",
-        picture,
-        table,
+        f"the repaired model it reaches {_reached(nominal_reached, nominal)}"
     )
+    with_repaired = (
+        f"Designed on the repaired model: predicted {number(repaired.cost_s)} s and "
+        f"{number(repaired.modulus_margin)}, reached {_reached(repaired_reached, repaired)}"
+    )
+    return (Text(with_nominal), Text(with_repaired), picture, table)
 
 
 def _reached(achieved: Run, predicted: Run) -> str:
@@ -634,18 +643,18 @@ def _reproduce_section(
         words = provenance.descriptions.get(experiment.name.split(" (")[0], "")
         samples = str(experiment.voltage_V.size)
         lines.append((experiment.name, role_words(experiment.role), experiment.kind, loop, samples, words))
-    experiments = Table.of(("experiment", "role", "input", "loop", "samples", "description"), lines)
-    made_of = Table.of(
+    experiments = Table(("experiment", "role", "input", "loop", "samples", "description"), tuple(lines))
+    made_of = Table(
         ("what", "value"),
-        [
+        (
             ("rig file", provenance.rig_file),
             ("SHA-256 of all inputs", provenance.input_sha256),
             ("simulations", str(view.found.simulations)),
             *provenance.versions,
-        ],
+        ),
         "The result is deterministic: the same files and versions give the same page.",
     )
-    files = [FileText("Repaired rig file", rig_text)]
+    files = [file_text("Repaired rig file", rig_text)]
     if effects_text:
-        files.append(FileText("Effects to add", effects_text))
+        files.append(file_text("Effects to add", effects_text))
     return PageSection("made", "To reproduce this", "Reproduce", (experiments, made_of, *files))

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, ClassVar, Literal, TypeAlias
+from urllib.parse import quote
 
 from markupsafe import Markup
 
@@ -232,13 +233,23 @@ class Fold:
 
 
 @dataclass(frozen=True)
+class Sketch:
+    """An image that is no drawing of `workflow.figures`. image: SVG of ours."""
+
+    image: Markup
+    caption: str
+    kind: ClassVar[str] = "sketch"
+
+
+@dataclass(frozen=True)
 class PageSection:
-    """A part of a page, folded at first; short: what the contents call it."""
+    """A part of a page; short: what the contents call it; open: not folded at first."""
 
     anchor: str
     title: str
     short: str
     blocks: tuple[Block, ...]
+    open: bool = False
 
 
 @dataclass(frozen=True)
@@ -250,27 +261,51 @@ class FirstScreen:
         state: "certified", "refused" or "plain".
         rows: At most five are shown.
         bullets: Sentences, the weightiest first; those behind the fifth fold.
-        picture: Below the numbers.
+        picture: Below the numbers; None without one.
         anchor: Where links to it lead.
         short: What the contents call it.
+        beside: Behind the picture.
+        below: Behind the bullets.
     """
 
     headline: str
     state: State
     rows: tuple[Row, ...]
     bullets: tuple[str, ...]
-    picture: Picture
+    picture: Picture | None = None
     anchor: str = "verdict"
     short: str = "Verdict"
+    beside: tuple[Block, ...] = ()
+    below: tuple[Block, ...] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """A whole page. wide: its tables have many columns."""
+
+    title: str
+    first: FirstScreen
+    sections: tuple[PageSection, ...]
+    wide: bool = False
 
 
 State: TypeAlias = Literal["certified", "refused", "plain"]
-Block: TypeAlias = Text | Heading | Remarks | Table | Picture | Copy | Code | Fold
+Block: TypeAlias = Text | Heading | Remarks | Table | Picture | Copy | Code | Fold | Sketch
 
 
 def link(anchor: str, words: str) -> Markup:
     """A link inside a page."""
     return Markup('<a href="#{}">{}</a>').format(anchor, words)
+
+
+def file_link(file: str, words: str = "") -> Markup:
+    """A link to a file beside the page, in words, else by its name; both may come from a user."""
+    return Markup('<a href="{}">{}</a>').format(quote(file), words or file)
+
+
+def file_text(title: str, text: str) -> Fold:
+    """A file as it stands, folded."""
+    return Fold(title, (Code(text),))
 
 
 def worded(name: str, text: str, *, key: str = "", verdict: Verdict = Verdict.NONE) -> Row:

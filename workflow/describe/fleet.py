@@ -25,8 +25,19 @@ from workflow.describe.diagnosis_words import (
     times_noise,
     value_words,
 )
-from workflow.describe.facts import Picture, Quantity, Row, Section
-from workflow.describe.page import FirstScreen, Line, Page, PageSection, Table, Warnings, link
+from workflow.describe.facts import (
+    Block,
+    FirstScreen,
+    Page,
+    PageSection,
+    Picture,
+    Quantity,
+    Remarks,
+    Row,
+    Section,
+    Table,
+    file_link,
+)
 from workflow.text.formats import count, listing, sentence
 from workflow.text.names import stated_name
 
@@ -267,7 +278,7 @@ def overview_page(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -
     bullets += [sentence(trend_words(trend)) for trend in trends(machines)]
     sections = []
     causes = causes_table(machine_groups)
-    if causes.lines:
+    if causes.rows:
         sections.append(PageSection("causes", "Machines of one cause", "Causes", (causes,), open=True))
     if machines:
         picture = Picture(
@@ -275,20 +286,14 @@ def overview_page(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -
             "RMS of (measured - model) over the sensor noise, validation records.",
             (machines,),
         )
-        drawn = (picture,) if len(machines) <= _MOST_DRAWN else ()
-        blocks = (*drawn, cases_table(machines))
+        blocks: tuple[Block, ...] = (cases_table(machines),)
+        if len(machines) <= _MOST_DRAWN:
+            blocks = (picture, *blocks)
         sections.append(PageSection("cases", "All cases", "Cases", blocks, open=True))
     if failed:
-        reasons = Warnings(tuple(f"{case}: {reason}" for case, reason in failed.items()))
+        reasons = Remarks(tuple(f"{case}: {reason}" for case, reason in failed.items()), "warning")
         sections.append(PageSection("failed", "Cases without an answer", "Failed", (reasons,), open=True))
-    first = FirstScreen(
-        outcome_words(machines, failed),
-        (),
-        tuple(bullets),
-        anchor="verdict",
-        short="Outcome",
-        all_bullets=True,
-    )
+    first = FirstScreen(outcome_words(machines, failed), "plain", (), tuple(bullets), short="Outcome")
     return Page("Gap diagnosis", first, tuple(sections))
 
 
@@ -312,7 +317,7 @@ def _group_words(group: Group) -> str:
         key = group.apart[1]
         _, low, high = group.sizes[group.apart]
         words += f", {stated_name(key)} {value_words(key, low)} to {value_words(key, high)}"
-    names = [link(machine.name, f"{machine.name}.html") for machine in group.machines[:_MOST_NAMED]]
+    names = [file_link(f"{machine.name}.html", machine.name) for machine in group.machines[:_MOST_NAMED]]
     more = ", …" if len(group.machines) > _MOST_NAMED else ""
     return Markup("{} ({}{})").format(words, Markup(", ").join(names), more)
 
@@ -326,9 +331,9 @@ def causes_table(machine_groups: Sequence[Group]) -> Table:
             values = [value_words(key, size) for size in sizes]
             lines.append((*of_group, in_words(effect), stated_name(key), *values))
             of_group = ("", "")
-    return Table.of(
+    return Table(
         ("cause", "machines", "effect", "parameter", "median", "smallest", "largest"),
-        lines,
+        tuple(lines),
         "A row of everything for each machine: fleet.csv.",
     )
 
@@ -345,8 +350,8 @@ def cases_table(machines: Sequence[FleetMachine]) -> Table:
             times_noise(machine.numbers["gap_before"]),
             times_noise(machine.numbers["gap_after"]),
             machine.closed,
-            link(file, file),
+            file_link(file),
         )
-        lines.append(Line(cells))
+        lines.append(cells)
     head = ("case", "answer", "probability", "error before", "error after", "explained", "page")
     return Table(head, tuple(lines), "Explained: with its 95 % interval.")

@@ -8,8 +8,16 @@ from markupsafe import Markup
 
 from ident.data.text_tables import Layout
 from ident.data.time_grid import LARGEST_JITTER
-from workflow.describe.facts import Picture, Quantity, Row, Section
-from workflow.describe.page import FirstScreen, Page, PageSection, Table
+from workflow.describe.facts import (
+    FirstScreen,
+    Page,
+    PageSection,
+    Picture,
+    Quantity,
+    Row,
+    Section,
+    Table,
+)
 from workflow.tasks.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
 from workflow.text.findings.sentences import words as finding_words
 from workflow.text.formats import count, number, share as percentage, si, sparkline
@@ -174,16 +182,18 @@ def look_page(found: LogLook, next_command: str) -> Page:
     if found.taken_as:
         roles = "; ".join(f"{role}: {name}" for role, name in found.taken_as.items())
         bullets.append(f"Taken as {roles}")
-    signals = Table.of(
-        ("column", "what it holds"), [(column.name, signal_words(column)) for column in found.columns]
+    signals = Table(
+        ("column", "what it holds"),
+        tuple((column.name, signal_words(column)) for column in found.columns),
     )
     first = FirstScreen(
         f"{count(found.rows, 'row')}, {count(len(found.columns), 'signal')}",
+        "plain",
         (),
         tuple(bullets),
-        (Picture("log", "Every column of numbers.", (found,)),),
-        anchor="file",
-        short="File",
+        Picture("log", "Every column of numbers.", (found,)),
+        "file",
+        "File",
     )
     sections = (PageSection("signals", "Signals", "Signals", (signals,), open=True),)
     return Page(f"Log {found.path.name}", first, sections)

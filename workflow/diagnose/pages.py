@@ -20,7 +20,7 @@ from workflow.describe.diagnosis_page import (
     rig_page,
 )
 from workflow.describe.diagnosis_view import DiagnosisView
-from workflow.describe.page import Table
+from workflow.describe.facts import Table
 from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_files import LoadedCase
 from workflow.diagnose.following import Following
@@ -127,7 +127,7 @@ def plant_page(
 def _can_show(told: RunSummary) -> list[Table]:
     """What records can tell; a next record is advised for the answer, not for all that could be one."""
     return [
-        Table.of((section.title, ""), [(row.name, row.text) for row in section.rows])
+        Table((section.title, ""), tuple((row.name, row.text) for row in section.rows))
         for section in told.sections
         if section.title != "next record"
     ]

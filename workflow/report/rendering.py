@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from workflow.describe.page import Page
+from workflow.describe.facts import Page
 from workflow.figures.style import drawings
 from workflow.figures.svg import COMMON_STYLE, Drawn, drawn, style_of
 from workflow.text.templates import environment
@@ -69,7 +69,15 @@ def render_page(
 
 def render_described(page: Page, progress: Callable[[float, str], None] | None = None) -> RenderedPage:
     """A page whose sentences `workflow.describe` has made; equal pages give equal bytes."""
-    return render_page("described.html.j2", progress, title=page.title, page=page)
+    return render_page(
+        "report.html.j2",
+        progress,
+        title=page.title,
+        first=page.first,
+        parts=page.sections,
+        study=False,
+        wide=page.wide,
+    )
 
 
 @dataclass(frozen=True)

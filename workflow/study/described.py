@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from workflow.describe.facts import Picture, Quantity, Row, Section, Verdict
-from workflow.describe.page import (
-    Block,
-    FileText,
+from workflow.describe.facts import (
     FirstScreen,
     Fold,
-    Line,
     Page,
     PageSection,
+    Picture,
+    Quantity,
+    Remarks,
+    Row,
+    Section,
     Table,
-    Warnings,
-    link,
+    Text,
+    file_link,
+    file_text,
 )
 from workflow.describe.summary import RunSummary
 from workflow.study.columns import StudyColumn
@@ -165,11 +167,10 @@ def study_page(study: StudyView) -> Page:
     ]
     first = FirstScreen(
         headline(study),
+        "certified" if any(row.good for row in study.rows) else "refused",
         tuple(_best_row(study, column, row) for column, row in study.best),
         tuple(reasons[:_FIRST_REASONS]) or ("All points are certified",),
-        _pictures(study),
-        state="certified" if any(row.good for row in study.rows) else "refused",
-        anchor="verdict",
+        _picture(study),
         short="Outcome",
     )
     sections = [_points_section(study)]
@@ -178,7 +179,7 @@ def study_page(study: StudyView) -> Page:
         if len(reasons) > _MOST_REASONS:
             shown.append(f"{len(reasons) - _MOST_REASONS} reasons more: see table.csv.")
         sections.append(
-            PageSection("why", "What the other points miss", "Why not", (Warnings(tuple(shown)),))
+            PageSection("why", "What the other points miss", "Why not", (Remarks(tuple(shown), "warning"),))
         )
     left_out = left_out_words(study)
     without = f"{sentence(left_out)} " if left_out else ""
@@ -186,8 +187,8 @@ def study_page(study: StudyView) -> Page:
         f"Base: {study.base}. {without}Points: every combination of the axes. Points share records, model "
         "and ellipses unless an axis changes them. All points use the same random numbers."
     )
-    file = FileText("The study's file", study.text)
-    sections.append(PageSection("study", "How it was made", "Made", (made, file)))
+    file = file_text("The study's file", study.text)
+    sections.append(PageSection("study", "How it was made", "Made", (Text(made), file)))
     return Page(study.title, first, tuple(sections), wide=True)
 
 
@@ -200,9 +201,9 @@ def _best_row(study: StudyView, column: StudyColumn, row: PointRow) -> Row:
     return Row("", f"{largest} {column.label}", Quantity(text, value, unit), remark)
 
 
-def _pictures(study: StudyView) -> tuple[Block, ...]:
+def _picture(study: StudyView) -> Picture | None:
     if not study.config.pareto:
-        return ()
+        return None
     caption = (
         "Filled: certified, and every run settles at its reference. Coloured: on the Pareto front, where no "
         "other filled point is better in both. Grey: dominated. Hollow: not certified, or some run keeps "
@@ -210,28 +211,26 @@ def _pictures(study: StudyView) -> tuple[Block, ...]:
     )
     if any(row.lowered for row in study.rows):
         caption += " Ringed: certified at a lower bandwidth than specified."
-    return (Picture("pareto", caption, (study,)),)
+    return Picture("pareto", caption, (study,))
 
 
 def _points_section(study: StudyView) -> PageSection:
     lowered = any(row.lowered for row in study.rows)
     certified = study.known([name for name in _CERTIFIED if lowered or name != _OF_LOWERED])
     achieved = study.known(_ACHIEVED)
-    states, settled = [], []
-    for row in study.in_order:
-        states.append(_line(study, row, certified, row.state, Verdict.MET if row.good else Verdict.MISSED))
-        settled.append(_line(study, row, achieved, *_settled_draws(row)))
     certificate = Table(
         _head(study, certified, "state"),
-        tuple(states),
+        tuple(_cells(study, row, certified, row.state) for row in study.in_order),
         "Worst case over the uncertainty set. γ of 1 or less: the specification is met. γ of any order: a "
         "controller of some order reaches it.",
+        tuple(row.good for row in study.in_order),
     )
     over_time = Table(
         _head(study, achieved, "stop moving"),
-        tuple(settled),
+        tuple(_cells(study, row, achieved, settled_words(row)) for row in study.in_order),
         "Worst over the runs. A dash: some run never gets that far (settling: to 2 % of the step). Peak of "
         "S: predicted for the nominal loop; measured on the arm as identified, with friction.",
+        tuple(is_settled(row) for row in study.in_order),
     )
     more = (
         "table.csv and table.json have more numbers with every digit. Each point is a run directory: "
@@ -241,19 +240,22 @@ def _points_section(study: StudyView) -> PageSection:
         "points",
         "All points",
         "Points",
-        (certificate, Fold("Closed loop over time", (over_time,)), more),
+        (certificate, Fold("Closed loop over time", (over_time,)), Text(more)),
         open=len(study.rows) <= MOST_UNFOLDED,
     )
 
 
-def _settled_draws(row: PointRow) -> tuple[str, Verdict]:
-    """How many runs of a point stop moving; at rest beside the reference is not settled."""
-    settled, draws = row.numbers["settled_draws"], row.numbers["draws"]
-    words = "" if settled is None else f"{settled} of {draws}"
-    if draws is None:
-        return words, Verdict.NONE
-    met = settled == draws and row.state != "does not settle"
-    return words, Verdict.MET if met else Verdict.MISSED
+def settled_words(row: PointRow) -> str:
+    """How many runs of a point stop moving; "" where nobody looked."""
+    settled = row.numbers["settled_draws"]
+    return "" if settled is None else f"{settled} of {row.numbers['draws']}"
+
+
+def is_settled(row: PointRow) -> bool | None:
+    """Whether all runs of a point come to rest at the reference; None where there were none."""
+    if row.numbers["draws"] is None:
+        return None
+    return row.numbers["settled_draws"] == row.numbers["draws"] and row.state != "does not settle"
 
 
 def _head(study: StudyView, columns: Sequence[str], last: str) -> tuple[str, ...]:
@@ -261,7 +263,7 @@ def _head(study: StudyView, columns: Sequence[str], last: str) -> tuple[str, ...
     return ("point", *axes, *(study.heading(name) for name in columns), last)
 
 
-def _line(study: StudyView, row: PointRow, columns: Sequence[str], last: str, verdict: Verdict) -> Line:
-    page = link(str(row.number), f"points/{row.name}/")
+def _cells(study: StudyView, row: PointRow, columns: Sequence[str], last: str) -> tuple[str, ...]:
+    page = file_link(f"points/{row.name}/", str(row.number))
     values = [value_words(row.numbers[name]) for name in columns]
-    return Line((page, *study.asked(row).values(), *values, last), verdict)
+    return (page, *study.asked(row).values(), *values, last)
