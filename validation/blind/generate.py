@@ -123,9 +123,28 @@ def generate(
 ) -> list[Answer]:
     """Write the cases of a seed below `out` and return their answers; the same seed gives the same bytes.
 
-    finished: answers of cases that are there already (case name -> answer) and are not drawn again.
-    only, workshop: one sort of cases, and workshop cases instead of the usual ones.
-    keep: called with every answer as soon as its case is written.
+    Parameters
+    ----------
+    n_cases, seed : int
+    out : Path
+        Made where it is absent.
+    jobs : int
+        Processes.
+    open_cases : bool
+        Write answers and exact rigs beside the records.
+    only : str, optional
+        One sort of cases.
+    workshop : bool
+        Workshop cases instead of the usual ones.
+    finished : mapping of str to dict, optional
+        Answers of cases that are there already, by name: they are not drawn again.
+    keep : callable, optional
+        Called with every answer as soon as its case is written.
+
+    Raises
+    ------
+    StageError
+        One line: a case could not be made.
     """
     out.mkdir(parents=True, exist_ok=True)
     answers = dict(finished or {})

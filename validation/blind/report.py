@@ -64,7 +64,7 @@ def _table(scored: Mapping[str, Any]) -> str:
 
 
 def summary(document: Mapping[str, Any], out: Path) -> RunSummary:
-    """For the terminal."""
+    """Scores as the terminal shows them; document: all of scores.json, out: where the details are."""
     scored = document["diagnosis"]
     sections = []
     for part in _SLICES:

@@ -80,8 +80,22 @@ def redraw_paper(
     """Redraw Figs. 1-7 into `out`, new or empty: paper.html, figure-N.svg, table.csv, table.json.
 
     Nothing is written before everything is computed and drawn; then each file appears whole, the page last:
-    no page ever stands over other figures. With `replace` the files of an earlier call are exchanged, and
-    nothing else is touched. Raises InputError when `out` cannot be written or holds something.
+    no page ever stands over other figures.
+
+    Parameters
+    ----------
+    out : Path
+        A directory.
+    settings : PaperSettings, optional
+        Seed and sizes of the repetitions.
+    replace : bool
+        Exchange the files of an earlier call; nothing else is touched.
+    progress : Progress, optional
+
+    Raises
+    ------
+    InputError
+        One line: `out` cannot be written, or holds something.
     """
     settings = settings or PaperSettings()
     progress = progress or Progress()

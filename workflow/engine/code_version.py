@@ -14,7 +14,20 @@ _ONLY_DRAWING = ("workflow/figures", "workflow/report", "workflow/text")
 
 @cache
 def code_digest(*more: str, drawing: bool = False) -> str:
-    """SHA-256 over the Python files of the rooms and of `more`; with `drawing` also over what only draws."""
+    """SHA-256 over the code that makes a result.
+
+    Parameters
+    ----------
+    *more : str
+        Packages beside those of a run.
+    drawing : bool
+        Also over what only draws: a page is made of that, too.
+
+    Returns
+    -------
+    str
+        Hexadecimal; read once in a process.
+    """
     root = Path(__file__).resolve().parents[2]
     paths = [path for room in (*_ROOMS, *more) for path in sorted((root / room).rglob("*.py"))]
     if drawing:

@@ -129,7 +129,10 @@ def draw_sensitivities(
 
 
 def draw_curve(panel: Panel, curve: SensitivityCurve, level: float) -> None:
-    """Nominal, worst case over the ellipses of `level`, and limit of a closed-loop gain."""
+    """Draw a closed-loop gain over frequency: nominal, worst case over the ellipses, and limit.
+
+    level: probability of the ellipses, for the legend. A worst case that is not finite leaves a gap.
+    """
     omega = curve.omega_rad_s
     finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
     panel.fill_between(omega, curve.nominal, finite, **style.BAND)

@@ -338,7 +338,11 @@ class UncertainMember:
     bands: tuple[Band, ...]
 
     def at_rate(self, controller_dt_s: float, omega: RealArray) -> UncertainMember:
-        """The part as a controller of this period sees it; omega (F,): where both tell a response."""
+        """The part as a controller of this period [s] sees it.
+
+        omega (F,): frequencies that logs and controller both tell [rad/s], at which the nominal model is the
+        nearest one.
+        """
         step_s = self.posterior.dt_s
         posterior = resampled(self.posterior, controller_dt_s)
         poles = resampled_poles(self.nominal.poles, step_s, controller_dt_s)
@@ -428,7 +432,10 @@ class UncertainChannel:
         return 0 if report is None else len(report.ar_coefficients)
 
     def at_rate(self, controller_dt_s: float | None) -> UncertainChannel:
-        """The channel as a controller of this period sees it; None: of the step of the logs."""
+        """The channel as a controller of this period [s] sees it; None: at the step of the logs.
+
+        Ellipses are those at frequencies below both Nyquist frequencies.
+        """
         step_s = self.posterior.dt_s
         if controller_dt_s is None or ratio_of(step_s, controller_dt_s) == (1, 1):
             return self
