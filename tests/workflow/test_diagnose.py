@@ -2,6 +2,7 @@
 
 import ast
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -341,6 +342,18 @@ def test_a_failing_case_does_not_lose_the_others(cases, tmp_path, here):
         [*cases, tmp_path / "three"], tmp_path / "new", controller=False, engine=KnownAnswer((FRICTION,))
     )
     assert (beside.exit_code, len(beside.documents)) == (2, 2)
+
+
+def test_one_case_of_a_rig_is_diagnosed_in_the_process_of_the_command(cases, tmp_path, undrawn):
+    processes = []
+
+    def engine(case, **options):
+        processes.append(os.getpid())
+        return KnownAnswer((FRICTION,))(case, **options)
+
+    found = diagnose_cases(cases[:1], tmp_path / "out", controller=False, engine=engine)
+    assert found.exit_code == 0
+    assert processes == [os.getpid()]
 
 
 def test_a_single_case_that_fails_leaves_nothing(cases, tmp_path, here):

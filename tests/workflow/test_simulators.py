@@ -17,12 +17,13 @@ from diagnosis import Change
 from diagnosis.machine.telling import Alike, Telling, telling
 from plant.effects import in_words
 from tests.workflow.command import ROOT
+from tests.workflow.diagnosis_examples import KnownAnswer
 from workflow.describe.fleet import FleetMachine
 from workflow.diagnose import check
-from workflow.diagnose.command import _summary
+from workflow.diagnose.command import _summary, diagnose_cases
 from workflow.diagnose.simulator_case import load_simulator_case
 from workflow.diagnose.simulator_settings import settings_of
-from workflow.engine.errors import InputError
+from workflow.engine.errors import InputError, StageError
 
 # A model that multiplies.
 GAIN = """INPUTS, OUTPUTS, PARAMETERS = "motor", "hinge", {"k": 2.0}
@@ -122,6 +123,14 @@ def test_a_mujoco_model_is_diagnosed_and_comes_back_repaired(tmp_path, flexlink,
         case["replayed"]["hinge"]["stated"] = stated
         (section,) = _summary([case], [FleetMachine.of(case)], [], out / "arm.html").sections
         assert any("worse than nominal" in row.value for row in section.rows) == doubted
+
+
+@pytest.mark.slow
+def test_a_model_that_ends_its_process_does_not_end_the_command(arm):
+    case = loaded(arm, ONE).case.name
+    (arm / "case.toml").write_text(ONE)
+    with pytest.raises(StageError, match="died"):
+        diagnose_cases([arm / "case.toml"], arm / "out", controller=False, engine=KnownAnswer(dies=(case,)))
 
 
 def test_a_replay_of_a_delay_starts_with_the_commands_before_it(tmp_path, monkeypatch):
