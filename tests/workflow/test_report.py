@@ -156,7 +156,7 @@ def test_numbers_on_the_page_are_the_stages_numbers(drawn):
     for line in opened:
         assert line[1:] in text
     loop = results.closed_loop.check
-    assert f"{loop.predicted.rise_time_s:.3g}" in text
+    assert f"{loop.predicted.rise_time_s:.4g}" in text
     assert f"{max(run.overshoot_percent for run in loop.achieved):.3g}" in text
     manifest = drawn.manifest()
     assert "ab" * 32 in text

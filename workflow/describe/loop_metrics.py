@@ -34,4 +34,5 @@ LOOP_METRICS = (
     LoopMetric("overshoot_percent", "overshoot", "%"),
     LoopMetric("settling_time_s", "settling time to 2 %", "s"),
     LoopMetric("peak_command", "peak command", "", of_tracking=False),
+    LoopMetric("rise_time_s", "rise time 10-90 %", "s"),
 )

@@ -46,7 +46,6 @@ _ALL = (
     StudyColumn("mode_damping", "mode damping", "", "larger"),
     StudyColumn("mode_omega_rad_s", "of the mode at", "rad/s"),
     StudyColumn("settling_time_with_friction_s", "settling time with friction, longest", "s", "smaller"),
-    StudyColumn("rise_time_s", "rise time", "s", "smaller"),
     StudyColumn("disturbance_peak", "disturbance peak", "", "smaller"),
     StudyColumn("settled_draws", "runs that stop moving"),
     StudyColumn("draws", "runs"),
@@ -129,7 +128,6 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
             numbers["mode_omega_rad_s"] = least_damped.omega_rad_s
     check = results.closed_loop.check
     if check is not None:
-        numbers["rise_time_s"] = check.spread_of("rise_time_s")[-1]
         numbers["disturbance_peak"] = check.spread_of("disturbance_peak")[-1]
         # A run that never gets there has no time: neither has the point.
         rows = metric_rows(check, "", "")
