@@ -217,14 +217,19 @@ class Comparison(Shown):
         """
         from matplotlib.figure import Figure
 
+        # A figure of the caller's keeps its settings; a new one only makes room for the labels.
         record = self.validation
         rows = self._rows(from_s, to_s)
         axes = Figure(layout="constrained").subplots() if ax is None else ax
+
+        # What was measured is black, the models have the colours of the caller's cycle.
         time_s = record.time_s[rows]
         curves = [axes.plot(time_s, record.output[rows, 0], color="black", label="measured")[0]]
         for model in self.models:
             label = f"{model.name}: {model.fit_percent:.1f} %"
             curves += axes.plot(time_s, model.simulated[rows], label=label)
+
+        # Units as the log says them; without any the name stands alone.
         unit = record.output_units[0] if record.output_units else ""
         axes.set_xlabel("time [s]")
         axes.set_ylabel(f"{record.output_names[0]} [{unit}]" if unit else record.output_names[0])
@@ -240,6 +245,7 @@ class Comparison(Shown):
         record = self.validation
         if from_s is None and to_s is None:
             return liveliest(record.output[:, 0], min(_DRAWN_SAMPLES, record.n_samples))
+        # The samples that lie between the two times, both ends counted.
         begin = 0 if from_s is None else int(np.ceil(from_s / record.dt_s))
         end = record.n_samples if to_s is None else int(np.floor(to_s / record.dt_s)) + 1
         rows = slice(max(begin, 0), min(end, record.n_samples))
@@ -307,6 +313,8 @@ def compare(
             "flexlink.Record(u=u, y=y, dt_s=dt_s); to draw responses together: flexlink.bode(first, second)"
         )
     validation.refuse_several()
+
+    # Names go with the models one by one; a single one may stand by itself.
     given_names = [names] if isinstance(names, str) else list(names)
     if not models:
         raise WrongArgumentError(f"compare: expected models after the record: {_EXPECTED}")
@@ -314,6 +322,8 @@ def compare(
         raise WrongArgumentError(
             f"compare: expected a name for each model; got {len(given_names)} names of {len(models)} models"
         )
+
+    # Each model is run as what made it runs it, and refused under its number.
     compared = []
     for number, model in enumerate(models, 1):
         result = _on_record(model, validation, f"compare: model {number}")
@@ -339,6 +349,7 @@ def _on_record(model: Any, record: Record, what: str) -> ComparedModel:
         return _gobf_on_record(model, record, what)
     if isinstance(model, np.ndarray | list) and np.ndim(model) == 1:
         return _impulse_on_record(np.asarray(model, dtype=np.float64), record, what)
+    # Everything else has a state space: one free run and one predictor serve all of them.
     state_model = _innovation_model(model, record, what)
     _refuse_other_step(state_model.dt_s, record, what)
     measured = record.output[:, 0]
@@ -363,6 +374,8 @@ def _innovation_model(model: Any, record: Record, what: str) -> InnovationModel:
     if isinstance(model, PolynomialModel):
         return model.innovation_form()
     name = type(model).__name__
+
+    # Numbers and systems of scipy become systems of python-control first.
     if isinstance(model, tuple):
         if len(model) != 3:
             raise WrongArgumentError(f"{what} is a tuple of {len(model)}; expected (num, den, dt_s)")
@@ -382,9 +395,11 @@ def _innovation_model(model: Any, record: Record, what: str) -> InnovationModel:
 
 def _gobf_on_record(model: Any, record: Record, what: str) -> ComparedModel:
     """A GOBF model, or a result that has one, on a record, run as validation runs it."""
+    # A result of an identification has the model, and the noise that was found beside it.
     bare_model = getattr(model, "model", model)
     _refuse_other_step(bare_model.dt_s, record, what)
     fresh = fit_on_fresh_data(bare_model, record)
+    # The first rows answer to an input before the record, where the model has a delay.
     simulated = np.full(record.n_samples, np.nan)
     simulated[record.n_samples - fresh.simulated.size :] = fresh.simulated
     one_step = np.nan
@@ -411,6 +426,7 @@ def _impulse_on_record(impulse: RealArray, record: Record, what: str) -> Compare
             f"{what} is an impulse response of {impulse.size} samples; expected 1 to fewer than the "
             f"{record.n_samples} of {record.label}"
         )
+    # Before this row it asks for inputs that were not recorded. A constant is fitted, as for other models.
     first = impulse.size - 1
     measured = record.output[first:, 0]
     response = lfilter(impulse, [1.0], record.input[:, 0])[first:]
@@ -450,6 +466,7 @@ def _timed(fit: Callable[[], ModelT]) -> ModelT:
 
 def _label_beside(axes: Any, curves: Sequence[Any]) -> None:
     """Write the label of each curve to the right of its end, in its colour, none over another."""
+    # Where each curve ends, as a share of the height of the axes.
     low, high = axes.get_ylim()
     figure = axes.figure
     height_in = axes.get_position().height * figure.get_size_inches()[1]
@@ -459,6 +476,8 @@ def _label_beside(axes: Any, curves: Sequence[Any]) -> None:
         finite = values[np.isfinite(values)]
         last = finite[-1] if finite.size else low
         ends.append(float(np.clip((last - low) / (high - low), 0.0, 1.0)))
+
+    # Two labels need a line of text between them.
     letters_in = _font_points() / 72
     step = _LABEL_HEIGHT * letters_in / height_in
     order = np.argsort(ends)

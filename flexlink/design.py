@@ -80,9 +80,31 @@ def synthesise(
 ) -> SynthesisResult:
     """Design one controller for one or several uncertain plants.
 
-    plants: an `UncertainPlant` or what makes one (ss, tf, a model), or several. rng: a generator, or the seed
-    of one. settings: fields of `SynthesisOptions`, instead of `options`. Others as in
-    `control_design.synthesise`. Raises SpecificationError where no controller can meet the specification.
+    Parameters
+    ----------
+    plants : UncertainPlant or what makes one, or a sequence of them
+        A system of python-control (ss, tf), a model or an uncertainty makes one.
+    specification : Specification
+    options : SynthesisOptions, optional
+        Or its fields as settings: `starts=1`.
+    rng : numpy Generator or int
+        A generator, or the seed of one, of the starts of the search.
+    guards : sequence of Guard
+        Single responses that must be stable as well, whatever the weights say of them.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+    thorough : bool
+        Search from many starts where those from the Youla bound do not settle it.
+
+    Returns
+    -------
+    SynthesisResult
+        Its `outcome` says whether the specification is met on the grid; certify it before use.
+
+    Raises
+    ------
+    SpecificationError
+        No controller can meet the specification.
 
     Examples
     --------
@@ -116,10 +138,32 @@ def synthesise_jointly(
     progress: Progress | None = None,
     **settings: Any,
 ) -> joint_synthesis.JointDesign:
-    """As `synthesise`, until the stated share of sampled responses is stable (Monte Carlo, not a bound).
+    """Design a controller with which the stated share of sampled responses is stable.
 
-    Arguments as `control_design.synthesise_jointly`; `rng` and settings as in `synthesise`. The plants need
-    an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
+    Parameters
+    ----------
+    plants : UncertainPlant or what makes one, or a sequence of them
+        With an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
+    specification : Specification
+    options : SynthesisOptions, optional
+        Or its fields as settings.
+    rng : numpy Generator or int
+        Of the search and of the samples.
+    stable_share : float
+        Of the sampled responses, below 1: Monte Carlo, not a bound.
+    draws : int
+        Sampled responses of each plant.
+    rounds : int
+        Designs with guards (responses that were unstable before) at most.
+    first : SynthesisResult, optional
+        A design to begin with.
+    progress : callable, optional
+        Called with the share that is done and what is being done.
+
+    Returns
+    -------
+    JointDesign
+        The last `result`, whether the share was `reached`, and how many were `unstable` each time.
 
     Examples
     --------
@@ -147,9 +191,19 @@ def synthesise_jointly(
 def youla_bracket(
     plants: Any, specification: Specification, options: YoulaOptions | None = None, **settings: Any
 ) -> youla.YoulaBracket:
-    """What no controller of any order can fall below (`floor`); `control_design.youla_bracket`.
+    """Return what no controller of any order can fall below, and what one of high order reaches.
 
-    settings: fields of `YoulaOptions`, instead of `options`.
+    Parameters
+    ----------
+    plants, specification
+        As in `synthesise`.
+    options : YoulaOptions, optional
+        Or its fields as settings: `grid_points=60`.
+
+    Returns
+    -------
+    YoulaBracket
+        `floor` and what is reached over the `ellipse`, both worst weighted gains.
 
     Examples
     --------
@@ -177,14 +231,33 @@ def certify(
 ) -> Certificate:
     """Certify a controller from any source, independently of the optimiser.
 
-    controller: a `Controller`, a result of `synthesise`, or a discrete system of python-control (ss, tf) from
-    error to command, to which the computational delay of the specification is added. plants: as in
-    `synthesise`. plants and specification default to those of a result of `synthesise`.
+    Parameters
+    ----------
+    controller : Controller, SynthesisResult or discrete system of python-control
+        A system (ss, tf) leads from error to command; the computational delay of the specification is added.
+    plants, specification
+        As in `synthesise`; by default those of a result of `synthesise`.
+    n_dense : int
+        Points of the grid.
+    between_own_points : 'linear' or 'nothing'
+        What is taken of a measured response between its frequencies.
+    joint_coverage : float, optional
+        Probability that the worst case holds for a complete posterior sample.
+    rng : numpy Generator or int
+        Of these samples.
+    joint_draws : int
+        How many.
+    joint_stable_share : float
+        Of them that has to be stable.
 
-    n_dense: points of the grid. between_own_points: the response between measured frequencies.
-    joint_coverage: probability that the worst case holds for a complete posterior sample, with `rng` (a
-    generator or the seed of one), `joint_draws`, `joint_stable_share`. Raises ValueError where sampling times
-    or delays do not match, or the loop is algebraic.
+    Returns
+    -------
+    Certificate
+
+    Raises
+    ------
+    ValueError
+        Sampling times or delays do not match, or the loop is algebraic.
 
     Examples
     --------
@@ -192,6 +265,7 @@ def certify(
     >>> flexlink.certify(given, example_plant(), example_specification()).certified
     True
     """
+    # A design brings what it was made for; what is given beside it comes first.
     if isinstance(controller, SynthesisResult):
         plants = controller.plants if plants is None else plants
         specification = specification or controller.specification
@@ -219,7 +293,19 @@ def synthesise_multivariable(
     **settings: Any,
 ) -> MultivariableResult:
     """Design one controller of all sensors and actuators; `control_design.synthesise_multivariable`.
-    settings: fields of `MultivariableOptions`, instead of `options`."""
+
+    Parameters
+    ----------
+    plants : MultivariablePlant or sequence of them
+    specification : MultivariableSpecification
+        One joint for each channel.
+    options : MultivariableOptions, optional
+        Or its fields as settings.
+
+    Returns
+    -------
+    MultivariableResult
+    """
     chosen = options_of(MultivariableOptions, options, settings)
     return multivariable.synthesise_multivariable(plants, specification, chosen)
 
@@ -234,12 +320,23 @@ def certify_multivariable(
 ) -> MultivariableCertificate:
     """Certify a controller of all sensors and actuators; `control_design.certify_multivariable`.
 
-    controller: a `Controller`, a result of `synthesise_multivariable`, or a discrete `control.StateSpace`
-    from errors to commands, as in `certify`.
+    Parameters
+    ----------
+    controller : Controller, MultivariableResult or discrete control.StateSpace
+        A system leads from errors to commands, as in `certify`.
+    plants : MultivariablePlant or sequence of them
+    specification : MultivariableSpecification
+    dense_points : int
+        Points of the grid.
+
+    Returns
+    -------
+    MultivariableCertificate
     """
-    given = getattr(controller, "controller", controller)
+    # A result of the synthesis has its controller.
+    law = getattr(controller, "controller", controller)
     return multivariable_certificate.certify_multivariable(
-        _as_controller(given, specification.computational_delay_samples, several=True),
+        _as_controller(law, specification.computational_delay_samples, several=True),
         plants,
         specification,
         dense_points=dense_points,
@@ -250,11 +347,20 @@ def certify_multivariable(
 def c_source(controller: Any, prefix: str = "controller", number: c_code.Number = "double") -> str:
     """C99 source of a controller; `control_design.c_source`.
 
-    controller: a `Controller`, a result that has one (`synthesise`, `certify`), or a discrete system of
-    python-control (ss, tf). prefix: start of every name. number: type of states and coefficients.
+    Parameters
+    ----------
+    controller : Controller, SynthesisResult, Certificate or discrete system of python-control
+    prefix : str
+        Start of every name in the source.
+    number : 'double' or 'float'
+        Type of states and coefficients.
+
+    Returns
+    -------
+    str
     """
-    given = getattr(controller, "controller", controller)
-    return c_code.c_source(_as_controller(given, 1), prefix, number)
+    law = getattr(controller, "controller", controller)
+    return c_code.c_source(_as_controller(law, 1), prefix, number)
 
 
 @front_door
@@ -271,15 +377,33 @@ def simulate_loop(
     command_step: float = 0.0,
     clip: float = np.inf,
 ) -> LoopRun:
-    """Simulate the closed loop with limits and delay; arguments as in `control_design.simulate`.
+    """Simulate the closed loop from rest, with limits, delay and quantisation.
 
-    controller: a `Controller`, or a discrete system of python-control (ss, tf) as in `certify`, with a delay
-    of one sample. machine: a `SampledArm` or anything with `measure`, `advance` and `reset`; a linear system
-    or an `UncertainPlant` (its nominal) as well. reference: (T,) in units of the measured signal.
-    hub_torque_Nm, input_disturbance, output_disturbance: (T,) from outside. measurement_step, command_step:
-    quantisation of the two signals, 0 for none. measured_index: which signal of the machine is fed back.
-    clip: limit of the command of the converter, both signs. Raises ValueError where sampling times or lengths
-    do not match.
+    Parameters
+    ----------
+    controller : Controller or discrete system of python-control
+        A system as in `certify`, with a delay of one sample.
+    machine : SampledArm, linear system or UncertainPlant
+        Or anything with `measure`, `advance` and `reset`; of an uncertain plant its nominal is taken.
+    reference : (T,) array
+        In units of the measured signal.
+    measured_index : int
+        Signal of the machine that is fed back.
+    hub_torque_Nm, input_disturbance, output_disturbance : (T,) array, optional
+        From outside.
+    measurement_step, command_step : float
+        Quantisation of the two signals; 0 for none.
+    clip : float
+        The machine clips its input there, both signs, in units of the command.
+
+    Returns
+    -------
+    LoopRun
+
+    Raises
+    ------
+    ValueError
+        Sampling times or lengths do not match.
 
     Examples
     --------
@@ -288,6 +412,7 @@ def simulate_loop(
     >>> abs(flexlink.step_metrics(run).steady_error) < 1e-3
     True
     """
+    # Of a plant the nominal system is the machine.
     if isinstance(machine, UncertainPlant):
         machine = machine.nominal
     if isinstance(machine, control.lti.LTI):
@@ -326,18 +451,20 @@ def _as_controller(system: Any, delay_samples: int, *, several: bool = False) ->
     """A `Controller` as it is, or a system with a delay."""
     if isinstance(system, Controller):
         return system
-    found = state_space(system, "the controller", several=several)
-    return Controller(
-        found.A, found.B, found.C, found.D, float(found.dt), computational_delay_samples=delay_samples
-    )
+    law = state_space(system, "the controller", several=several)
+    return Controller(law.A, law.B, law.C, law.D, float(law.dt), computational_delay_samples=delay_samples)
 
 
 def _several(plants: Any) -> tuple[UncertainPlant, ...]:
     """One plant or a list of them, each an `UncertainPlant` or what makes one."""
-    several = list(plants) if isinstance(plants, Sequence) and not isinstance(plants, str) else [plants]
-    return tuple(
-        each
-        if isinstance(each, UncertainPlant)
-        else UncertainPlant(each, name="plant" if len(several) == 1 else f"plant {k + 1}")
-        for k, each in enumerate(several)
-    )
+    # A string is a sequence, too, and no plant: it is refused by name.
+    are_several = isinstance(plants, Sequence) and not isinstance(plants, str)
+    systems = list(plants) if are_several else [plants]
+    uncertain_plants = []
+    for number, system in enumerate(systems, 1):
+        if isinstance(system, UncertainPlant):
+            uncertain_plants.append(system)
+        else:
+            name = "plant" if len(systems) == 1 else f"plant {number}"
+            uncertain_plants.append(UncertainPlant(system, name=name))
+    return tuple(uncertain_plants)

@@ -31,6 +31,7 @@ __all__ = [
     "simulate",
 ]
 
+# Functions of `plant`, on one thread and with calls refused in a line.
 linear_arm = front_door(modal.linear_arm)
 multisine = front_door(excitation.multisine)
 paper_link = front_door(presets.paper_link)
@@ -50,10 +51,10 @@ class Simulation(Shown, simulation.Trajectory):
         signals = [each.name for each in fields(self) if each.name not in ("time_s", "voltage_V")]
         if output not in signals:
             raise ValueError(f"no output {output!r}; there are {', '.join(signals)}")
+        signal = getattr(self, output)
         return Record(
-            self.voltage_V, getattr(self, output), self.dt_s,
-            name=name, input_names=("voltage_V",), output_names=(output,),
-        )  # fmt: skip
+            self.voltage_V, signal, self.dt_s, name=name, input_names="voltage_V", output_names=output
+        )
 
 
 @front_door
@@ -99,6 +100,7 @@ def simulate(
     >>> arm.record("tip_m").output.shape
     (500, 1)
     """
+    # 200 would be simulated as one sample in 200 s.
     if dt_s is not None:
         refuse_rate(dt_s)
     trajectory = simulation.simulate(
@@ -112,4 +114,5 @@ def simulate(
         n_modes=n_modes,
         substep_s=substep_s,
     )
+    # The same fields, with words, pictures and tables.
     return Simulation(**{field.name: getattr(trajectory, field.name) for field in fields(trajectory)})

@@ -50,6 +50,7 @@ __all__ = [
     "uncertainty",
 ]
 
+# Functions of `ident`, on one thread and with calls refused in a line.
 band_limited = front_door(signal_filter.band_limited)
 basis_response = front_door(functions.basis_response)
 empirical_frf = front_door(nonparametric.empirical_frf)
@@ -63,8 +64,23 @@ def identify(
 ) -> Identification:
     """Identify a model of one input and one output; the data choose the order unless you give it.
 
-    settings: fields of `IdentOptions`, instead of `options`; as in `flexlink identify` the data decide about
-    the noise unless you state it. Raises ValueError for a setting or a record that cannot be used.
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        One input and one output, of one machine.
+    options : IdentOptions, optional
+        Or its fields as settings: `n_real=0, n_pairs=1`. As in `flexlink identify` the data decide about the
+        noise unless you state it.
+
+    Returns
+    -------
+    Identification
+        Model, fits in percent and warnings.
+
+    Raises
+    ------
+    ValueError
+        A setting or a record that cannot be used.
 
     Examples
     --------
@@ -72,13 +88,16 @@ def identify(
     GobfModel of order 2, u -> y, dt = 0.01 s: fits 99.0 % of record
       mode at 20 rad/s (3.18 Hz), damping ratio 0.0499
     """
-    used, chosen = _records(records), options_of(IdentOptions, options, settings) or IdentOptions()
+    used = _records(records)
+    chosen = options_of(IdentOptions, options, settings) or IdentOptions()
+    # As the command does: white noise is a claim, and nobody has made it.
     if "noise" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"noise": "auto"})
+    # What `compare` says of the time is the fit alone, without reading and checking.
     begin = perf_counter()
-    found = identify_records(used, chosen)
+    identification = identify_records(used, chosen)
     fit_s = perf_counter() - begin
-    return replace(found, records=used, order_given=chosen.n_pairs is not None, fit_s=fit_s)
+    return replace(identification, records=used, order_given=chosen.n_pairs is not None, fit_s=fit_s)
 
 
 @front_door
@@ -128,20 +147,50 @@ def identify_mimo(
 ) -> MimoIdentification:
     """Identify one model with shared poles of several inputs, outputs or both.
 
-    settings: fields of `IdentOptions`, instead of `options`; with several outputs at most one integrator and
-    no relative degree. free_shapes: leave every residue free, in place of one shape for every mode. start:
-    poles where the search begins. Raises ValueError as `identify`.
+    Parameters
+    ----------
+    records : Record or sequence of Record
+    options : IdentOptions, optional
+        Or its fields as settings; with several outputs at most one integrator and no relative degree.
+    free_shapes : bool
+        Leave every residue free, in place of one shape for every mode.
+    start : Poles, optional
+        Where the search begins.
+
+    Returns
+    -------
+    MimoIdentification
+
+    Raises
+    ------
+    ValueError
+        As of `identify`.
     """
-    chosen, used = options_of(IdentOptions, options, settings), _records(records)
-    found = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
-    return replace(found, records=used)
+    chosen = options_of(IdentOptions, options, settings)
+    used = _records(records)
+    identification = several_outputs.identify_mimo(used, chosen, free_shapes=free_shapes, start=start)
+    return replace(identification, records=used)
 
 
 @front_door
 def matrix_posterior(
     records: Record | Sequence[Record], identification: MimoIdentification, *, level: float = 0.95
 ) -> matrix_response.MatrixPosterior:
-    """Uncertainty of a matrix response: balls that hold it with probability `level` at every frequency."""
+    """Return balls that hold a matrix response with probability `level` at every frequency.
+
+    Parameters
+    ----------
+    records : Record or sequence of Record
+        Those of the identification.
+    identification : MimoIdentification
+    level : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    MatrixPosterior
+        `at(omega_rad_s)` has the balls.
+    """
     return matrix_response.matrix_posterior(_records(records), identification, level=level)
 
 
@@ -154,10 +203,24 @@ def uncertainty(
 ) -> Uncertainty:
     """Posterior of the response around an identified model: noise, pole error and unmodelled dynamics.
 
-    records: those of the identification; not needed if it came from `flexlink.identify`. settings: fields of
-    `EmbeddingOptions`, instead of `options`; the data decide about a noise model unless you state one.
-    `order_given` is taken from `flexlink.identify`. Ellipses of another level than 95 %:
-    `spread.at(omega_rad_s).ellipse(level)`. Raises ValueError where the output does not answer to the input.
+    Parameters
+    ----------
+    identification : Identification
+    records : Record or sequence of Record, optional
+        Those of the identification; not needed if it came from `flexlink.identify`.
+    options : EmbeddingOptions, optional
+        Or its fields as settings. The data decide about a noise model unless you state one; `order_given` is
+        taken from `flexlink.identify`.
+
+    Returns
+    -------
+    Uncertainty
+        With ellipses at any frequency; of another level than 95 %: `spread.at(omega_rad_s).ellipse(level)`.
+
+    Raises
+    ------
+    ValueError
+        The output does not answer to the input.
 
     Examples
     --------
@@ -169,14 +232,17 @@ def uncertainty(
     >>> bool(spread.at([20.0]).contains(found.model.frequency_response([20.0]))[0])
     True
     """
+    # Options may stand in the place of records, which the identification has itself.
     if isinstance(records, EmbeddingOptions):
         records, options = None, records
+    # Words that are looked for here and stand elsewhere.
     for name, mend in _ELSEWHERE.items():
         if name in settings:
             raise ValueError(f"{name} is no setting of uncertainty: {mend}")
     chosen = options_of(EmbeddingOptions, options, settings) or EmbeddingOptions()
     if "coloured_noise" not in chosen.model_fields_set:
         chosen = chosen.model_copy(update={"coloured_noise": "auto"})
+    # An order that was searched for is less certain than one that was given.
     if chosen.order_given is None:
         chosen = chosen.model_copy(update={"order_given": getattr(identification, "order_given", False)})
     used = _records_of(identification, records)
@@ -196,10 +262,26 @@ def error_surface(
 ) -> ErrorSurface:
     """Mean square residual with one pole pair of an identified model moved over a grid, its others frozen.
 
-    records: those of the identification, taken from it if it came from `flexlink.identify`. pair: number of
-    the pole pair, from 0. coordinates: "log" (omega in rad/s and zeta) or "raw" (beta and gamma). first,
-    second: grids of these; without them n_points of each around the identified pair. Raises ValueError if
-    there is no such pair or a grid leaves the stable pairs.
+    Parameters
+    ----------
+    identification : Identification
+    records : Record or sequence of Record, optional
+        Those of the identification; not needed if it came from `flexlink.identify`.
+    pair : int
+        Number of the pole pair, from 0.
+    coordinates : 'log' or 'raw'
+        omega in rad/s and zeta, or beta and gamma of the paper.
+    first, second : (n,) array, optional
+        Grids of these; by default n_points of each around the identified pair.
+
+    Returns
+    -------
+    ErrorSurface
+
+    Raises
+    ------
+    ValueError
+        There is no such pair, or a grid leaves the stable pairs.
 
     Examples
     --------
@@ -222,6 +304,7 @@ def error_surface(
     )
 
 
+# Settings that people look for in `uncertainty`, and where to find what they want.
 _ELSEWHERE = {
     "level": "spread.at(omega_rad_s).ellipse(level) has ellipses of any level",
     "method": "the paper's recipe is validation.paper.classical.classical(records, model)",

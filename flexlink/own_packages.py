@@ -8,7 +8,9 @@ import sys
 from importlib.machinery import ModuleSpec, PathFinder
 from typing import Any
 
+# Packages of this distribution, which a file of the user's own may have the name of.
 NAMES = ("plant", "ident", "control_design", "diagnosis", "workflow", "validation")
+# The folder in which they stand beside this one.
 _ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
 
 
@@ -27,5 +29,6 @@ def find_own_first() -> None:
             raise ImportError(
                 f"{file} was imported as {name!r}, the name of a package of flexlink: rename the file"
             )
+    # Before Python's own finders, which look into the current folder first.
     if _OwnPackages not in sys.meta_path:
         sys.meta_path.insert(0, _OwnPackages)

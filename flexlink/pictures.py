@@ -110,6 +110,7 @@ def bode(
         raise ValueError(
             f"expected a name for each response; got {len(results)} responses and {len(given_names)} names"
         )
+    # One response alone has a third panel, the size of its ellipses, unless two axes are given.
     if len(results) == 1 and not given_names:
         response = as_response(results[0], omega_rad_s)
         model = getattr(results[0], "model", results[0])
@@ -117,6 +118,7 @@ def bode(
         if ax is None or np.size(ax) == 3:
             return _figure(draw_bode(response, channel, "as logged", dB=dB, Hz=Hz), ax)
         given_names = [channel]
+    # Several are told apart by their names, or by number and class.
     curve_names = given_names or [f"{k}: {type(result).__name__}" for k, result in enumerate(results, 1)]
     responses = {
         name: as_response(result, omega_rad_s) for name, result in zip(curve_names, results, strict=True)
@@ -126,8 +128,22 @@ def bode(
 
 @front_door
 def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
-    """Nyquist curve of a loop with its ellipses: of a design or a certificate, or of a plant with a
-    controller, each as for `bode`. ax: axes to draw on.
+    """Draw the Nyquist curve of a loop with its ellipses.
+
+    Parameters
+    ----------
+    loop : object
+        A design or a certificate, or a plant with a controller beside it, each as for `bode`.
+    controller : object, optional
+        Of a plant that is given alone.
+    ax : axes of matplotlib, optional
+        To draw on in place of a new figure.
+    omega_rad_s : (F,) array, optional
+        Frequencies; by default those that show the loop.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Examples
     --------
@@ -143,7 +159,9 @@ def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
 
 @front_door
 def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
-    """The same on a Nichols chart: gain [dB] over phase, with lines of constant closed-loop gain and phase.
+    """Draw a loop on a Nichols chart: gain [dB] over phase, with lines of constant closed-loop gain.
+
+    Parameters and what is returned as of `nyquist`.
 
     Examples
     --------
@@ -159,11 +177,27 @@ def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
 
 @front_door
 def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = None) -> Figure:
-    """Step response of a plant or model as it is, or of its loop with a controller; of a design's or a
-    certificate's nominal loop. A loop has a second panel with its command.
+    """Draw the step response of a plant, or of its loop with a controller, then with the command below.
 
-    ax: as many axes. time_s (T,): evenly sampled; if left out, until nothing moves. Raises TypeError for what
-    has no poles.
+    Parameters
+    ----------
+    result : object
+        A plant or model; or a design or a certificate, whose nominal loop is taken.
+    controller : object, optional
+        As in `nyquist`; without one a plant is drawn as it is.
+    ax : axes of matplotlib, optional
+        One, of a loop two.
+    time_s : (T,) array, optional
+        Evenly sampled; by default until nothing moves.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    TypeError
+        What has no poles.
 
     Examples
     --------
@@ -177,14 +211,20 @@ def step(result: Any, controller: Any = None, *, ax: Any = None, time_s: Any = N
 
     plant, controller = _parts(result, controller)
     plant = state_space(getattr(plant, "nominal", getattr(plant, "model", plant)), "the plant")
-    law = None if controller is None else _law(controller)
-    found = control.step_response(plant if law is None else control.feedback(plant * law), time_s)
-    output, command, names = found.outputs[None], found.inputs[None], {"output": ("output", "")}
-    if law is not None:
-        command = control.forced_response(law, found.time, 1 - found.outputs).outputs[None]
-        names |= {"command": ("command", "")}
+    panels = {"output": ("output", "")}
+    if controller is None:
+        response = control.step_response(plant, time_s)
+        command = response.inputs[None]
+    else:
+        # The command is what the controller makes of the error, reference less output.
+        law = _law(controller)
+        response = control.step_response(control.feedback(plant * law), time_s)
+        command = control.forced_response(law, response.time, 1 - response.outputs).outputs[None]
+        panels |= {"command": ("command", "")}
+    output = response.outputs[None]
+    # No limit of the command is drawn: the loop is linear here.
     runs = LoopRuns(output, command, None, np.zeros_like(output, dtype=bool))
-    return _figure(draw_closed_loop(found.time, np.ones_like(found.time), runs, names), ax)
+    return _figure(draw_closed_loop(response.time, np.ones_like(response.time), runs, panels), ax)
 
 
 def _figure(picture: Any, ax: Any = None) -> Figure:
@@ -204,27 +244,31 @@ def _parts(result: Any, controller: Any) -> tuple[Any, Any]:
 
 
 def _loop_of(result: Any, controller: Any, omega_rad_s: Any) -> FrequencyUncertainty:
+    """The response of a loop K G with its ellipses, of a plant alone where there is no controller."""
     from workflow.figures.bands import smooth_grid, times
 
     plant, controller = _parts(result, controller)
-    found = as_response(plant, omega_rad_s)
+    plant_response = as_response(plant, omega_rad_s)
     if controller is None:
-        return found
+        return plant_response
     law = _law(controller)
-    if omega_rad_s is None and as_response(plant, found.omega_rad_s[:1]).omega_rad_s.size == 1:
-        # Known at every frequency, and none was asked for: those that show the loop.
+    # A measured response has its own frequencies, whatever is asked for.
+    is_known_everywhere = as_response(plant, plant_response.omega_rad_s[:1]).omega_rad_s.size == 1
+    if omega_rad_s is None and is_known_everywhere:
+        # None was asked for: those that show the loop.
         grid = smooth_grid(
-            found.omega_rad_s[found.omega_rad_s > 0],
+            plant_response.omega_rad_s[plant_response.omega_rad_s > 0],
             lambda omega: as_response(plant, omega).centre * frequency_response(law, omega),
         )
-        found = as_response(plant, grid)
-    return times(found, frequency_response(law, found.omega_rad_s))
+        plant_response = as_response(plant, grid)
+    return times(plant_response, frequency_response(law, plant_response.omega_rad_s))
 
 
 def _law(controller: Any) -> control.StateSpace:
-    """A controller with its computational delay."""
-    own = isinstance(controller, Controller)
-    return controller.to_control(include_delay=True) if own else state_space(controller, "the controller")
+    """A controller with its computational delay; a system of another package has it in itself."""
+    if isinstance(controller, Controller):
+        return controller.to_control(include_delay=True)
+    return state_space(controller, "the controller")
 
 
 def as_response(result: Any, omega_rad_s: Any = None) -> FrequencyUncertainty:
@@ -232,23 +276,29 @@ def as_response(result: Any, omega_rad_s: Any = None) -> FrequencyUncertainty:
     was measured, with its ellipses; without size where it is taken as exact. Of a design its loop."""
     if isinstance(result, (SynthesisResult, Certificate)):
         return _loop_of(result, None, omega_rad_s)
-    found = getattr(result, "model", result)
-    if isinstance(found, FrequencyUncertainty):
-        return found
-    if isinstance(found, UncertainPlant):
-        if isinstance(found.uncertainty, (FrequencyUncertainty, ResponsePosterior)):
-            return as_response(found.uncertainty, omega_rad_s)
-        found = found.nominal
-    if isinstance(found, control.FrequencyResponseData):
-        return measured_response(found)
-    if not isinstance(found, (ResponsePosterior, GobfModel)):
-        found = state_space(found, f"a {type(result).__name__}")
-    dt_s = float(found.dt if isinstance(found, control.StateSpace) else found.dt_s)
+    model = getattr(result, "model", result)
+    # What was measured keeps its frequencies.
+    if isinstance(model, FrequencyUncertainty):
+        return model
+    if isinstance(model, control.FrequencyResponseData):
+        return measured_response(model)
+    if isinstance(model, UncertainPlant):
+        if isinstance(model.uncertainty, (FrequencyUncertainty, ResponsePosterior)):
+            return as_response(model.uncertainty, omega_rad_s)
+        model = model.nominal
+
+    # Everything else answers at any frequency.
+    has_own_response = isinstance(model, (ResponsePosterior, GobfModel))
+    if not has_own_response:
+        model = state_space(model, f"a {type(result).__name__}")
+    dt_s = float(model.dt_s if has_own_response else model.dt)
     omega = _grid(dt_s) if omega_rad_s is None else np.asarray(omega_rad_s, dtype=np.float64)
-    if isinstance(found, ResponsePosterior):
-        return found.at(omega)
-    given = isinstance(found, GobfModel)
-    centre = found.frequency_response(omega) if given else frequency_response(found, omega)
+    if isinstance(model, ResponsePosterior):
+        return model.at(omega)
+    if isinstance(model, GobfModel):
+        centre = model.frequency_response(omega)
+    else:
+        centre = frequency_response(model, omega)
     return FrequencyUncertainty(omega, centre, np.zeros((omega.size, 2, 2)), dt_s)
 
 
@@ -276,15 +326,15 @@ def _simulation(simulation: Simulation) -> Figure:
 
 
 @plot.register(Identification)
-def _poles(found: Identification) -> Figure:
+def _poles(identification: Identification) -> Figure:
     from workflow.figures.poles import draw_poles
 
-    return _figure(draw_poles(found.model))
+    return _figure(draw_poles(identification.model))
 
 
 @plot.register(FrfIdentification)
-def _fitted_response(found: FrfIdentification) -> Figure:
-    return bode(found.response, found.model, names=("measured", "fitted"), omega_rad_s=found.omega_rad_s)
+def _fitted_response(fit: FrfIdentification) -> Figure:
+    return bode(fit.response, fit.model, names=("measured", "fitted"), omega_rad_s=fit.omega_rad_s)
 
 
 for kind in (GobfModel, ResponsePosterior, FrequencyUncertainty):
@@ -321,15 +371,15 @@ def _surface(surface: ErrorSurface) -> Figure:
 
 
 @plot.register(Comparison)
-def _comparison(found: Comparison) -> Figure:
-    return found.plot()
+def _comparison(comparison: Comparison) -> Figure:
+    return comparison.plot()
 
 
 @plot.register(Diagnosis)
-def _causes(found: Diagnosis) -> Figure:
+def _causes(diagnosis: Diagnosis) -> Figure:
     from workflow.figures.gap_answer import draw_probabilities
 
-    return _figure(draw_probabilities(found))
+    return _figure(draw_probabilities(diagnosis))
 
 
 def _grid(dt_s: float) -> npt.NDArray[np.float64]:

@@ -26,8 +26,9 @@ def describe(result: object) -> str:
 
 def html_text(result: Shown) -> str:
     """Return the sentences as HTML for a notebook, with a table where the class has a short one."""
-    headline, *others = (html.escape(line.strip()) for line in describe(result).splitlines())
-    sentences = f"<p>{'<br>'.join([f'<b>{headline}</b>', *others])}</p>"
+    headline, *lines = (html.escape(line.strip()) for line in describe(result).splitlines())
+    sentences = "<br>".join([f"<b>{headline}</b>", *lines])
+    sentences = f"<p>{sentences}</p>"
     if not result.table_in_notebook:
         return sentences
     table = result.table().to_html(index=False, na_rep="", float_format="{:.4g}".format, border=0)

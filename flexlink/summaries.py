@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from workflow.text.findings.sentences import words
-from workflow.text.formats import at_least, at_most, bound, listing
+from workflow.text.formats import at_least, at_most, bound, hertz, listing
 
 if TYPE_CHECKING:
     from control_design.analysis.certificate import Certificate
@@ -54,10 +54,10 @@ _EVEN_ODDS = 0.5
 
 def _modes(poles: Poles, dt_s: float) -> list[str]:
     """A line for each mode, its frequency and damping ratio."""
-    return [
-        f"  mode at {omega:.4g} rad/s ({omega / (2 * math.pi):.3g} Hz), damping ratio {zeta:.3g}"
-        for omega, zeta in zip(poles.omega_rad_s(dt_s), poles.zeta(), strict=True)
-    ]
+    lines = []
+    for omega, zeta in zip(poles.omega_rad_s(dt_s), poles.zeta(), strict=True):
+        lines.append(f"  mode at {omega:.4g} rad/s ({hertz(omega):.3g} Hz), damping ratio {zeta:.3g}")
+    return lines
 
 
 def _warnings(findings: Iterable[Finding]) -> list[str]:
@@ -76,6 +76,7 @@ def record(result: Record) -> list[str]:
         f"{result.n_samples * result.dt_s:.4g} s in all",
         f"  {', '.join(result.input_names)} -> {', '.join(result.output_names)}{reference}",
     ]
+    # What time stamps were taken for, where there were any.
     column = result.time_column
     if column is not None:
         known = "" if column.stated or column.in_header else " (no unit stated)"
@@ -102,43 +103,43 @@ def identification(result: Identification) -> list[str]:
 def frf_identification(result: FrfIdentification) -> list[str]:
     model = result.model
     omega = result.omega_rad_s
-    return [
+    inside_percent = 100 * result.share_inside
+    headline = (
         f"GobfModel of order {model.order} of a measured response, dt = {model.dt_s:.6g} s: inside "
-        f"{100 * result.share_inside:.3g} % of {omega.size} ellipses, {omega[0]:.4g} to {omega[-1]:.4g} "
-        "rad/s",
-        *_modes(model.poles, model.dt_s),
-        *(f"  {words(verdict)}" for verdict in result.verdicts),
-        *_warnings(result.warnings),
-    ]
+        f"{inside_percent:.3g} % of {omega.size} ellipses, {omega[0]:.4g} to {omega[-1]:.4g} rad/s"
+    )
+    verdicts = [f"  {words(verdict)}" for verdict in result.verdicts]
+    return [headline, *_modes(model.poles, model.dt_s), *verdicts, *_warnings(result.warnings)]
 
 
 def mimo_identification(result: MimoIdentification) -> list[str]:
     model: Any = result.model
+    inputs = ", ".join(model.input_names)
+    # A model of one output has no tuple of names.
     outputs = ", ".join(model.output_names) if hasattr(model, "output_names") else model.output_name
-    return [
-        f"Model of order {model.order}, {', '.join(model.input_names)} -> {outputs}, dt = {model.dt_s:.6g} "
-        "s: "
-        f"fits {_fits(result.record_names, result.fit_percent)}",
-        *_modes(model.poles, model.dt_s),
-        *_warnings(result.warnings),
-    ]
+    fits = _fits(result.record_names, result.fit_percent)
+    headline = f"Model of order {model.order}, {inputs} -> {outputs}, dt = {model.dt_s:.6g} s: fits {fits}"
+    return [headline, *_modes(model.poles, model.dt_s), *_warnings(result.warnings)]
 
 
 def matrix_posterior(result: MatrixPosterior) -> list[str]:
-    model = result.model
-    return [
-        f"Matrix response {', '.join(model.input_names)} -> {', '.join(model.output_names)}, "
-        f"{100 * result.level:.4g} % balls frequency by frequency",
-        *_modes(model.poles, result.dt_s),
-    ]
+    inputs = ", ".join(result.model.input_names)
+    outputs = ", ".join(result.model.output_names)
+    headline = (
+        f"Matrix response {inputs} -> {outputs}, {100 * result.level:.4g} % balls frequency by frequency"
+    )
+    return [headline, *_modes(result.model.poles, result.dt_s)]
 
 
 def error_surface(result: ErrorSurface) -> list[str]:
     points = " x ".join(str(count) for count in result.mean_square.shape)
+    coordinates = " and ".join(result.names)
+    lowest = result.mean_square.min()
+    highest = result.mean_square.max()
+    n_minima = len(result.local_minima())
     return [
-        f"Error surface over {' and '.join(result.names)}, {points} points: mean square "
-        f"{result.mean_square.min():.4g} to {result.mean_square.max():.4g}, {len(result.local_minima())} "
-        "local minima inside"
+        f"Error surface over {coordinates}, {points} points: mean square {lowest:.4g} to {highest:.4g}, "
+        f"{n_minima} local minima inside"
     ]
 
 
@@ -185,12 +186,14 @@ def multivariable_certificate(result: MultivariableCertificate) -> list[str]:
                 f"{at_most(verdict.pole_radius, 6)})"
             )
             continue
+        # The value on the grid, and the bound between its points, which decides.
         for name, value in verdict.bounds.items():
             lines.append(
                 f"  {_met(value <= 1)} {verdict.plant}: {name}: {at_most(verdict.worst[name], 4)} against 1, "
                 f"at most {at_most(value, 4)} at every frequency (largest at "
                 f"joints[{verdict.worst_joint[name]}], {verdict.worst_at[name]:.4g} rad/s)"
             )
+        # What limits of the command do to the end of a step, where there are any.
         limited = verdict.limited
         if limited is not None and limited.steps:
             lines.append(
@@ -225,6 +228,7 @@ def uncertainty(result: Uncertainty) -> list[str]:
     ]
     for omega, share in result.at_modes():
         lines.append(f"  mode at {omega:.4g} rad/s: semi-axis {100 * share:.2g} % of the response")
+    # Told only where the data raise the odds of a further mode.
     if result.missed_mode_suspected:
         lines.append(
             f"  ! a mode may be missing from the model (probability {report.probability_missed_mode:.2g}, "
@@ -244,9 +248,11 @@ def response_posterior(result: ResponsePosterior) -> list[str]:
 
 
 def simulation(result: Simulation) -> list[str]:
+    hub_rad = np.abs(result.hub_angle_rad).max()
+    tip_m = np.abs(result.tip_m).max()
     return [
-        f"Simulated {result.time_s.size} samples, every {result.dt_s:.6g} s: hub to "
-        f"{np.abs(result.hub_angle_rad).max():.3g} rad, tip to {np.abs(result.tip_m).max():.3g} m"
+        f"Simulated {result.time_s.size} samples, every {result.dt_s:.6g} s: hub to {hub_rad:.3g} rad, tip "
+        f"to {tip_m:.3g} m"
     ]
 
 
@@ -287,6 +293,7 @@ def synthesis_result(result: SynthesisResult) -> list[str]:
 
 def certificate(result: Certificate) -> list[str]:
     lines = [_certificate_headline(result)]
+    # Of an unstable loop nothing was achieved (nan).
     for item in result.items:
         if not math.isnan(item.achieved):
             lines.append(_requirement(result, item))
@@ -331,6 +338,7 @@ def _requirement(result: Certificate, item: SpecificationItem) -> str:
         f"  {_met(item.met)} {item.plant}: {name}: {bound(item.achieved, item.at_least)} against "
         f"{item.required:.4g} {item.unit}"
     )
+    # The weight is relative; a user thinks in units of the command.
     limit = None if result.specification is None else result.specification.effort_limit
     if item.requirement.startswith("effort") and limit is not None:
         line += (
@@ -341,10 +349,14 @@ def _requirement(result: Certificate, item: SpecificationItem) -> str:
 
 
 def closed_loop_trajectory(result: ClosedLoopTrajectory) -> list[str]:
+    # The last sample is held for a period, too.
+    duration_s = result.time_s[-1] + result.dt_s
+    largest_command = np.abs(result.command).max()
+    limited_percent = 100 * result.limited.mean()
     return [
-        f"Closed loop over {result.time_s[-1] + result.dt_s:.4g} s: output ends at {result.measured[-1]:.4g} "
-        f"(reference {result.reference[-1]:.4g}), command at most {np.abs(result.command).max():.4g}, "
-        f"limited in {100 * result.limited.mean():.3g} % of the samples"
+        f"Closed loop over {duration_s:.4g} s: output ends at {result.measured[-1]:.4g} (reference "
+        f"{result.reference[-1]:.4g}), command at most {largest_command:.4g}, limited in "
+        f"{limited_percent:.3g} % of the samples"
     ]
 
 
@@ -356,18 +368,20 @@ def _plain(name: str) -> str:
 def diagnosis(result: Diagnosis) -> list[str]:
     added = [effect.id for effect in result.repair]
     lines = [_diagnosis_headline(result, added)]
+    # A value that was re-estimated and did not move is not told.
     moved = [name for name, deviation in result.deviations.items() if deviation]
     if moved:
         lines.append(f"  moved in the repaired model: {', '.join(moved)}")
+    # The likeliest causes, and whatever else the repaired model holds.
     for effect in result.effects:
         if effect not in result.effects[:_SHOWN_CAUSES] and effect.name not in added:
             continue
         kind = "probability" if effect.name in ("none", "unknown") else "present with probability"
         repaired = ", in the repaired model" if effect.name in added else ""
         lines.append(f"  {_plain(effect.name)}: {kind} {effect.presence:.2g}{repaired}")
-    others = [name for name in result.ambiguous_with if name not in added]
-    if others:
-        lines.append(f"  not excluded: {_plain(', '.join(others))}")
+    not_excluded = [name for name in result.ambiguous_with if name not in added]
+    if not_excluded:
+        lines.append(f"  not excluded: {_plain(', '.join(not_excluded))}")
     lines += [f"  doubtful: {doubt}" for doubt in result.doubts]
     return lines
 
@@ -385,8 +399,8 @@ def _diagnosis_headline(result: Diagnosis, added: Sequence[str]) -> str:
     if result.verdict == "unknown":
         cause = "of unknown cause" if added else "explained by none of the candidate effects"
         return f"Model error {cause} (error / noise: {_sizes(result, added)})"
-    more = ", and something else" if complete.probability < _EVEN_ODDS else ""
-    return f"Model error / noise: {_sizes(result, added)}{more}"
+    incomplete = ", and something else" if complete.probability < _EVEN_ODDS else ""
+    return f"Model error / noise: {_sizes(result, added)}{incomplete}"
 
 
 def _sizes(result: Diagnosis, effects: Sequence[str]) -> str:

@@ -59,6 +59,7 @@ def table(result: object) -> pd.DataFrame:
 
 @table.register(Record)
 def _record(record: Record) -> pd.DataFrame:
+    # Time, then inputs, outputs and references by their names.
     columns = {"time_s": record.dt_s * np.arange(record.n_samples)}
     for names, signals in (
         (record.input_names, record.input),
@@ -84,28 +85,29 @@ def _model(model: GobfModel) -> pd.DataFrame:
 
 
 def _modes(poles: Poles, dt_s: float, unstable: ComplexArray | tuple[()] = ()) -> pd.DataFrame:
+    """A row per mode, real pole and unstable pole; columns that a kind does not have are nan."""
     modes = pd.DataFrame({"kind": "mode", "omega_rad_s": poles.omega_rad_s(dt_s), "zeta": poles.zeta()})
     decays = pd.DataFrame({"kind": "real pole", "decay_per_s": poles.decay_per_s(dt_s)})
+    # A pole outside the circle grows: its decay is negative.
     outside = np.log(np.asarray(unstable, complex)) / dt_s
     growing = pd.DataFrame(
         {"kind": "unstable pole", "omega_rad_s": np.abs(outside.imag), "decay_per_s": -outside.real}
     )
-    rows = pd.concat([part for part in (modes, decays, growing) if len(part)] or [modes], ignore_index=True)
+    # pandas warns of empty parts; a model without any pole has an empty table of modes.
+    parts = [part for part in (modes, decays, growing) if len(part)] or [modes]
+    rows = pd.concat(parts, ignore_index=True)
     rows = rows.reindex(columns=["kind", "omega_rad_s", "frequency_Hz", "zeta", "decay_per_s"])
     return rows.assign(frequency_Hz=rows["omega_rad_s"] / (2 * np.pi))
 
 
 @table.register(FrfIdentification)
-def _fitted_response(found: FrfIdentification) -> pd.DataFrame:
-    rows = _modes(found.model.poles, found.model.dt_s)
+def _fitted_response(fit: FrfIdentification) -> pd.DataFrame:
+    # Standard deviations go to the rows of their kind; the others stay nan.
+    rows = _modes(fit.model.poles, fit.model.dt_s)
     is_mode = rows["kind"] == "mode"
-    deviations = {
-        "omega_std_rad_s": (is_mode, found.omega_std_rad_s),
-        "zeta_std": (is_mode, found.zeta_std),
-        "decay_std_per_s": (~is_mode, found.decay_std_per_s),
-    }
-    for name, (of_kind, values) in deviations.items():
-        rows.loc[of_kind, name] = values
+    rows.loc[is_mode, "omega_std_rad_s"] = fit.omega_std_rad_s
+    rows.loc[is_mode, "zeta_std"] = fit.zeta_std
+    rows.loc[~is_mode, "decay_std_per_s"] = fit.decay_std_per_s
     return rows
 
 
@@ -118,11 +120,19 @@ def _surface(surface: ErrorSurface) -> pd.DataFrame:
 
 @table.register(MultivariableCertificate)
 def _joints(certificate: MultivariableCertificate) -> pd.DataFrame:
-    return pd.DataFrame(
-        {"plant": v.plant, "requirement": name, "achieved": v.worst[name], "bound": bound,
-         "met": v.stable and bound <= 1, "omega_rad_s": v.worst_at[name]}
-        for v in certificate.verdicts for name, bound in v.bounds.items()
-    )  # fmt: skip
+    rows = []
+    for verdict in certificate.verdicts:
+        for name, bound in verdict.bounds.items():
+            row = {
+                "plant": verdict.plant,
+                "requirement": name,
+                "achieved": verdict.worst[name],
+                "bound": bound,
+                "met": verdict.stable and bound <= 1,
+                "omega_rad_s": verdict.worst_at[name],
+            }
+            rows.append(row)
+    return pd.DataFrame(rows)
 
 
 @table.register(SynthesisResult)
@@ -132,14 +142,24 @@ def _synthesis(result: SynthesisResult) -> pd.DataFrame:
 
 
 @table.register(Diagnosis)
-def _diagnosis(found: Diagnosis) -> pd.DataFrame:
-    rows = []
-    for effect in found.effects:
-        about = {"effect": effect.name, "present": effect.presence, "main_cause": effect.probability}
-        for name, value in effect.parameters.items() or [(None, np.nan)]:
+def _diagnosis(diagnosis: Diagnosis) -> pd.DataFrame:
+    rows: list[dict[str, object]] = []
+    for effect in diagnosis.effects:
+        # An effect without parameters has a row, too: it has a probability.
+        parameters = effect.parameters or {None: np.nan}
+        for name, value in parameters.items():
             low, high = effect.intervals.get(str(name), (np.nan, np.nan))
-            sized = {"parameter": name, "value": value, "low": low, "high": high}
-            rows.append({**about, **sized, "gap_after": effect.gap_after})
+            row = {
+                "effect": effect.name,
+                "present": effect.presence,
+                "main_cause": effect.probability,
+                "parameter": name,
+                "value": value,
+                "low": low,
+                "high": high,
+                "gap_after": effect.gap_after,
+            }
+            rows.append(row)
     return pd.DataFrame(rows)
 
 
@@ -153,11 +173,11 @@ def _facts(summary: RunSummary) -> pd.DataFrame:
 
 
 # Those whose rows are there already.
-table.register(Simulation, lambda found: pd.DataFrame(vars(found)))
-table.register(Comparison, lambda found: found.table())
-table.register(Identification, lambda found: _model(found.model))
-table.register(MimoIdentification, lambda found: _modes(found.model.poles, found.model.dt_s))
-table.register(YoulaBracket, lambda found: pd.DataFrame([vars(plant) for plant in found.plants]))
-table.register(Certificate, lambda found: pd.DataFrame([vars(item) for item in found.items]))
+table.register(Simulation, lambda result: pd.DataFrame(vars(result)))
+table.register(Comparison, lambda result: result.table())
+table.register(Identification, lambda result: _model(result.model))
+table.register(MimoIdentification, lambda result: _modes(result.model.poles, result.model.dt_s))
+table.register(YoulaBracket, lambda result: pd.DataFrame([vars(plant) for plant in result.plants]))
+table.register(Certificate, lambda result: pd.DataFrame([vars(item) for item in result.items]))
 for kind in (ResponsePosterior, FrequencyUncertainty):
-    table.register(kind, lambda found: pd.DataFrame(vars(response_band(as_response(found)))))
+    table.register(kind, lambda result: pd.DataFrame(vars(response_band(as_response(result)))))

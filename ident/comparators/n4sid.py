@@ -14,11 +14,12 @@ from ident.comparators.innovation_model import InnovationModel, free_responses
 from ident.data.arrays import RealArray
 from ident.data.record import Record
 
-# Rows of past and of future samples at least, and for each state. The method needs more rows than states;
-# more of them lower the variance of slow poles, and the cost grows with their square. 20 is a usual default.
+# Rows of past and of future samples at least. More of them lower the variance of slow poles, and the cost
+# grows with their square; 20 is a usual default.
 _FEWEST_ROWS = 20
+# Rows for each state at least: the method needs more rows than states. Twice as many, chosen.
 _ROWS_PER_STATE = 2
-# Samples for each row at least: the regression has 3 unknowns a row for each of the rows it predicts.
+# Samples for each row at least: a regression has 3 unknowns a row. Twice as many, chosen.
 _SAMPLES_PER_ROW = 6
 
 

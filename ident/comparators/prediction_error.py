@@ -19,7 +19,10 @@ from ident.comparators.stable_sections import (
 from ident.data.arrays import RealArray
 
 _ONE = np.ones(1)
+# Jacobians of a local search at most: a bound on its time, where the cost never stands still.
 _ITERATIONS = 100
+# Share of the cost by which a step has to lower it. Chosen: far below what noise leaves open (1/T), far above
+# rounding.
 _COST_TOLERANCE = 1e-8
 
 

@@ -12,10 +12,11 @@ from ident.data.finding import FindingKind
 from workflow.text import formats
 from workflow.text.options import setting_in_uncertainty, setting_name
 
-# Probabilities beyond these are not printed as 0 and 1, a certainty that nobody has: far out in the tail
-# doubles end. Digits near one are shown from .99 on.
+# A smaller probability is not printed as 0, a certainty that nobody has: far out in the tail doubles end.
 _SMALLEST_SHOWN = 1e-300
+# A larger one is not printed as 1, with two digits less than that.
 _LARGEST_SHOWN = 0.999
+# From here on a third digit is shown: two would round to 1.
 _NEAR_ONE = 0.99
 # A peak outside the measured band is told where it is this much higher than both ends, 5 %: chosen.
 _PEAK = 1.05
