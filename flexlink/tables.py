@@ -146,7 +146,9 @@ def _diagnosis(diagnosis: Diagnosis) -> pd.DataFrame:
     rows: list[dict[str, object]] = []
     for effect in diagnosis.effects:
         # An effect without parameters has a row, too: it has a probability.
-        parameters = effect.parameters or {None: np.nan}
+        parameters: dict[str | None, float] = dict(effect.parameters.items())
+        if not parameters:
+            parameters = {None: np.nan}
         for name, value in parameters.items():
             low, high = effect.intervals.get(str(name), (np.nan, np.nan))
             row = {
