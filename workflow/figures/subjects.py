@@ -33,7 +33,6 @@ from workflow.config.run_config import Channel, RunConfig
 from workflow.figures import style
 from workflow.figures.bands import Complex, Real, smooth_grid
 from workflow.figures.style import ratio_unit
-from workflow.tasks.design import joint_numbers
 from workflow.tasks.exports import Logged
 from workflow.tasks.giving_way import GaveWay, gave_way
 from workflow.tasks.identification import as_fitted
@@ -386,11 +385,6 @@ class RunView(AnyRunView):
         """Level of the ellipses that were certified: calibrated to sampled responses where asked for."""
         joint = None if self.results.certify.certificate is None else self.results.certify.certificate.joint
         return self.level if joint is None else max(self.level, joint.level)
-
-    @property
-    def shares(self) -> Mapping[str, Any]:
-        """Shares of sampled responses that hold and are stable, with their 95 % intervals."""
-        return joint_numbers(self.results.certify.sampled)
 
     @cached_property
     def loop_grid(self) -> Real:
