@@ -235,6 +235,7 @@ def command_line() -> str:
 # Pages of the Python reference.
 MODULES = {
     "models": "Records, models and uncertainty",
+    "comparison": "Beside other methods",
     "design": "Controllers and certificates",
     "machines": "Simulated machines",
     "causes": "Diagnosis",

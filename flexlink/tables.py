@@ -146,10 +146,8 @@ def _diagnosis(diagnosis: Diagnosis) -> pd.DataFrame:
     rows: list[dict[str, object]] = []
     for effect in diagnosis.effects:
         # An effect without parameters has a row, too: it has a probability.
-        parameters: dict[str | None, float] = dict(effect.parameters.items())
-        if not parameters:
-            parameters = {None: np.nan}
-        for name, value in parameters.items():
+        parameters: list[tuple[str | None, float]] = list(effect.parameters.items()) or [(None, np.nan)]
+        for name, value in parameters:
             low, high = effect.intervals.get(str(name), (np.nan, np.nan))
             row = {
                 "effect": effect.name,

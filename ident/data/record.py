@@ -57,7 +57,7 @@ class Record(Shown):
     """One uniformly sampled experiment: T samples of U inputs, Y outputs and R references.
 
     Made of arrays, pandas columns, a time response of python-control, or (with `from_file`, `from_table`) of
-    a log.
+    a log. Arguments that are not listed here are the attributes of that name.
 
     Parameters
     ----------
@@ -71,8 +71,6 @@ class Record(Shown):
         Set points of a closed loop.
     input_names, output_names, reference_names : str or sequence of str
         A single name may stand by itself.
-
-    The others are the attributes below.
 
     Attributes
     ----------
@@ -612,8 +610,8 @@ class Record(Shown):
         time : str, optional
             Column of numbers (unit from its name, else seconds) or of date-times. Default: the index, if it
             holds times; otherwise give dt_s.
-
-        The others as in `from_file`.
+        more : object
+            As in `from_file`.
 
         Raises
         ------

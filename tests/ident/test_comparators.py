@@ -6,6 +6,7 @@ import pytest
 import scipy.linalg
 import scipy.signal
 
+from ident.comparators.n4sid import n4sid
 from ident.comparators.polynomial_fits import PolynomialModel, armax, arx, oe
 from ident.comparators.prediction_error import prediction_errors, prediction_jacobian
 from ident.comparators.stable_sections import from_sections, sections_derivative, stabilised, to_sections
@@ -47,6 +48,37 @@ def test_white_output_noise_biases_arx_and_not_oe():
     # Standard deviation of the OE coefficients here about 2e-3; the ARX bias does not shrink with the record.
     np.testing.assert_allclose(oe(record, 2, 2).f, A, atol=0.01)
     assert np.max(np.abs(arx(record, 2, 2).a - A)) > 0.05
+
+
+def test_n4sid_finds_plant_and_noise():
+    omega = np.linspace(1, 300, 50)
+    exact = data(300)
+    truth = arx(exact, 2, 2).frequency_response(omega)
+    np.testing.assert_allclose(n4sid(exact, 2).frequency_response(omega), truth, rtol=1e-9)
+    noisy = data(8000, noise_std=0.5, noise=(C, A))
+    model = n4sid(noisy, 2)
+    # Of 8000 samples about 1 % of the response is left open, and 1 % of a standard deviation.
+    np.testing.assert_allclose(model.frequency_response(omega), truth, rtol=0.05)
+    errors = noisy.output[:, 0] - model.one_step_ahead(noisy)
+    assert np.std(errors) == pytest.approx(0.5, rel=0.04)
+
+
+@pytest.mark.parametrize("arguments", [(2, 2, 2), (2, 3, 1), (3, 1, 2)])
+def test_the_innovation_form_is_the_same_model(arguments):
+    record = data(2000, noise_std=0.5, noise=(C, A))
+    model = armax(record, *arguments)
+    state_model = model.innovation_form()
+    omega = np.linspace(1, 300, 50)
+    np.testing.assert_allclose(
+        state_model.frequency_response(omega), model.frequency_response(omega), rtol=1e-9
+    )
+    u = record.input[:, 0]
+    np.testing.assert_allclose(state_model.simulate(u), model.simulate(u), atol=1e-9)
+    # From rest the innovations are the prediction errors, but for the start that is fitted.
+    errors = record.output[:, 0] - state_model.one_step_ahead(record)
+    delayed = np.r_[0.0, u[:-1]]
+    expected = prediction_errors(model, delayed, record.output[:, 0])
+    np.testing.assert_allclose(errors[200:], expected[200:], atol=0.02)
 
 
 @pytest.mark.parametrize("output_error_start", [True, pytest.param(False, marks=pytest.mark.slow)])
