@@ -469,7 +469,7 @@ class UncertaintyResult:
 
     def conditions(self, config: RunConfig) -> tuple[Finding, ...]:
         """What a certificate over these ellipses stands or falls with."""
-        conditions = []
+        conditions = list[Finding]()
         for index in dict.fromkeys((config.control_index, config.performance_index)):
             if index is not None:
                 conditions += conditions_of(self.channels[index].advice)
