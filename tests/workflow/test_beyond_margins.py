@@ -293,7 +293,7 @@ def test_a_hint_that_was_not_designed_and_certified_is_not_given(monkeypatch, fa
     assert tried == [10.0, 18.0, 36.0]
     if fails == "certificate":
         verdict.certified = True
-        assert design().reason.endswith("would_meet ('effort_limit', 18.0)")
+        assert design().reason.endswith("effort_limit = 18 would meet it")
 
 
 def test_words_of_sampled_responses():
