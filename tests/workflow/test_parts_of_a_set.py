@@ -11,7 +11,7 @@ from benchmarks.closed_loop_machines.judge import worst_of
 from ident.friction import RateMember
 from tests.workflow import report_examples as example
 from workflow.config.design_file import DesignFile
-from workflow.describe.run import uncertainty_numbers
+from workflow.describe.uncertainty import uncertainty_numbers
 from workflow.engine.run_directory import RunDirectory
 from workflow.report.pages import write_report
 from workflow.tasks.design_source import load_sources
