@@ -22,7 +22,7 @@ from control_design.controllers.law import Law
 from control_design.plants.ellipses import Boolean, Complex, Real
 from control_design.plants.plant_set import delayed
 from ident.data.arrays import lock
-from ident.data.keywords import clear_constructor
+from ident.data.keywords import clear_constructor, refuse_rate
 
 if TYPE_CHECKING:
     import control
@@ -170,8 +170,10 @@ class Controller(Law):
     def proportional(cls, gain: float, dt_s: float, **settings: Any) -> Controller:
         """Controller u = gain e without states at a period dt_s in seconds; settings are further fields.
 
-        Raises ValueError as the class does, for a gain or a period that is not finite among others.
+        Raises ValueError as the class does, for a gain or a period that is not finite among others, and for
+        a period that is rather a rate in Hz.
         """
+        refuse_rate(dt_s)
         no_states = np.zeros((0, 0))
         no_input = np.zeros((0, 1))
         no_output = np.zeros((1, 0))

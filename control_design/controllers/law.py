@@ -20,7 +20,6 @@ from control_design.plants.ellipses import Complex, Real
 from control_design.plants.plant_set import matrix_response
 from ident.data.arrays import lock
 from ident.data.json_text import json_value
-from ident.data.keywords import refuse_rate
 from ident.data.mat_files import mat_bytes
 
 if TYPE_CHECKING:
@@ -74,7 +73,6 @@ class Law:
                 raise ValueError(f"{self.kind} matrix {name} has a value that is not finite")
         if not (self.dt_s > 0 and np.isfinite(self.dt_s)):
             raise ValueError(f"dt_s must be positive; got {self.dt_s}")
-        refuse_rate(self.dt_s)
         # A numpy scalar is written otherwise in C and JSON.
         object.__setattr__(self, "dt_s", float(self.dt_s))
 

@@ -80,8 +80,10 @@ def state_space(system: Any, what: str = "the system", *, several: bool = False)
         )
     is_state_space = isinstance(system, control.StateSpace)
     _refuse(system, what, several=several and is_state_space)
+    # A state space may be in any unit of time; polynomials are typed, and then with a rate for a period.
     if is_state_space:
         return system
+    refuse_rate(system.dt)
     try:
         return of_polynomials(system.num[0][0], system.den[0][0], system.dt)
     except ValueError as error:
@@ -122,4 +124,3 @@ def _refuse(system: Any, what: str, *, several: bool = False) -> None:
         else:
             mend = "sample it: control.sample_system(system, dt_s, 'zoh')"
         raise WrongArgumentError(f"{what} is in continuous time, flexlink works in discrete time: {mend}")
-    refuse_rate(system.dt)
