@@ -25,9 +25,11 @@ from plant.effects import EFFECTS
 # benchmarks.frozen_answers --only exact --change`).
 DISAGREEMENT = {"smooth": 0.03, "continuous": 0.06, "non-smooth": 0.25}
 # Prior probability of sets by their number of effects; it is shared equally among the sets of that number.
-# One missing effect is what a user looks for most often, one gap in four has none of the listed ones.
+# One missing effect is what a user looks for most often, one gap in four has none of the listed ones; two are
+# a quarter as frequent as one, three a fourteenth of that. Chosen.
 _PRIOR_OF_COUNT = {0: 0.25, 1: 0.5, 2: 0.14, 3: 0.01}
-# Prior of larger sets, each number of effects by itself: no search looks for them under known noise.
+# Prior of larger sets, each number of effects by itself: no search looks for them under known noise. Chosen:
+# a tenth of three.
 _PRIOR_OF_MORE = 1e-3
 # Prior probability of a cause beyond the list: what the numbers of effects above leave.
 PRIOR_UNKNOWN = 0.1
@@ -137,12 +139,14 @@ def log_prior(names: Sequence[str], listed_count: int | None = None) -> float:
     names : sequence of str
         Effects of the set; empty for none.
     listed_count : int, optional
-        Number of effects that are looked for, at least as many as the set has; by default all registered.
+        Number of effects that are looked for, at least as many as the set has: with fewer there is no such
+        set, and the result is no logarithm of a probability. By default all registered.
 
     Returns
     -------
     float
-        log of `_PRIOR_OF_COUNT` over the number of sets with as many effects, a binomial coefficient.
+        log of `_PRIOR_OF_COUNT`, above three effects of `_PRIOR_OF_MORE`, over the number of sets with as
+        many effects, a binomial coefficient.
     """
     if listed_count is None:
         listed_count = len(EFFECTS)

@@ -165,8 +165,9 @@ def point_at(
 def superposed(records: RecordsToFit, parent: Fit, points: Sequence[StartPoint]) -> list[StartPoint]:
     """Points beside the effects of another fit, their changes simply added, best first: no simulation.
 
-    A second effect large enough for superposition to fail shows all the same. Points whose change is not
-    known are left out.
+    Loss and deviations are those beside the other fit; start, size and change stay as they were. A second
+    effect large enough for superposition to fail shows all the same. Points whose change is not known are
+    left out.
     """
     moved = []
     for point in points:

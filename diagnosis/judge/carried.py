@@ -140,8 +140,11 @@ def _carried_by_each(
 
 
 def _sets_that_close(search: Search, nominal: Explanation) -> tuple[tuple[Names, float], ...]:
-    """The `FOLLOWED_SETS` sets that close most of the validation error, each more than any part of it, with
-    the share that it closes."""
+    """The `FOLLOWED_SETS` (four) sets that close most of the validation error, with the shares they close.
+
+    Each closes surely more than the best fitted part of it with one effect fewer: `_CLOSES` more, twice
+    as much from three effects on. A part that was not fitted counts as closing nothing.
+    """
     by_evidence = sorted(search.explanations, key=lambda explanation: explanation.log_evidence)
     # The likeliest fit of a set comes last and stays.
     closed = {e.sorted_names: closed_by(search, e, nominal) for e in by_evidence if e.names}

@@ -227,7 +227,11 @@ class Judge(ABC, Generic[E]):
         )
 
     def _prediction(self, closed: float) -> Prediction:
-        """What the repair is worth; closed: share of the validation error that it explains."""
+        """What the repair is worth on logs that it was not fitted to.
+
+        closed : share of the validation error that it explains. Errors are RMS in noise deviations, the
+        standard error is a share of the nominal model's energy.
+        """
         keys = self.search.records.nominal.keys
         best = min(self.trials, key=lambda trial: trial.error.rms)
         nominal = self.trials[0]

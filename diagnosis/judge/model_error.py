@@ -196,12 +196,14 @@ def _competing(search: Search, judgement: JudgedSets) -> tuple[CompetingHypothes
     """Sets whose effects contradict each other, for the experiment that parts them, most probable first.
 
     One standard deviation of an output is what the likelihood counts as one: the energies that do not
-    interest, over as many independent values as its bands have. Neglected: that they grow with the motion.
+    interest, over as many independent values as its bands have; infinite where nobody measures. Neglected:
+    that they grow with the motion.
     """
     case = search.case
     records = search.records
     contradicting: dict[tuple[str, ...], Fit] = {}
     for judged_set in judgement.judged:
+        # What a set is about: effects that are likelier there than not.
         key = tuple(sorted(judged_set.holding(0.5)))
         related = [other for other in contradicting if set(key) <= set(other) or set(other) <= set(key)]
         if key and not related:

@@ -168,7 +168,8 @@ class Case(RecordedCase[Experiment]):
     def at_fast_lengths(self) -> Case:
         """The case with its records cut at their ends to lengths at which a cosine transform is fast.
 
-        Those have no large prime factors; a record of hundreds of rows loses less than 2 %.
+        Those have no large prime factors (`scipy.fft.prev_fast_len`): a record of 209 rows keeps 200, the
+        most that one of hundreds loses; of a thousand and more it is 2.2 % at most.
         """
         parts = []
         for e in self.experiments:

@@ -158,7 +158,8 @@ class FlexibleArm:
         """Voltage (T, 1) -> outputs (T, Y) without noise, of the rig with these effects.
 
         Further arguments: state (S,) of the start, None for rest at zero; zeros (Z,) that the readings are
-        off by; first_row of the run that the record is a part of, for what depends on time.
+        off by; first_row of the run that the record is a part of, for what depends on time, which only a
+        state brings: from rest at zero the run begins with the record.
         """
         prepared = self._prepared(effects)
         dt_s = self.rig.sampling.dt_s

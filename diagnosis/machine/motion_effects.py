@@ -263,6 +263,8 @@ class PulseResponse:
     def of(cls, motion: Real, dt_s: float, *, of_speed: bool) -> PulseResponse:
         """motion (T,): change of the motion per force, the pulse in its second sample.
 
+        A caller turns its sign so that it begins above zero.
+
         Raises NotFollowedError if the force does not move the body at once, or the motion is no number.
         """
         h = motion[1:]

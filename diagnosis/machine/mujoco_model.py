@@ -118,8 +118,11 @@ def read(path: str) -> Any:
     Raises ValueError, one line, where it is no file or MuJoCo does not read it. MuJoCo's warnings are turned
     off for the whole process: it would write those of every trial that runs away to the terminal and a file.
     """
-    _refuse_pipes(Path(path))
     mujoco.set_mju_user_warning(lambda text: None)
+    try:
+        _refuse_pipes(Path(path))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be read: {error.strerror}") from error
     try:
         return mujoco.MjSpec.from_file(path)
     except ValueError as error:

@@ -335,12 +335,17 @@ class _Visibility:
         return self._change({}, {effect.name: values})
 
     def _change(self, parameters: Mapping[str, float], effects: Mapping[str, Mapping[str, float]]) -> float:
-        """Largest RMS of a change over the noise, of records in which it is large and reaches above noise."""
+        """Largest RMS of a change over the noise, of records in which it is large and reaches above noise.
+
+        Infinite where a trial runs away: that shows, whatever its size.
+        """
         noise = self.simulation.noise
         largest = 0.0
         for e, before in zip(self.records, self.as_stated, strict=True):
             values = {**self.simulation.parameters, **parameters}
             change = self.simulation(values, effects, e.input) - before
+            if not np.all(np.isfinite(change)):
+                return np.inf
             rms = np.sqrt(np.mean(change**2, axis=0))
             matters = rms > self.least_share * np.std(e.output, axis=0)
             reaches_above_noise = np.max(np.abs(change), axis=0) > _SEEN_NOISE_DEVIATIONS * noise

@@ -418,6 +418,7 @@ class Quantities:
             if place is not None:
                 # Of all that moves with it: what a robot carries is no multiple of its last link.
                 mass_kg = float(model.body_subtreemass[model.body_rootid[k]])
+                # From a thousandth of it, which no actuator feels, to ten times its mass.
                 size = _size("mass_kg", mass_kg, (1e-3, 10.0))
                 yield _quantity(f"{name}.payload", 0.0, partial(put_payload, *place), size, group="link")
         if not body.mass > 0:
@@ -431,6 +432,7 @@ class Quantities:
         of_link = partial(_quantity, group="link", tried="by name")
         radius_of_gyration = float(np.sqrt(np.max(body.inertia) / body.mass))
         radius = max(radius_of_gyration, float(np.linalg.norm(body.ipos)))
+        # A centre farther off than the body reaches would be another body's.
         shift = _size("shift_m", radius or 1.0, (1e-3, 1.0))
         for i, axis in enumerate("xyz"):
             yield of_link(f"{name}.com_{axis}", 0.0, partial(put_centre, name, i), shift, signed=True)

@@ -77,8 +77,10 @@ class SimulationError(ValueError):
 def place_of(error: BaseException, file: str = "") -> str:
     """The last line of a user's file on the way to an error, as " (FILE, line N)"; "" where there is none.
 
-    file : that file; by default the one that is called first, beside those of this package.
+    file : that file, spelt as Python was given it; by default the one that is called first, beside those of
+    this package.
     """
+    # The first frame is whoever caught the error.
     frames = traceback.extract_tb(error.__traceback__)[1:]
     package = str(Path(__file__).parent)
     called = [frame for frame in frames if str(Path(frame.filename).parent) != package]

@@ -135,7 +135,9 @@ _KNOWS_NOTHING = 1.0
 def wrong_values(tolerances: Mapping[str, float]) -> tuple[PlantEffect, ...]:
     """Effects "wrong_NAME", a ratio, of stated values that may be wrong by several of their tolerances.
 
-    tolerances : name -> relative standard deviation; a value of which nothing is known has no such effect.
+    From how many tolerances on a ratio is sought, `ratio_candidates` says (three); the lower end of the
+    effect's parameter holds the tolerance. tolerances : name -> relative standard deviation; a value of which
+    nothing is known (1 or more) has no such effect.
     """
     return tuple(
         PlantEffect(f"wrong_{key}", (EffectParameter("ratio", tolerance, _LARGEST_RATIO),), multiplies=key)

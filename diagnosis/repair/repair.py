@@ -178,8 +178,8 @@ class Repairs(Generic[E]):
     def _shortlist(self) -> list[E]:
         """Fitted sets that are worth a look at logs left out: the nominal, then those that leave least.
 
-        For every number of effects the `SEVERAL` that leave least of the validation records and the likeliest
-        one; none that leaves more of these than the nominal does.
+        For every number of effects the `FOLLOWED_SETS` (four) that leave least of the validation records and
+        the likeliest one; none that leaves more of these than the nominal does by over one standard error.
         """
         likeliest = best_of_sets(self.search.explanations)
         energies = {}

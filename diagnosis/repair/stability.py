@@ -20,7 +20,8 @@ def share_of_repairs(trials: Sequence[Trial[Any]]) -> dict[str, float]:
     Parameters
     ----------
     trials : sequence of Trial
-        Sets of effects with their errors in the same blocks.
+        At least one set of effects, each with its errors in the same blocks (`PredictionError.energy`, (B,)
+        with B of two or more).
     """
     shares = dict.fromkeys((name for trial in trials for name in trial.names), 0.0)
     for names, share in shares_of_sets(trials).items():

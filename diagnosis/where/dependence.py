@@ -80,8 +80,8 @@ _NO_ENERGY = 1e-300
 
 # Units of positions; an output without a unit is taken for one.
 _POSITIONS = ("rad", "m", "deg", "mm", "")
-# Units of speeds.
-_SPEEDS = ("rad/s", "m/s", "deg/s")
+# Units of speeds: theirs over a second.
+_SPEEDS = tuple(f"{unit}/s" for unit in _POSITIONS if unit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -607,8 +607,8 @@ def _acting_on_known_motion(
 
 
 def _moving(name: str, unit: str, values: Sequence[Real], dt_s: float) -> tuple[_Variable, ...]:
-    """Position, speed and acceleration of an output (T,) of every record; of one that is no motion, its
-    value.
+    """Position, speed and acceleration of an output (T,) of every record, those that vary; of one that is no
+    motion, its value.
 
     The position of an output that is a speed is counted from the begin of its record.
     """

@@ -124,6 +124,16 @@ def test_a_trial_that_runs_away_is_not_finite_from_there_on(force):
     assert not np.any(np.isfinite(outputs[first_bad:]))
 
 
+def test_a_value_with_which_a_trial_runs_away_shows():
+    """A servo that is stable as stated, and not with three times its gain at this timestep (a hundredth of a
+    second, 139 rad/s as stated)."""
+    servo = ROD.replace('<motor name="motor"', '<position name="motor" kp="6000" kv="1"')
+    text = servo.replace('timestep="0.001"', 'timestep="0.01"')
+    command = 0.1 * steps()
+    plant, _ = plant_of(arm_of(text), command, command)
+    assert "motor.kp" in plant.tolerances
+
+
 @pytest.mark.parametrize("model_error", [0.0, 0.05])
 def test_a_model_that_runs_away_as_stated_is_refused(model_error):
     arm = arm_of(ROD.replace('damping="0.2"', 'damping="0.2" stiffness="-1e5"'))

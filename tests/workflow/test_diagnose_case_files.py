@@ -163,6 +163,10 @@ SPOILT = {
     "wrong number of rows": (_case("samples = 240", "samples = 250"), ["[0].samples", "250", "240"]),
     "forbidden name": (_case('case = "arm"', 'case = "../arm"'), ["case.toml", "case", "../arm"]),
     "taken name": (_case('case = "arm"', 'case = "index"'), ["case.toml", "'index'"]),
+    "no such reference": (
+        _case('role = "estimation"', 'role = "estimation"\ncolumns = { reference_rad = "setpiont" }'),
+        ["01_prbs.csv", "no column 'setpiont'"],
+    ),
     "no such column": (
         _case('role = "estimation"', 'role = "estimation"\ncolumns = { tip_m = "tip_mm" }'),
         ["01_prbs.csv", "no column 'tip_mm'", "time_s"],

@@ -109,7 +109,9 @@ def _experiment(
     names = {quantity: entry.column(quantity, settings.columns) for quantity in (*wanted, "reference_rad")}
     with naming(str(path)):
         table = read_table(path)
-        if names["reference_rad"].column in table.names:
+        # Most logs have no reference; a column that was stated is missed where it is not there.
+        is_stated = entry.columns.reference_rad is not None or settings.columns.reference_rad is not None
+        if is_stated or names["reference_rad"].column in table.names:
             wanted.append("reference_rad")
         taken = [names[quantity].column for quantity in wanted]
         if (column := repeated(taken)) is not None:

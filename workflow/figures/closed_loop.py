@@ -84,7 +84,7 @@ def draw_closed_loop(
         Outputs of the lines `FRICTION`, as far as they go; the step's panel goes as far as the longest.
     settled_s : float, optional
         The panels are cut where nothing moves any more, not before this time after the step; None: all is
-        shown.
+        shown, but beside a disturbance, whose panel takes over where it begins.
     onto : tuple of Picture and Panel, optional
         Drawn on in place of a new picture; of one row and column.
     """

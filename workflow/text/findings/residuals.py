@@ -64,7 +64,8 @@ def independence(passed: bool, probability: float, lag: int, correlation: float,
         )
     else:
         verdict = (
-            f"The residuals depend on the input {lag} samples before (correlation {correlation:+.2f}, {p}): "
+            f"The residuals depend on the input {formats.count(lag, 'sample')} before "
+            f"(correlation {correlation:+.2f}, {p}): "
             "the model lacks dynamics or delay there; allow more poles, a direct term or another delay."
         )
     if precedes_input:
@@ -74,9 +75,10 @@ def independence(passed: bool, probability: float, lag: int, correlation: float,
 
 def not_independent(lag: int) -> str:
     return (
-        f"the residuals depend on the input, most {lag} samples after it: allow a pole pair or a real pole "
-        "more, a direct term, or another delay; if that does not help, the machine is not linear at this "
-        "amplitude (dry friction, saturation), and the ellipses hold for this kind of input only"
+        f"the residuals depend on the input, most {formats.count(lag, 'sample')} after it: allow a pole pair "
+        "or a real pole more, a direct term, or another delay; if that does not help, the machine is not "
+        "linear at this amplitude (dry friction, saturation), and the ellipses hold for this kind of input "
+        "only"
     )
 
 
