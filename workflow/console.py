@@ -24,10 +24,22 @@ if TYPE_CHECKING:
     from workflow.describe.summary import RunSummary
 
 
-FIRST_LINE_S, LINE_EVERY_S = 0.4, 10.0
-_STARTING, _REFUSED_S = "starting", 3.0  # what is refused in one line is refused by then
-COMPILING_S = 25.0  # all kernels that one command needs, the first time
-# So much work as expected is taken for granted before the speed of this machine counts.
+# When the first line of progress comes [s], where there is no terminal: as soon as one wonders.
+FIRST_LINE_S = 0.4
+# Time between lines of progress [s]: a log of an hour's work stays short.
+LINE_EVERY_S = 10.0
+# What is said before any work is reported.
+_STARTING = "starting"
+# What is refused in one line is refused by then [s]: no progress is said before it.
+_REFUSED_S = 3.0
+# Time to compile all kernels that one command needs, the first time [s]. Chosen: it is said, and
+# counts in the time left, nothing else.
+COMPILING_S = 25.0
+# Share of the expected work below which no time left is said: less says nothing about the whole.
+_LEAST_SHARE = 0.02
+# Width where standard output has none and COLUMNS says none, as in a pipe: rows stay on one line.
+_PIPE_COLUMNS = 120
+# So much work as expected [s] is taken for granted before the speed of this machine counts.
 _PRIOR_S = 10.0
 
 
@@ -37,9 +49,13 @@ class TerminalProgress(progress.Progress):
 
     def __init__(self, *, quiet: bool = False) -> None:
         console = Console(stderr=True)
-        self._quiet, self._lines = quiet, not quiet and not console.is_terminal
-        self._began_s, self._compiled_s, self._worked_s = time.monotonic(), 0.0, 0.0
-        self._over, self._watching = threading.Event(), ExitStack()
+        self._quiet = quiet
+        self._lines = not quiet and not console.is_terminal
+        self._began_s = time.monotonic()
+        self._compiled_s = 0.0
+        self._worked_s = 0.0
+        self._over = threading.Event()
+        self._watching = ExitStack()
         self._teller = threading.Thread(target=self._tell, daemon=True)
         self._bar = Progress(
             SpinnerColumn(),
@@ -50,10 +66,12 @@ class TerminalProgress(progress.Progress):
             transient=True,
             disable=quiet or not console.is_terminal,
         )
-        self._doing, self._task = _STARTING, self._bar.add_task(_STARTING, total=1.0, left="")
+        self._doing = _STARTING
+        self._task = self._bar.add_task(_STARTING, total=1.0, left="")
         self._expected: dict[str, float] = {}
         self._done_s = 0.0
-        self._reported_s = self._began_s  # when work was last reported
+        # When work was last reported.
+        self._reported_s = self._began_s
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -66,7 +84,8 @@ class TerminalProgress(progress.Progress):
     ) -> None:
         self._over.set()
         if self._lines:
-            self._teller.join()  # what comes later may have another standard error, or none
+            # What comes later may have another standard error, or none.
+            self._teller.join()
         self._watching.close()
         self._bar.stop()
 
@@ -89,7 +108,7 @@ class TerminalProgress(progress.Progress):
         """Share done and time left, as of the last report of work: it falls till the next and is unknown
         where that takes longer. What compiled is no sign of slowness, but more of it is to come."""
         total_s = sum(self._expected.values())
-        if not total_s or self._worked_s < 0.02 * total_s:  # less says nothing about the whole
+        if not total_s or self._worked_s < _LEAST_SHARE * total_s:
             return ""
         spent_s = self._reported_s - self._began_s - self._compiled_s
         left_s = (total_s - self._worked_s) * ((spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S))
@@ -104,7 +123,9 @@ class TerminalProgress(progress.Progress):
         from numba.core import event
 
         class Watch(event.Listener):
-            depth, began_s = 0, 0.0
+            # A kernel compiles those that it calls: only the outermost is timed.
+            depth = 0
+            began_s = 0.0
 
             def on_start(watch, event: object) -> None:  # noqa: N805
                 if watch.depth == 0:
@@ -137,7 +158,8 @@ class TerminalProgress(progress.Progress):
         self.update(stage, 0.0)
 
     def update(self, stage: str, fraction: float, message: str = "") -> None:
-        interrupts.check()  # some libraries swallow one while they are loaded
+        # Some libraries swallow an interrupt while they are loaded.
+        interrupts.check()
         self._worked(self._done_s + min(max(fraction, 0.0), 1.0) * self._expected.get(stage, 0.0))
         self._doing = f"{stage}: {message}" if message else stage
         ahead = self._ahead().partition(", ")[2].rstrip(")")
@@ -147,7 +169,8 @@ class TerminalProgress(progress.Progress):
 
     def finish(self, stage: str, seconds: float, *, taken_up: bool) -> None:
         if taken_up:
-            self._expected[stage] = 0.0  # it says nothing about the speed of this run
+            # It says nothing about the speed of this run.
+            self._expected[stage] = 0.0
             self._bar.update(self._task, total=sum(self._expected.values()) or 1.0)
         self._done_s += self._expected.get(stage, 0.0)
         self._worked(self._done_s)
@@ -159,11 +182,11 @@ class TerminalProgress(progress.Progress):
 def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
     """The table of numbers on standard output, and the verdict where it is no complaint on standard error.
     verbose: rows of parts, too."""
-    from workflow.text.formats import BARS  # numpy, which a command that only says its version can do without
+    # It loads numpy, which a command that only says its version can do without.
+    from workflow.text.formats import BARS
 
-    # A pipe has no width; 120 columns keep the rows on one line there, where COLUMNS does not say less.
-    told = sys.stdout.isatty() or "COLUMNS" in os.environ
-    console = Console(file=sys.stdout, width=None if told else 120)
+    has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
+    console = Console(file=sys.stdout, width=None if has_width else _PIPE_COLUMNS)
     table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
     table.add_column("section", style="bold")
     # Names of columns are folded, not cut: what tells two of them apart may stand at the end.

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pydantic.fields import FieldInfo
 
 F = TypeVar("F", bound=Callable[..., Any])
+# Ends of a field's range as a help text says them, by their names in pydantic's metadata.
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 # Where it is not that of the field, and no hint names it (`workflow.text.options`).
 _NAMES = {
@@ -38,23 +39,34 @@ _NAMES = {
 }
 # What is typed for a key of [specification] in place of a number: it is not asked.
 NONE = "none"
+# Before the help of an option that is stated for each column by itself.
 _BY_COLUMN = "COLUMN=VALUE (repeatable): "
 
 
 def with_fields(**places: Sequence[str]) -> Callable[[F], F]:
-    """Give a command, which takes them as `**given`, options for fields of settings. places: by the name of
-    a place in `SETTINGS`, fields, with what stands before them in the table of option names ("x.field")."""
+    """Give a command options for fields of settings; it takes their values as `**given`.
+
+    The options are made by `completed`: a place that is not in `SETTINGS` is a KeyError only there.
+
+    Parameters
+    ----------
+    places : sequences of str
+        By the name of a place in `SETTINGS`, its fields, with what stands before them in the table of option
+        names ("x.field").
+    """
 
     def noted(function: F) -> F:
-        own = inspect.signature(function)
-        kept = [each for each in own.parameters.values() if each.kind is not each.VAR_KEYWORD]
-        function.__signature__ = own.replace(parameters=kept)  # type: ignore[attr-defined]
+        # Typer would take `**given` for one option of that name.
+        signature = inspect.signature(function)
+        named = [each for each in signature.parameters.values() if each.kind is not each.VAR_KEYWORD]
+        function.__signature__ = signature.replace(parameters=named)  # type: ignore[attr-defined]
         function.of_fields = places  # type: ignore[attr-defined]
         return function
 
     return noted
 
 
+# Where the settings of each place stand: "module:class", loaded when a command with fields of it is called.
 SETTINGS = {
     "fit": "workflow.config.uncertainty_options:FitOptions",
     "ellipses": "workflow.config.uncertainty_options:UncertaintyOptions",
@@ -72,10 +84,11 @@ SETTINGS = {
 def completed(function: Callable[..., Any]) -> Callable[..., Any]:
     """The command with the options that `with_fields` promised."""
     hints = get_type_hints(function, include_extras=True)
-    own = inspect.signature(function).parameters.values()
-    parameters = [each.replace(annotation=hints[each.name]) for each in own]
+    named = inspect.signature(function).parameters.values()
+    parameters = [each.replace(annotation=hints[each.name]) for each in named]
     for place, names in function.of_fields.items():  # type: ignore[attr-defined]
         fields = resolve_name(SETTINGS[place]).model_fields
+        # Only a specification has keys whose absence differs from their default.
         may_be_none = place == "specification"
         parameters += [
             _parameter(name, fields[name.rpartition(".")[2]], may_be_none=may_be_none) for name in names
@@ -112,17 +125,20 @@ def _number_or_none(text: str) -> float | str:
 def _parameter(key: str, field: FieldInfo, *, may_be_none: bool = False) -> inspect.Parameter:
     """Option for a field; may_be_none: an optional number takes the word none as well."""
     kind = _kind(field.annotation)
-    words = (_BY_COLUMN if _is_mapping(field.annotation) else "") + described(field)
+    words = described(field)
+    if _is_mapping(field.annotation):
+        words = _BY_COLUMN + words
     form = "<float> <float>" if get_origin(kind) is tuple else None
     parser = None
     if may_be_none and kind is float and type(None) in get_args(field.annotation):
-        form, parser = "<float>|none", _number_or_none
-    said = typer.Option(option_name(key), help=words[0].upper() + words[1:], metavar=form, parser=parser)
+        form = "<float>|none"
+        parser = _number_or_none
+    option = typer.Option(option_name(key), help=words[0].upper() + words[1:], metavar=form, parser=parser)
     return inspect.Parameter(
         key.replace(".", "_"),
         inspect.Parameter.KEYWORD_ONLY,
         default=False if kind is bool else None,
-        annotation=Annotated[kind if kind is bool else kind | None, said],
+        annotation=Annotated[kind if kind is bool else kind | None, option],
     )
 
 
@@ -142,6 +158,7 @@ def _kind(annotation: Any) -> Any:
     pairs = [kind for kind in kinds if get_origin(kind) is tuple]
     if pairs:
         return list[get_args(pairs[0])[0]] if Ellipsis in get_args(pairs[0]) else pairs[0]  # type: ignore[misc]
+    # A field that takes a number or a word is typed as text, and its settings tell which it is.
     plain = [kind for kind in kinds if kind in (bool, int, float, Path)]
     choices = [choice for kind in kinds for choice in get_args(kind) if isinstance(choice, str)]
     return plain[0] if len(plain) == 1 and not choices else str
@@ -151,11 +168,18 @@ def described(field: FieldInfo) -> str:
     """Description, choices, range and, where it is not said, default of a field."""
     from pydantic_core import PydanticUndefined
 
-    choices = [get_args(kind) for kind in (field.annotation, *get_args(field.annotation))]
-    more = [", ".join(some) for some in choices if len(some) > 1 and isinstance(some[0], str)]
-    more += [f"{_LIMITS[k]} {getattr(m, k):g}" for m in field.metadata for k in _LIMITS if hasattr(m, k)]
-    said = str(field.description)
-    unsaid = not any(field.default is none for none in (None, False, PydanticUndefined, ()))
-    if unsaid and "default:" not in said:
-        more.append(f"default: {field.default}")
-    return said + (f" [{'; '.join(more)}]" if more else ".")
+    remarks = []
+    # Words of a Literal, which may stand beside None.
+    for kind in (field.annotation, *get_args(field.annotation)):
+        choices = get_args(kind)
+        if len(choices) > 1 and isinstance(choices[0], str):
+            remarks.append(", ".join(choices))
+    for metadata in field.metadata:
+        for limit, words in _LIMITS.items():
+            if hasattr(metadata, limit):
+                remarks.append(f"{words} {getattr(metadata, limit):g}")
+    description = str(field.description)
+    has_default = not any(field.default is none for none in (None, False, PydanticUndefined, ()))
+    if has_default and "default:" not in description:
+        remarks.append(f"default: {field.default}")
+    return f"{description} [{'; '.join(remarks)}]" if remarks else f"{description}."

@@ -560,7 +560,7 @@ RAMPS = np.interp(
     + ["set point cut off", "ramps"],
 )
 def test_a_command_is_cut_off_where_it_stays_at_its_ends(command, cut):
-    assert bool(check._at_ends(command)) == cut
+    assert bool(check.share_at_ends(command)) == cut
 
 
 @pytest.mark.parametrize(

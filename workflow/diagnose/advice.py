@@ -23,6 +23,7 @@ _MOST_CHECKED = 4
 # Times the noise or the threshold from which on a separation is no longer told as a number: beyond that it
 # says how small the noise is, not how different the answers are.
 _CLEARLY = 20.0
+# How a record is repeated, by `Repeat.change`.
 _AGAIN = {
     "same": "as it was",
     "third": "at a third of its size",
@@ -31,20 +32,20 @@ _AGAIN = {
 }
 
 
-def advice_words(found: Diagnosis, coming: Following) -> tuple[str, ...]:
+def advice_words(diagnosis: Diagnosis, coming: Following) -> tuple[str, ...]:
     """The advice in sentences, the decision first; never empty.
 
     Parameters
     ----------
-    found : Diagnosis
+    diagnosis : Diagnosis
     coming : Following
         What `following` decided for it.
     """
-    return tuple(_ADVICES[coming.advice](found, coming))
+    return tuple(_ADVICES[coming.advice](diagnosis, coming))
 
 
-def _time(found: Diagnosis, coming: Following) -> Iterator[str]:
-    if found.nothing_tried:
+def _time(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
+    if diagnosis.nothing_tried:
         yield "Give the diagnosis more time (--time-limit) before you record again: nothing was tried."
     else:
         yield (
@@ -53,34 +54,34 @@ def _time(found: Diagnosis, coming: Following) -> Iterator[str]:
         )
 
 
-def _confirm(found: Diagnosis, coming: Following) -> Iterator[str]:
-    yield f"Look at the machine for {with_sizes(found.unlisted)}: one run without it would confirm it."
+def _confirm(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
+    yield f"Look at the machine for {with_sizes(diagnosis.unlisted)}: one run without it would confirm it."
 
 
-def _repeat_worst(found: Diagnosis, coming: Following) -> Iterator[str]:
-    yield _of_worst(found, "Repeat")
+def _repeat_worst(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
+    yield _of_worst(diagnosis, "Repeat")
 
 
-def _of_worst(found: Diagnosis, begin: str) -> str:
+def _of_worst(diagnosis: Diagnosis, begin: str) -> str:
     """A sentence on the record in which most is left: of its motion, or over the noise."""
-    worst = found.worst_experiment[0]
-    if found.completeness.threshold > 0:
-        worst = found.completeness.in_record or worst
+    worst = diagnosis.worst_experiment[0]
+    if diagnosis.completeness.threshold > 0:
+        worst = diagnosis.completeness.in_record or worst
     return (
         f"{begin} {worst}, the worst record, at half and twice its amplitude and at another speed. What the"
         " residual follows shows where to look."
     )
 
 
-def _repeat_all(found: Diagnosis, coming: Following) -> Iterator[str]:
+def _repeat_all(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
     yield (
         "No other candidate effect is left. Repeat the experiments: what two runs have in common beyond noise"
         " would be another cause."
     )
 
 
-def _none(found: Diagnosis, coming: Following) -> Iterator[str]:
-    if found.untried:
+def _none(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
+    if diagnosis.untried:
         yield "These candidates that were tried need no further experiment; others were not tried."
     else:
         yield (
@@ -89,8 +90,8 @@ def _none(found: Diagnosis, coming: Following) -> Iterator[str]:
         )
 
 
-def _look(found: Diagnosis, coming: Following) -> Iterator[str]:
-    open_answers = _open_answers(found)
+def _look(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
+    open_answers = _open_answers(diagnosis)
     left_open = f"These records leave {names_words(open_answers)} open."
     repeat = coming.repeat
     if repeat is not None and repeat.separates:
@@ -99,27 +100,27 @@ def _look(found: Diagnosis, coming: Following) -> Iterator[str]:
     else:
         nothing = ""
         if repeat is not None:
-            most = max(pair.standard_deviations for pair in repeat.separations)
+            largest = max(pair.standard_deviations for pair in repeat.separations)
             nothing = (
                 " No record repeated, as it was or changed, separates them: by"
-                f" {number(most, 2)} times the threshold at most."
+                f" {number(largest, 2)} times the threshold at most."
             )
         yield f"Check the machine before you record again. {left_open}{nothing}"
         begin = "Check"
-    yield from _checks(found, begin)
-    if found.verdict == "unknown" and not found.unlisted:
-        yield _of_worst(found, "If none of these is the cause, repeat")
+    yield from _checks(diagnosis, begin)
+    if diagnosis.verdict == "unknown" and not diagnosis.unlisted:
+        yield _of_worst(diagnosis, "If none of these is the cause, repeat")
 
 
-def _open_answers(found: Diagnosis) -> list[str]:
+def _open_answers(diagnosis: Diagnosis) -> list[str]:
     """Answers that the records leave open: the accepted effects and what may stand for or beside them."""
-    return [*found.combination, *found.instead, *found.perhaps]
+    return [*diagnosis.combination, *diagnosis.instead, *diagnosis.perhaps]
 
 
-def _checks(found: Diagnosis, begin: str) -> Iterator[str]:
+def _checks(diagnosis: Diagnosis, begin: str) -> Iterator[str]:
     """How each of the first effects that are open is checked at the machine, where that is known."""
-    known = checks(found)
-    effects = [name for name in _open_answers(found) if name not in ("none", "unknown")]
+    known = checks(diagnosis)
+    effects = [name for name in _open_answers(diagnosis) if name not in ("none", "unknown")]
     for name in effects[:_MOST_CHECKED]:
         if name in known:
             yield f"{begin} for {in_words(name)}: {known[name]}."
@@ -128,9 +129,9 @@ def _checks(found: Diagnosis, begin: str) -> Iterator[str]:
             yield f"{begin} for {in_words(name)}: measure {value} by itself."
 
 
-def checks(found: Diagnosis) -> dict[str, str]:
+def checks(diagnosis: Diagnosis) -> dict[str, str]:
     """Effect -> what to do to see whether it is there, as its class says."""
-    machine = found.case.machine
+    machine = diagnosis.case.machine
     kinds = machine.effects if isinstance(machine, Plant) else EFFECTS.values()
     return {kind.id: kind.check for kind in kinds if kind.check}
 
@@ -140,24 +141,24 @@ def _of_repeat(repeat: Repeat) -> str:
     pairs = "; ".join(_apart(pair, "times the threshold") for pair in repeat.separations if pair.separated)
     as_it_was = ""
     if repeat.change != "same":
-        most = max(pair.standard_deviations for pair in repeat.same)
-        as_it_was = f", as it was by {_size(most)} at most"
+        largest = max(pair.standard_deviations for pair in repeat.same)
+        as_it_was = f", as it was by {_size(largest)} at most"
     return f"Repeat {repeat.record} {_AGAIN[repeat.change]}: it would {pairs}{as_it_was}."
 
 
-def _separate(found: Diagnosis, coming: Following) -> Iterator[str]:
+def _separate(diagnosis: Diagnosis, coming: Following) -> Iterator[str]:
     proposal = coming.proposal
     assert proposal is not None
     first = coming.competing[0].name
     left_open = ""
-    if not found.instead and not found.perhaps:
-        names = [f"{one.name} ({probability_words(one.probability)})" for one in coming.competing]
-        left_open = f" Still possible: {listing(names)}."
+    if not diagnosis.instead and not diagnosis.perhaps:
+        answers = [f"{answer.name} ({probability_words(answer.probability)})" for answer in coming.competing]
+        left_open = f" Still possible: {listing(answers)}."
     best = _of_excitation(proposal)
     if not proposal.separates:
-        most = max(pair.standard_deviations for pair in proposal.separations)
+        largest = max(pair.standard_deviations for pair in proposal.separations)
         count = len(proposal.considered)
-        at_most = f"the best, {best}, does by {number(most, 2)} standard deviations at most."
+        at_most = f"the best, {best}, does by {number(largest, 2)} standard deviations at most."
         if proposal.decided:
             rivals = listing([rival.name for rival in coming.competing[1:]])
             yield (
@@ -167,23 +168,23 @@ def _separate(found: Diagnosis, coming: Following) -> Iterator[str]:
         else:
             nothing = f"None of {count} simulated experiments separates these answers: {at_most}"
             yield f"Check the machine before you record again. {nothing}{left_open}"
-            yield from _checks(found, "Check")
+            yield from _checks(diagnosis, "Check")
         return
 
     separated = [_apart(pair, "standard deviations") for pair in proposal.separations if pair.separated]
-    others = [
+    not_separated = [
         f"not separate {' from '.join(pair.hypotheses)} ({number(pair.standard_deviations, 2)})"
         for pair in proposal.separations
         if not pair.separated
     ]
-    would = "; it would ".join([*separated, *others])
+    would = "; it would ".join([*separated, *not_separated])
     if proposal.decided:
         yield (
             f"No further experiment is needed: the records already decide for {first}. To confirm it, run"
-            f" {found.case.name}.next.csv, a {best}: it would {would}."
+            f" {diagnosis.case.name}.next.csv, a {best}: it would {would}."
         )
     else:
-        yield f"Run {found.case.name}.next.csv, a {best}: it would {would}.{left_open}"
+        yield f"Run {diagnosis.case.name}.next.csv, a {best}: it would {would}.{left_open}"
     low, high = (1000 * end for end in proposal.deflection_range_m)
     yield (
         f"In it the hub stays within {interval(proposal.hub_angle_range_rad, 2)} rad, the deflection within"

@@ -54,7 +54,8 @@ def load_case(place: Path, rig: str | None = None) -> LoadedCase:
     """
     file, settings = read_case_file(place)
     folder = file.parent
-    name = settings.case or (folder.resolve().name if file.name == CASE_FILE else file.stem)
+    called_by_folder = file.name == CASE_FILE
+    name = settings.case or (folder.resolve().name if called_by_folder else file.stem)
     if name in _TAKEN_NAMES:
         raise InputError(f"{file}: case: {name!r} is the name of a file of the overview; choose another")
     # A folder may come from anybody; who names a case file himself knows what it reads.
@@ -90,22 +91,50 @@ def _refuse_outside(folder: Path | None, path: Path, where: str) -> None:
 def _rig(path: Path) -> Rig:
     if not path.is_file():
         beside = sorted(p.name for p in path.parent.glob("*.toml") if p.name != CASE_FILE)
-        found = f"; beside it: {', '.join(beside)}" if beside else ""
-        raise InputError(f"{path}: no such rig file{found}")
+        instead = f"; beside it: {', '.join(beside)}" if beside else ""
+        raise InputError(f"{path}: no such rig file{instead}")
     return read_rig(path)
 
 
 def _experiment(
     file: Path, index: int, entry: ExperimentEntry, settings: CaseSettings, rig: Rig, within: Path | None
 ) -> Experiment:
+    """One log of a case file as an experiment, its rows on the grid of the sampling period.
+
+    Commands and references are held between the controller's ticks, outputs are sampled (`TimeGrid`).
+
+    Parameters
+    ----------
+    file : Path
+        The case file; `entry.file` is relative to its folder.
+    index : int
+        Of the entry, for errors.
+    entry : ExperimentEntry
+    settings : CaseSettings
+        Columns, outputs and sampling period of all logs.
+    rig : Rig
+        Its sampling period has to be that of the log.
+    within : Path or None
+        Folder that the log must not lie outside of; None: it may lie anywhere.
+
+    Raises
+    ------
+    InputError
+        One line that names the case file and key, or the log: no such file, a column that is missing, that
+        stands for two quantities or whose unit is not that of its quantity, a sampling period or a number of
+        rows that is not the stated one.
+    """
     here = f"{file}: experiments[{index}]"
     with naming(f"{here}.file"):
         path = file.parent / expand(entry.file)
     _refuse_outside(within, path, f"{here}.file")
     if not path.is_file():
         raise InputError(f"{here}.file: no such file: {path}")
-    stamped = entry.columns.time_s or settings.columns.time_s or settings.dt_s is None
-    wanted = [*(("time_s",) if stamped else ()), "voltage_V", *settings.outputs]
+
+    # Without a sampling period only time stamps say when the outputs were sampled.
+    wanted = ["voltage_V", *settings.outputs]
+    if entry.columns.time_s or settings.columns.time_s or settings.dt_s is None:
+        wanted.insert(0, "time_s")
     names = {quantity: entry.column(quantity, settings.columns) for quantity in (*wanted, "reference_rad")}
     with naming(str(path)):
         table = read_table(path)
@@ -113,20 +142,30 @@ def _experiment(
         is_stated = entry.columns.reference_rad is not None or settings.columns.reference_rad is not None
         if is_stated or names["reference_rad"].column in table.names:
             wanted.append("reference_rad")
-        taken = [names[quantity].column for quantity in wanted]
-        if (column := repeated(taken)) is not None:
-            both = [quantity for quantity in wanted if names[quantity].column == column]
-            raise InputError(f"{here}: {both[0]} and {both[1]} are both {column!r}")
-        read = table.columns(taken)
+        columns = [names[quantity].column for quantity in wanted]
+        twice = repeated(columns)
+        if twice is not None:
+            first, second, *_ = [quantity for quantity in wanted if names[quantity].column == twice]
+            raise InputError(f"{here}: {first} and {second} are both {twice!r}")
+        readings_of = table.columns(columns)
+
+        # A stated scale is right whatever the header says; otherwise the header's unit is converted.
         values = {}
         for quantity in wanted:
-            place, unit = names[quantity], written_unit(quantity)
-            own = table.unit(place.column) if place.scale is None and quantity != "time_s" else ""
-            if (usual := per(own, unit) if own else 1.0) is None:
+            place = names[quantity]
+            unit = written_unit(quantity)
+            header_unit = table.unit(place.column)
+            factor: float | None = 1.0
+            if header_unit and place.scale is None and quantity != "time_s":
+                factor = per(header_unit, unit)
+            if factor is None:
                 raise ValueError(
-                    f"column {place.column!r} is in {shown(own, 30)}: state what makes it {unit} (scale)"
+                    f"column {place.column!r} is in {shown(header_unit, 30)}: "
+                    f"state what makes it {unit} (scale)"
                 )
-            values[quantity] = place.quantity(read[place.column], usual)
+            values[quantity] = place.quantity(readings_of[place.column], factor)
+
+        # Time stamps decide which row is when; the rig file's period has to be theirs.
         n_rows = len(values["voltage_V"])
         grid = TimeGrid(settings.dt_s or rig.sampling.dt_s, np.arange(n_rows), np.zeros(n_rows))
         if "time_s" in values:

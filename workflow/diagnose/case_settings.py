@@ -36,10 +36,11 @@ class Column(Section):
     )
 
     def quantity(self, values: RealArray, usual: float = 1.0) -> RealArray:
-        """usual: the scale where none is stated."""
+        """(T,) the quantity of a column's values (T,); usual: the scale where none is stated."""
         if self.unwrap is not None:
             values = unwrapped(values, self.unwrap)[0]
-        return values * (usual if self.scale is None else self.scale) + self.offset
+        scale = usual if self.scale is None else self.scale
+        return values * scale + self.offset
 
 
 def _moves(column: Column) -> Column:
@@ -122,8 +123,8 @@ def case_document(place: Path) -> tuple[Path, dict[str, Any]]:
     """The case file of a folder, or the one named itself, and what it says. Raises InputError."""
     file = place if place.is_file() else place / CASE_FILE
     if not file.is_file():
-        others = sorted(place.glob("*.toml")) if place.is_dir() else []
-        instead = f"; is it {others[0]}?" if len(others) == 1 else ""
+        toml_files = sorted(place.glob("*.toml")) if place.is_dir() else []
+        instead = f"; is it {toml_files[0]}?" if len(toml_files) == 1 else ""
         raise InputError(
             f"{place}: no case is there; expected a folder with {CASE_FILE}, or a TOML file like it{instead}"
         )

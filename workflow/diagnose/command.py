@@ -38,8 +38,10 @@ from workflow.engine.executor import Executor, Failure, Report, ThisProcess, wor
 from workflow.engine.progress import Progress
 from workflow.report.rendering import render_described
 
-_Failed = tuple[str, Failure]  # case, why it has no answer
-_CASE_S = 30.0  # expected: it shapes the progress bar only
+# A case, and why it has no answer.
+_Failed = tuple[str, Failure]
+# Time that a case is expected to take [s]: it shapes the progress bar only.
+_CASE_S = 30.0
 # Of more cases the terminal shows groups alone.
 _MOST_SHOWN = 20
 
@@ -72,10 +74,11 @@ class DiagnosisRun:
         ]
 
     def json_parts(self, *, ascii_only: bool = False) -> Iterator[str]:
-        """All of it as JSON text, one answer after another."""
+        """The run as JSON text in parts, an answer each: a thousand answers are never in memory at once."""
         failed = [{"case": case, "reason": failure.reason} for case, failure in self.failures]
-        rest = {"cases": [], "failed": failed, "report": self.summary.report_path}
-        before, after = codec.plain_text(rest, ascii_only=ascii_only).split("[", 1)
+        frame = {"cases": [], "failed": failed, "report": self.summary.report_path}
+        # The answers go between the brackets of the empty list of cases, which comes first.
+        before, after = codec.plain_text(frame, ascii_only=ascii_only).split("[", 1)
         for document in self.documents:
             text = codec.plain_text(document, ascii_only=ascii_only).rstrip().replace("\n", "\n  ")
             yield f"{before}[\n  {text}" if before else f",\n  {text}"
@@ -110,13 +113,14 @@ def diagnose_cases(
     progress = progress or Progress()
     code = code_digest("diagnosis", drawing=True)
     limits: dict[str, Any] = {} if time_limit_s is None else {"time_limit_s": time_limit_s}
-    options, engine = {"controller": controller, **limits}, partial(engine or diagnose, **limits)
+    options = {"controller": controller, **limits}
+    engine = partial(engine or diagnose, **limits)
     work, unreadable = _load(
         places, lambda place: PlacedCase(place, rig, Path.cwd(), options, code, engine, out.resolve())
     )
     width = max(1, min(jobs or os.cpu_count() or 1, len(work)))
     preload = ["diagnosis.diagnosis", "workflow.diagnose.command"]
-    inputs = {one.name: one.input_sha256 for one in work}
+    inputs = {case.name: case.input_sha256 for case in work}
     directory = DiagnosisDirectory(out)
     # A model of a user's may end its process, or wait for ever in code that no interrupt reaches.
     in_this_process = scheduler is None and len(work) == 1 and not work[0].of_simulator
@@ -132,7 +136,7 @@ def diagnose_cases(
             directory.discard_if_empty()
             failure = failures[0][1]
             raise (InputError if failure.bad_input else StageError)(failure.reason)
-        documents = Answers(directory, [one.name for one in machines])
+        documents = Answers(directory, [machine.name for machine in machines])
         page = out / f"{work[0].name}.html"
         if len(places) > 1:
             page = out / "index.html"
@@ -186,7 +190,7 @@ class PlacedCase:
     of_simulator: bool = False
 
     def read(self) -> PlacedCase:
-        """With name and hash of what stands there. Raises InputError."""
+        """This case with the name and the hash of its files, which are read. Raises InputError."""
         loaded = load_any_case(self.place, self.rig)
         return changed(
             self,
@@ -229,9 +233,11 @@ def _load(
             named = place.resolve() if isinstance(place, Path) else Path(place.model)
             failures.append((named.name, Failure(str(error), bad_input=True)))
     if not loaded:
-        more = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
-        raise InputError(failures[0][1].reason + more)
-    if (name := repeated([one.name for one in loaded])) is not None:
+        further = f" (and {len(failures) - 1} more cases cannot be read)" if len(failures) > 1 else ""
+        raise InputError(failures[0][1].reason + further)
+    # The name of a case is that of its files in the output directory.
+    name = repeated([case.name for case in loaded])
+    if name is not None:
         raise InputError(
             f"two cases are called {name!r}: give one another name in its {CASE_FILE} (key 'case')"
         )
@@ -255,10 +261,16 @@ def load_any_case(
 def _compute(
     directory: DiagnosisDirectory, work: Sequence[PlacedCase], executor: Executor, progress: Progress
 ) -> tuple[list[FleetMachine], list[_Failed]]:
-    there = {one.name: directory.finished(one.name, one.made_from) for one in work}
-    answers = {name: FleetMachine.of(known) for name, known in there.items() if known is not None}
-    todo = {one.name: one for one in work if one.name not in answers}
-    names, several = list(todo), len(work) > 1
+    """Diagnose the cases that have no answer yet, and save each answer as soon as it is there."""
+    # A resumed run keeps the answers that the same inputs and the same code gave.
+    answers = {}
+    for case in work:
+        document = directory.finished(case.name, case.made_from)
+        if document is not None:
+            answers[case.name] = FleetMachine.of(document)
+    todo = {case.name: case for case in work if case.name not in answers}
+    names = list(todo)
+    several = len(work) > 1
     progress.plan([("cases", _CASE_S * len(todo) / executor.width)])
     shares = [0.0] * len(todo)
     timings = directory.document("timings.json")
@@ -271,25 +283,26 @@ def _compute(
         progress.update("cases", sum(shares) / len(todo), words)
 
     with progress.stage("cases", taken_up=not todo):
-        for index, found in executor.run(list(todo.values()), watch):
+        for index, result in executor.run(list(todo.values()), watch):
             name = names[index]
-            if isinstance(found, Failure):
-                failures[name] = found
+            if isinstance(result, Failure):
+                failures[name] = result
             else:
-                files, cpu_s = found
+                files, cpu_s = result
                 timings[name] = {"cpu_s": round(cpu_s, 3)}
                 directory.save(name, {**files, "timings.json": codec.plain_text(timings).encode()})
                 answers[name] = FleetMachine.of(json.loads(files[f"{name}.json"]))
             watch(index, 1.0, "done")
     return (
-        [answers[one.name] for one in work if one.name in answers],
-        [(one.name, failures[one.name]) for one in work if one.name in failures],
+        [answers[case.name] for case in work if case.name in answers],
+        [(case.name, failures[case.name]) for case in work if case.name in failures],
     )
 
 
 def _summary(
     documents: Answers, machines: Sequence[FleetMachine], failures: Sequence[_Failed], page: Path
 ) -> RunSummary:
+    """Rows for the terminal: groups of several machines, answers of a few, cases that failed."""
     count = len(documents)
     sections = []
     if count > 1:
@@ -297,10 +310,12 @@ def _summary(
     if count <= _MOST_SHOWN:
         sections += [diagnosis_section(document, page.parent) for document in documents]
     sections += [failed_case(case, failure.reason) for case, failure in failures]
-    alone = count == 1 and not failures
+    verdict = f"{count} of {count + len(failures)} cases answered"
+    if count == 1 and not failures:
+        verdict = short_answer(documents[0])
     return RunSummary(
         title="Gap diagnosis",
         sections=sections,
-        verdict=short_answer(documents[0]) if alone else f"{count} of {count + len(failures)} cases answered",
+        verdict=verdict,
         report_path=str(page) if documents or failures else None,
     )

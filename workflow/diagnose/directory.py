@@ -30,8 +30,9 @@ _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv", ".xml")
 
 def answer_text(document: Mapping[str, Any]) -> str:
     """An answer as its JSON file has it, with the hash of the rest in it."""
-    rest = {key: value for key, value in document.items() if key != "sha256"}
-    return codec.plain_text({**rest, "sha256": storage.sha256_of_bytes(codec.plain_text(rest).encode())})
+    hashed = {key: value for key, value in document.items() if key != "sha256"}
+    sha256 = storage.sha256_of_bytes(codec.plain_text(hashed).encode())
+    return codec.plain_text({**hashed, "sha256": sha256})
 
 
 @dataclass(frozen=True)
@@ -47,13 +48,15 @@ class DiagnosisDirectory(Store):
         if not self.manifest_path.is_file():
             return self.own_files
         cases = storage.read_json(self.manifest_path).get("inputs", {})
-        named = [
-            case for case in cases if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", case)
-        ]  # no path elsewhere
+        # A manifest that somebody else wrote must not name a path elsewhere.
+        named = [case for case in cases if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", case)]
         return (*(f"{case}{ending}" for case in named for ending in _ENDINGS), *self.own_files)
 
     def save(self, case: str, files: Mapping[str, bytes]) -> None:
-        """All files of a case, its JSON file last, and the timings; what an earlier answer had goes."""
+        """Write all files of a case, its JSON file last, and the timings.
+
+        Files of an earlier answer that this one does not have are deleted.
+        """
         answer = f"{case}.json"
         (self.path / answer).unlink(missing_ok=True)
         for ending in _ENDINGS:
@@ -65,9 +68,10 @@ class DiagnosisDirectory(Store):
     def finished(self, case: str, made_from: Mapping[str, Any]) -> dict[str, Any] | None:
         """The answer to a case if it is there, whole and made from this; else None."""
         document = self.document(f"{case}.json")
-        if document.get("made_from") != made_from or answer_text(document) != (
-            self.path / f"{case}.json"
-        ).read_text("utf-8"):
+        if document.get("made_from") != made_from:
+            return None
+        # The file holds the hash of itself: an edited answer is not what was computed.
+        if answer_text(document) != (self.path / f"{case}.json").read_text("utf-8"):
             return None
         for name, digest in document.get("files", {}).items():
             file = self.path / name

@@ -15,17 +15,20 @@ FORMAT = "flexlink-diagnosis-1"
 LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out, and no runner-up competes
 
 
-def completeness_of(found: Diagnosis, remains: Where) -> dict[str, Any]:
+def completeness_of(diagnosis: Diagnosis, remains: Where) -> dict[str, Any]:
     """Whether the effects are all, what remains, and between which frequencies most of it lies."""
-    run = remains.concentration() if remains.is_gap else None
-    mostly = None if run is None else (run.low_Hz, run.high_Hz)
-    return {**codec.plain(found.completeness), "mostly_Hz": mostly}
+    mostly_Hz = None
+    if remains.is_gap:
+        band = remains.concentration()
+        if band is not None:
+            mostly_Hz = (band.low_Hz, band.high_Hz)
+    return {**codec.plain(diagnosis.completeness), "mostly_Hz": mostly_Hz}
 
 
 def document_of(
-    loaded: LoadedCase | SimulatorCase, found: Diagnosis, beside: Mapping[str, Any] | None = None
+    loaded: LoadedCase | SimulatorCase, diagnosis: Diagnosis, beside: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """The answer as plain values.
+    """The answer as plain values: what the JSON file of a case holds, in its order.
 
     `effects` are all possible answers, best first, "none" and "unknown" among them: `probability` of being
     the main cause (they sum to one), `presence` of being there at all. `presence` has that of every
@@ -36,23 +39,15 @@ def document_of(
     (`diagnosis.answer.Prediction`). partial_model: its effects where the answer is none or unknown.
     beside: what else was looked at.
     """
-    document = {
-        "format": FORMAT,
-        "case": loaded.case.name,
-        "repair": {
-            "values": {
-                key: {"stated": loaded.case.machine.description.value(key), "repaired": found.rig.value(key)}
-                for key in found.deviations
-            },
-            "effects": [effect.to_dict() for effect in found.repair],
-            "prediction": found.prediction,
-        },
-        "verdict": found.verdict,
-        "detail_verdict": found.detail_verdict,
-        "effects": found.effects,
-        "combination": found.combination,
-        "presence": {
-            effect.name: {
+    nominal = loaded.case.machine.description
+    repaired_values = {}
+    for key in diagnosis.deviations:
+        repaired_values[key] = {"stated": nominal.value(key), "repaired": diagnosis.rig.value(key)}
+
+    presence = {}
+    for effect in diagnosis.effects:
+        if effect.name not in ("none", "unknown"):
+            presence[effect.name] = {
                 "probability": effect.presence,
                 "parameters": effect.parameters,
                 "intervals": effect.intervals,
@@ -60,42 +55,56 @@ def document_of(
                 "explains": effect.explains,
                 "needs": effect.untried,
             }
-            for effect in found.effects
-            if effect.name not in ("none", "unknown")
+
+    by_probability = sorted(diagnosis.sets.items(), key=lambda item: -item[1])
+    sets = [{"effects": names, "probability": p} for names, p in by_probability if p >= LEAST_SHOWN]
+
+    document = {
+        "format": FORMAT,
+        "case": loaded.case.name,
+        "repair": {
+            "values": repaired_values,
+            "effects": [effect.to_dict() for effect in diagnosis.repair],
+            "prediction": diagnosis.prediction,
         },
-        "completeness": found.completeness,
-        "partial_model": found.partial_model,
-        "ambiguous_with": found.ambiguous_with,
-        "instead": found.instead,
-        "perhaps": found.perhaps,
-        "probability": found.probability,
-        "probabilities": found.probabilities,
-        "sets": [
-            {"effects": names, "probability": p}
-            for names, p in sorted(found.sets.items(), key=lambda item: -item[1])
-            if p >= LEAST_SHOWN
-        ],
-        "gap_before": found.gap_before,
-        "gap_refit": found.gap_refit,
-        "gap_after": found.gap_after,
-        "noise_floor": found.noise_floor,
-        "noise_below_stated": found.noise_below_stated,
-        "doubts": found.doubts,
-        "held_out_decided": found.held_out_decided,
-        "unlisted": [effect.to_dict() for effect in found.unlisted],
-        "replayed": found.replayed,
-        "units": found.case.units,
+        "verdict": diagnosis.verdict,
+        "detail_verdict": diagnosis.detail_verdict,
+        "effects": diagnosis.effects,
+        "combination": diagnosis.combination,
+        "presence": presence,
+        "completeness": diagnosis.completeness,
+        "partial_model": diagnosis.partial_model,
+        "ambiguous_with": diagnosis.ambiguous_with,
+        "instead": diagnosis.instead,
+        "perhaps": diagnosis.perhaps,
+        "probability": diagnosis.probability,
+        "probabilities": diagnosis.probabilities,
+        "sets": sets,
+        "gap_before": diagnosis.gap_before,
+        "gap_refit": diagnosis.gap_refit,
+        "gap_after": diagnosis.gap_after,
+        "noise_floor": diagnosis.noise_floor,
+        "noise_below_stated": diagnosis.noise_below_stated,
+        "doubts": diagnosis.doubts,
+        "held_out_decided": diagnosis.held_out_decided,
+        "unlisted": [effect.to_dict() for effect in diagnosis.unlisted],
+        "replayed": diagnosis.replayed,
+        "units": diagnosis.case.units,
         "model_error": getattr(loaded, "model_error", 0.0),
-        "validation": [e.name for e in found.case.held_out],
-        "gap_closed": found.gap_closed,
-        "gap_closed_interval": found.gap_closed_interval,
-        "gap_by_experiment": found.gap_by_experiment,
-        **(beside or {}),
-        **({} if found.shares is None else {"shares": found.shares}),
-        "deviations": found.deviations,
-        "suspected": {name: found.presence(name) for name in loaded.suspected},
+        "validation": [e.name for e in diagnosis.case.held_out],
+        "gap_closed": diagnosis.gap_closed,
+        "gap_closed_interval": diagnosis.gap_closed_interval,
+        "gap_by_experiment": diagnosis.gap_by_experiment,
+    }
+    # Further keys stand where readers of earlier answers have them.
+    document |= beside or {}
+    if diagnosis.shares is not None:
+        document["shares"] = diagnosis.shares
+    document |= {
+        "deviations": diagnosis.deviations,
+        "suspected": {name: diagnosis.presence(name) for name in loaded.suspected},
         "rig_file": loaded.rig_file,
-        "simulations": found.simulations,
+        "simulations": diagnosis.simulations,
     }
     plain: dict[str, Any] = codec.plain(document)
     return plain

@@ -68,57 +68,59 @@ class Following:
         that are measured, the hub angle first."""
         assert self.proposal is not None
         noise = self.competing[0].noise
-        first, second = (one.outputs(self.proposal.voltage_V) for one in self.competing[:2])
+        first, second = (answer.outputs(self.proposal.voltage_V) for answer in self.competing[:2])
         return np.asarray(((first - second) / noise)[:, np.isfinite(noise)])
 
 
-def following(found: Diagnosis) -> Following:
+def following(diagnosis: Diagnosis) -> Following:
     """The one advice for an answer.
 
     A proposed experiment is as long as the longest record, within the largest voltage, angle and deflection
     of all of them.
     """
-    if found.detail_verdict == "not_converged" or found.nothing_tried:
+    if diagnosis.detail_verdict == "not_converged" or diagnosis.nothing_tried:
         return Following("time")
 
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
-    if found.verdict == "unknown" and not imitated & set(found.ambiguous_with):
-        if found.unlisted:
+    if diagnosis.verdict == "unknown" and not imitated & set(diagnosis.ambiguous_with):
+        if diagnosis.unlisted:
             return Following("confirm")
-        likely = {name for name in found.ambiguous_with if found.presence(name) >= _LOOKED_FOR} - {"none"}
-        return Following("look" if likely else "repeat_worst")
+        # A likely named effect is worth a look before a record: a look costs less.
+        named = [name for name in diagnosis.ambiguous_with if name != "none"]
+        is_likely = any(diagnosis.presence(name) >= _LOOKED_FOR for name in named)
+        return Following("look" if is_likely else "repeat_worst")
 
-    competing = _competing(found)
-    has_limits = isinstance(found.case, Case) and not found.case.model_error > 0
+    competing = _competing(diagnosis)
+    has_limits = isinstance(diagnosis.case, Case) and not diagnosis.case.model_error > 0
     if has_limits and len(competing) < 2:
-        return _without_rivals(found)
-    if isinstance(found.case, Case) and len(competing) > 1:
-        longest = max(e.voltage_V.size for e in found.case.experiments)
-        limits = Limits.of_records(found.case)
+        return _without_rivals(diagnosis)
+    if isinstance(diagnosis.case, Case) and len(competing) > 1:
+        longest = max(e.voltage_V.size for e in diagnosis.case.experiments)
+        limits = Limits.of_records(diagnosis.case)
         proposal = next_experiment(competing, limits, n_samples=max(longest, _SHORTEST))
         return Following("separate", proposal, competing)
 
     # Of a machine of one's own nobody has said what it can be asked for: a record is repeated.
-    named_rivals = set(found.ambiguous_with) - {"unknown"}
-    if not named_rivals and not (found.combination and found.ambiguous_with):
-        return _without_rivals(found)
-    repeat = best_repeat(found.case, competing) if len(competing) > 1 else None
+    named_rivals = set(diagnosis.ambiguous_with) - {"unknown"}
+    if not named_rivals and not (diagnosis.combination and diagnosis.ambiguous_with):
+        return _without_rivals(diagnosis)
+    repeat = best_repeat(diagnosis.case, competing) if len(competing) > 1 else None
     return Following("look", competing=competing, repeat=repeat)
 
 
-def _competing(found: Diagnosis) -> tuple[CompetingHypothesis, ...]:
+def _competing(diagnosis: Diagnosis) -> tuple[CompetingHypothesis, ...]:
     """Fitted answers in words; a second one only where it is thinkable at all or fits as well."""
     competing = []
-    for k, hypothesis in enumerate(found.competing):
-        is_open = any(cause in found.ambiguous_with for cause in hypothesis.causes)
+    for k, hypothesis in enumerate(diagnosis.competing):
+        is_open = any(cause in diagnosis.ambiguous_with for cause in hypothesis.causes)
         if k == 0 or hypothesis.probability >= LEAST_SHOWN or is_open:
             causes = [in_words(cause) for cause in hypothesis.causes] or [in_words("none")]
             competing.append(replace(hypothesis, name=listing(causes)))
     return tuple(competing)
 
 
-def _without_rivals(found: Diagnosis) -> Following:
+def _without_rivals(diagnosis: Diagnosis) -> Following:
     """Where no other named answer is left: more records for what is no name, or none."""
-    if found.completeness.probability < _COMPLETE:
+    if diagnosis.completeness.probability < _COMPLETE:
         return Following("repeat_worst")
-    return Following("repeat_all" if "unknown" in found.ambiguous_with else "none")
+    return Following("repeat_all" if "unknown" in diagnosis.ambiguous_with else "none")

@@ -28,10 +28,12 @@ from workflow.engine.errors import naming
 from workflow.engine.executor import Report
 from workflow.tasks.controller_check import ControllerCheck, NoControllerError, check_controller
 
-# Seconds for what records can tell.
-_TOLD_S = 10.0
+# Longest time for what records can tell [s]. Chosen: short beside a diagnosis, which is what was asked for.
+_TELLING_S = 10.0
 # What comes behind the diagnosis takes about so much of a case's time, for the progress bar only.
 _DIAGNOSED = 0.8
+# Below this probability that nothing else remains, something else is there as likely as not.
+_COMPLETE = 0.5
 
 
 def files_of(
@@ -50,40 +52,42 @@ def files_of(
     """
     name = loaded.case.name
     with naming(f"case {name}"):
-        found = diagnose(loaded.case, progress=lambda f, m: report(_DIAGNOSED * f, m))
+        diagnosis = diagnose(loaded.case, progress=lambda f, m: report(_DIAGNOSED * f, m))
     if isinstance(loaded, SimulatorCase):
-        found = with_units(replace(found, doubts=(*loaded.doubts, *found.doubts)), loaded.units)
+        # What the logs themselves make doubtful comes before what the fit does.
+        diagnosis = replace(diagnosis, doubts=(*loaded.doubts, *diagnosis.doubts))
+        diagnosis = with_units(diagnosis, loaded.units)
         with naming(f"case {name}"):
-            beside, files = _of_simulator(loaded, found, out)
+            beside, files = _of_simulator(loaded, diagnosis, out)
     else:
-        beside, files = _of_rig(loaded, found, made_from["options"]["controller"], report)
-    document = document_of(loaded, found, beside)
+        beside, files = _of_rig(loaded, diagnosis, made_from["options"]["controller"], report)
+    document = document_of(loaded, diagnosis, beside)
     document["made_from"] = made_from
     document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}
     return {**files, f"{name}.json": answer_text(document).encode()}, time.process_time()
 
 
 def _of_rig(
-    loaded: LoadedCase, found: Diagnosis, controller: bool, report: Report
+    loaded: LoadedCase, diagnosis: Diagnosis, controller: bool, report: Report
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """What the answer says beside the diagnosis, and the files beside the answer."""
     case = loaded.case
     with naming(f"case {case.name}"):
         report(_DIAGNOSED, "where")
-        place = where(found.case, found.residuals_refit, found.probabilities)
-        remains = remains_of(found)
+        place = where(diagnosis.case, diagnosis.residuals_refit, diagnosis.probabilities)
+        remains = remains_of(diagnosis)
         report(_DIAGNOSED, "next experiment")
-        coming = following(found)
-        advice = advice_words(shown(found), coming)
+        coming = following(diagnosis)
+        advice = advice_words(shown(diagnosis), coming)
         report(_DIAGNOSED, "controller")
-        check, no_check = _control(found) if controller else (None, "not_asked")
-    rig_name, effects_name = f"{case.name}.rig.toml", f"{case.name}.effects.toml"
-    effects = effects_text(found) if found.repair else ""
-    rig = rig_text(
-        case.name, case.rig, found.rig, moved(found, found.deviations), effects_name if effects else ""
-    )
+        check, no_check = _control(diagnosis) if controller else (None, "not_asked")
+    rig_name = f"{case.name}.rig.toml"
+    effects_name = f"{case.name}.effects.toml"
+    effects = effects_text(diagnosis) if diagnosis.repair else ""
+    moved_values = moved(diagnosis, diagnosis.deviations)
+    rig = rig_text(case.name, case.rig, diagnosis.rig, moved_values, effects_name if effects else "")
     html = case_page(
-        DiagnosisView(found, place, remains),
+        DiagnosisView(diagnosis, place, remains),
         loaded,
         coming,
         advice,
@@ -101,7 +105,7 @@ def _of_rig(
     beside = {
         "where": place,
         "remains": remains,
-        "completeness": completeness_of(found, remains),
+        "completeness": completeness_of(diagnosis, remains),
         "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.proposal or {})},
         "controller": {"skipped": no_check} if check is None else check.document(),
     }
@@ -109,41 +113,42 @@ def _of_rig(
 
 
 def _of_simulator(
-    loaded: SimulatorCase, found: Diagnosis, out: Path
+    loaded: SimulatorCase, diagnosis: Diagnosis, out: Path
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
     """What the answer says beside the diagnosis of a simulation, and the files beside the answer."""
     name = loaded.case.name
     files: dict[str, bytes] = {}
-    coming = following(found)
-    advice = advice_words(shown(found), coming)
-    place = where_in_records(found.case, found.residuals_refit, found.case.dt_s)
-    remains = remains_of(found)
-    told = of_case(loaded, telling(loaded.case, time.monotonic() + _TOLD_S))
+    coming = following(diagnosis)
+    advice = advice_words(shown(diagnosis), coming)
+    place = where_in_records(diagnosis.case, diagnosis.residuals_refit, diagnosis.case.dt_s)
+    remains = remains_of(diagnosis)
+    record_check = of_case(loaded, telling(loaded.case, time.monotonic() + _TELLING_S))
     if loaded.repaired is not None:
-        files[f"{name}.xml"] = loaded.repaired(found, out).encode()
+        files[f"{name}.xml"] = loaded.repaired(diagnosis, out).encode()
     files[f"{name}.html"] = plant_page(
-        found, advice, told, loaded.model_error, *files, places=(place, remains)
+        diagnosis, advice, record_check, loaded.model_error, *files, places=(place, remains)
     ).encode()
     beside = {
         "where": place,
         "remains": remains,
-        "completeness": completeness_of(found, remains),
+        "completeness": completeness_of(diagnosis, remains),
         "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.repeat or {})},
         # What records can tell advises more records, whatever the answer; the answer has its own advice.
-        "check": {name: value for name, value in told.numbers.items() if name != "advice"},
+        "check": {name: value for name, value in record_check.numbers.items() if name != "advice"},
     }
     return beside, files
 
 
-def _control(found: Diagnosis) -> tuple[ControllerCheck | None, str]:
-    """The check, or why there is none: a reason of ours (the page's templates know it) or of the design."""
-    if found.verdict == "none":
+def _control(diagnosis: Diagnosis) -> tuple[ControllerCheck | None, str]:
+    """The check, or why there is none: a key that `rig_page` words, or a sentence of the design."""
+    if diagnosis.verdict == "none":
         return None, "no_gap"
-    incomplete = found.completeness.probability < 0.5
-    if found.verdict == "unknown" or incomplete or found.detail_verdict == "not_converged":
+    # A controller is not worth comparing between two models of which neither is likely the machine.
+    incomplete = diagnosis.completeness.probability < _COMPLETE
+    if diagnosis.verdict == "unknown" or incomplete or diagnosis.detail_verdict == "not_converged":
         return None, "not_explained"
     try:
-        return check_controller(found.case, found.rig, found.repair), ""
+        return check_controller(diagnosis.case, diagnosis.rig, diagnosis.repair), ""
     except NoControllerError as error:
         return None, str(error)
 
@@ -157,7 +162,8 @@ def rig_text(
     """
     head = [f"# {case}: rig as repaired by flexlink diagnose"]
     for key, tolerances in deviations.items():
-        old, new = stated.value(key), repaired.value(key)
+        old = stated.value(key)
+        new = repaired.value(key)
         if old != new:
             percent = 100 * (new / old - 1) if old else 0.0
             head.append(
@@ -168,11 +174,12 @@ def rig_text(
     return "\n".join([*head, repaired.to_toml()])
 
 
-def effects_text(found: Diagnosis) -> str:
+def effects_text(diagnosis: Diagnosis) -> str:
     """The effects as [[effects]] tables, in the spelling of [[source.effects]] in a run configuration."""
-    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in found.repair]})
+    tables = tomlkit.dumps({"effects": [effect.to_dict() for effect in diagnosis.repair]})
     origin = "found by flexlink diagnose"
-    if found.partial_model:
+    if diagnosis.partial_model:
         origin = "with which flexlink diagnose leaves less; the cause is not known"
-    head = f"# {found.case.name}: effects {origin}; in a run configuration they go under [[source.effects]]"
+    case = diagnosis.case.name
+    head = f"# {case}: effects {origin}; in a run configuration they go under [[source.effects]]"
     return f"{head}\n\n{tables}"

@@ -58,7 +58,7 @@ def case_page(
     versions.append(("python", sys.version.split()[0]))
     proposed = None
     if coming.proposal is not None and coming.proposal.separates:
-        names = [one.name for one in coming.competing]
+        names = [answer.name for answer in coming.competing]
         proposed = ProposedExperiment(coming.proposal, coming.differences(), names)
     page = rig_page(
         view,
@@ -75,7 +75,7 @@ def case_page(
 
 
 def plant_page(
-    found: Diagnosis,
+    diagnosis: Diagnosis,
     advice: Sequence[str],
     told: RunSummary | None = None,
     model_error: float = 0.0,
@@ -87,7 +87,7 @@ def plant_page(
 
     Parameters
     ----------
-    found : Diagnosis
+    diagnosis : Diagnosis
     advice : sequence of str
         On what to do next, in sentences (`advice_words`).
     told : RunSummary, optional
@@ -105,20 +105,20 @@ def plant_page(
         The plant does not state its sampling period (`where_in_records`).
     """
     place, remains = places or (
-        where_in_records(found.case, found.residuals_refit, found.case.dt_s),
-        remains_of(found),
+        where_in_records(diagnosis.case, diagnosis.residuals_refit, diagnosis.case.dt_s),
+        remains_of(diagnosis),
     )
     numbers = {
-        "parameters": dict(found.rig.parameters),
-        "effects": [change.to_dict() for change in found.repair],
+        "parameters": dict(diagnosis.rig.parameters),
+        "effects": [change.to_dict() for change in diagnosis.repair],
     }
     page = own_plant_page(
-        DiagnosisView(found, place, remains),
+        DiagnosisView(diagnosis, place, remains),
         advice,
         can_show=() if told is None else _can_show(told),
         model_error=model_error,
         repaired_file=repaired,
-        moving=moving_figures(found) or Markup(),
+        moving=moving_figures(diagnosis) or Markup(),
         numbers_text=json.dumps(numbers, indent=1),
     )
     return render_described(page).html
@@ -133,8 +133,8 @@ def _can_show(told: RunSummary) -> list[Table]:
     ]
 
 
-def remains_of(found: Diagnosis) -> Where:
+def remains_of(diagnosis: Diagnosis) -> Where:
     """Where the rest lies that the repaired model leaves."""
-    if isinstance(found.case, PlantCase):
-        return where_in_records(found.case, found.residuals_after, found.case.dt_s)
-    return where(found.case, found.residuals_after)
+    if isinstance(diagnosis.case, PlantCase):
+        return where_in_records(diagnosis.case, diagnosis.residuals_after, diagnosis.case.dt_s)
+    return where(diagnosis.case, diagnosis.residuals_after)

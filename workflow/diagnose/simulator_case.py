@@ -131,7 +131,7 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
     return {name: with_unit for name, with_unit in names.items() if with_unit != name}
 
 
-def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diagnosis:
+def with_units(diagnosis: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diagnosis:
     """A diagnosis with sizes of its effects under names with units; the repair keeps those that the
     simulation takes.
 
@@ -151,7 +151,7 @@ def with_units(found: Diagnosis, units: Mapping[str, Mapping[str, str]]) -> Diag
             remarks=with_names(effect.remarks),
         )
 
-    return replace(found, effects=tuple(renamed(effect) for effect in found.effects))
+    return replace(diagnosis, effects=tuple(renamed(effect) for effect in diagnosis.effects))
 
 
 def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:

@@ -201,9 +201,10 @@ def noise_of(
         if stated:
             levels.append(stated)
             continue
+        # Third differences of a smooth motion are small, those of noise are not; the median leaves out jumps.
         third = np.concatenate([np.diff(e.output[:, k], 3) for e in experiments])
         rough = _PER_MEDIAN * float(np.median(np.abs(third))) / np.sqrt(_THIRD_DIFFERENCES)
-        # A uniform error of one step.
+        # A quantised reading has a uniform error of one step, of 1 / sqrt(12) of it, however still it lies.
         steps = np.abs(np.concatenate([np.diff(e.output[:, k]) for e in experiments]))
         step = float(np.min(steps[steps > 0], initial=np.inf))
         quantised = step / np.sqrt(12) if np.isfinite(step) else 0.0
@@ -256,10 +257,13 @@ def _signals(table: Table, names: Sequence[str], n_commands: int, settings: Simu
     """(T, N) quantities of the model in its units on the log's grid; the first ones are commands, which are
     held from row to row where rows are put on another grid."""
     columns = [column_of(name, table, settings) for name in names]
-    absent = [name for name, one in zip(names, columns, strict=True) if one.column not in table.names]
+    absent = []
+    for name, column in zip(names, columns, strict=True):
+        if column.column not in table.names:
+            absent.append(name)
     if absent:
         raise ValueError(f"no column for {listing(absent)}: {which_column(absent, table, settings)}")
-    # A column may be several quantities.
+    # A column may be several quantities, and a record has it once.
     commands = list(dict.fromkeys(column.column for column in columns[:n_commands]))
     measured = list(
         dict.fromkeys(column.column for column in columns[n_commands:] if column.column not in commands)

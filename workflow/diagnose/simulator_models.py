@@ -72,7 +72,7 @@ class OpenedModel(Protocol):
     def plant(self, experiments: Sequence[PlantExperiment], noise: Real) -> Plant:
         """The plant of these records and noise levels (Y,). Raises ValueError, one line."""
 
-    def repaired(self, plant: Plant, found: Diagnosis, folder: Path) -> str:
+    def repaired(self, plant: Plant, diagnosis: Diagnosis, folder: Path) -> str:
         """Text of the repaired model, to be written into a folder."""
 
 
@@ -113,7 +113,7 @@ class SimulationModel:
             motion_is_sure=stated is not None,
         )
 
-    def repaired(self, plant: Plant, found: Diagnosis, folder: Path) -> str:
+    def repaired(self, plant: Plant, diagnosis: Diagnosis, folder: Path) -> str:
         """Raises NotImplementedError: effects act around the simulation, which stays as it is."""
         raise NotImplementedError("only an MJCF model is repaired")
 
@@ -150,9 +150,9 @@ class MjcfModel:
         arm = replace(self.arm, tracking_rad_s=tracking)
         return arm.plant(experiments, noise, model_error=self.settings.model_error, named=named)
 
-    def repaired(self, plant: Plant, found: Diagnosis, folder: Path) -> str:
+    def repaired(self, plant: Plant, diagnosis: Diagnosis, folder: Path) -> str:
         """MJCF with the repair of a diagnosis; its validation records are keyframes."""
-        return self.arm.repaired(plant, found.rig, found.repair, found.case.held_out, folder)
+        return self.arm.repaired(plant, diagnosis.rig, diagnosis.repair, diagnosis.case.held_out, folder)
 
     def _refuse_other_reach(self, experiments: Sequence[PlantExperiment]) -> None:
         """Raises InputError where columns without a unit go farther than the model can, and in another unit
@@ -242,9 +242,9 @@ def _open_mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings
 
     # A joint beside a sensor of its name is known to the plant by its label, any other by its own name.
     outputs = []
-    for one_label in labels:
-        kind, name = measured[one_label]
-        outputs.append(one_label if kind == "joint" and "sensor" in kinds[name] else name)
+    for output_label in labels:
+        kind, name = measured[output_label]
+        outputs.append(output_label if kind == "joint" and "sensor" in kinds[name] else name)
     arm = MujocoArm.from_file(str(model), outputs=tuple(outputs), dt_s=dt_s)
     commands = tuple(label("actuator", name) for name in arm.inputs)
 
@@ -259,10 +259,11 @@ def _open_mjcf(model: Path, tables: Sequence[Table], settings: SimulatorSettings
     if absent:
         raise ValueError(f"columns: {table.path} has no column {columns[absent[0]]!r} ({absent[0]})")
     for name in commands:
-        both = [one for one in labels if columns[one] == column_of(name, table, settings).column]
-        if both:
+        command_column = column_of(name, table, settings).column
+        outputs_of_column = [output for output in labels if columns[output] == command_column]
+        if outputs_of_column:
             raise ValueError(
-                f"column {columns[both[0]]!r} is both {name} and {both[0]}: say which of the two"
+                f"column {command_column!r} is both {name} and {outputs_of_column[0]}: say which of the two"
             )
 
     known = {*arm.measured_joints, *dead}

@@ -29,35 +29,45 @@ from workflow.text.sentences.design import lowered as lowered_text, order_advice
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
-    results, config = RunResults(run), point.config
-    design, certify, numbers = results.design, results.certify, numbers_of(results, config)
-    state: State = (
-        "impossible"
-        if design.synthesis is None
-        else "not certified"
-        if not certify.certified
-        else "certified"
-        if numbers["settled_draws"] and numbers["settled_draws"] == numbers["draws"]
-        else "keeps moving"
-    )
+    config = point.config
+    results = RunResults(run)
+    design = results.design
+    certify = results.certify
+    numbers = numbers_of(results, config)
+    all_settle = numbers["settled_draws"] and numbers["settled_draws"] == numbers["draws"]
+    state: State
+    if design.synthesis is None:
+        state = "impossible"
+    elif not certify.certified:
+        state = "not certified"
+    elif all_settle:
+        state = "certified"
+    else:
+        state = "keeps moving"
+
     if isinstance(config, JointsConfig):
         if state == "keeps moving":  # which is not told from resting beside the reference
             state = "does not settle"
         why = summarise(results, config).verdict
         return PointRow(point.number, point.name, point.values, state, why, numbers)
-    specification, check = config.specification, results.closed_loop.check
+    specification = config.specification
+    check = results.closed_loop.check
     # The certificate is the judge and names every item that is missed; the optimiser only what blocks it.
     why = certify.reason
     if design.gamma is not None and design.gamma > 1:
-        reached, order = results.achievable_performance, specification.controller_order
-        advice = order_advice(reached.bracket, design.gamma, order, specification.structure)
-        why = f"{why}; {advice}" if advice else why
+        bracket = results.achievable_performance.bracket
+        advice = order_advice(bracket, design.gamma, specification.controller_order, specification.structure)
+        if advice:
+            why = f"{why}; {advice}"
     if certify.certified:
         conditions = results.uncertainty.conditions(config)
         why = run_verdict(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
+
     lowered = lowered_text(specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
     if state == "certified" and check and check.tracking and check.spread_of("settling_time_s")[-1] is None:
-        state, why = "does not settle", never_settles(check)  # at rest beside the reference
+        # At rest, but beside the reference: certified, and yet of no use.
+        state = "does not settle"
+        why = never_settles(check)
     elif state == "certified" and lowered:
         state = "certified at a lower bandwidth"
     given_way = gave_way_text(gave_way(specification, design.specification))
@@ -73,21 +83,18 @@ def csv_text(axes: Sequence[StudyAxis], rows: Sequence[PointRow], front: Sequenc
 
     front: numbers of the points on each Pareto front; a column each.
     """
-    records = [
-        {
-            "number": row.number,
-            "name": row.name,
-            **{
-                a.key: v if isinstance(v := row.values[a.key], (int, float)) else _cell(short(v))
-                for a in axes
-            },
-            "state": row.state,
-            **row.numbers,
-            **{f"front_{k}": "yes" if row.number in on else "no" for k, on in enumerate(front, 1)},
-            "why": _cell(row.why),
-        }
-        for row in rows
-    ]
+    records = []
+    for row in rows:
+        record: dict[str, Any] = {"number": row.number, "name": row.name}
+        for axis in axes:
+            value = row.values[axis.key]
+            record[axis.key] = value if isinstance(value, (int, float)) else _cell(short(value))
+        record["state"] = row.state
+        record |= row.numbers
+        for k, points_on_front in enumerate(front, 1):
+            record[f"front_{k}"] = "yes" if row.number in points_on_front else "no"
+        record["why"] = _cell(row.why)
+        records.append(record)
     # As objects: a whole number stays one beside a cell without a number.
     return str(pd.DataFrame(records, dtype=object).to_csv(index=False, lineterminator="\n"))
 
@@ -101,14 +108,18 @@ def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     """Numbers of the good points that no other good point beats in one column without losing in the other."""
     names = (plot.x, plot.y)
     placed = [row for row in rows if row.good and None not in [row.numbers[name] for name in names]]
-    a, b = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
-    beats = np.less_equal.outer(a, a) & np.less_equal.outer(b, b)
-    beats &= np.less.outer(a, a) | np.less.outer(b, b)  # [j, i]: j beats i
+    x, y = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
+    # beats[j, i]: j is nowhere worse than i, and somewhere better.
+    beats = np.less_equal.outer(x, x) & np.less_equal.outer(y, y)
+    beats &= np.less.outer(x, x) | np.less.outer(y, y)
     return [placed[i].number for i in np.flatnonzero(~np.any(beats, axis=0))]
 
 
+# Axes that change what is required of a point begin like this...
 _REQUIREMENTS = ("specification", "joints[")
+# ... except those that change the controller only.
 _CONTROLLERS = ("specification.controller_order", "specification.structure")
+# Columns by which the best point is named, in the order in which one asks for them.
 _BEST_BY = ("worst_gamma", "bandwidth_rad_s", "modulus_margin", "disk_margin", "rise_time_s")
 
 
@@ -150,26 +161,32 @@ class StudyView:
         return {axis.name: short(row.values[axis.key]) for axis in self.config.axes}
 
     def known(self, names: Sequence[str]) -> list[str]:
-        """Those columns that some point has a number in: the others were not asked for."""
+        """Columns in which some point has a number, of `names`; the others were not asked for."""
         return [name for name in names if any(row.numbers[name] is not None for row in self.rows)]
 
     @property
     def best(self) -> list[tuple[StudyColumn, PointRow]]:
         """The best certified point by each of the columns one asks for first."""
         # Where requirements differ, so does what a gamma of 1 means.
-        same = not any(row.lowered for row in self.rows) and not any(
-            axis.key.startswith(_REQUIREMENTS) and axis.key not in _CONTROLLERS for axis in self.config.axes
-        )
-        columns = [COLUMNS[name] for name in _BEST_BY if same or name != "worst_gamma"]
-        ranked = {
-            column: [
-                (column.badness(number), row.number, row)
-                for row in self.rows
-                if row.good and (number := row.numbers[column.name])
-            ]
-            for column in columns
-        }
-        return [(column, min(rows)[-1]) for column, rows in ranked.items() if rows]
+        differ = any(row.lowered for row in self.rows)
+        for axis in self.config.axes:
+            if axis.key.startswith(_REQUIREMENTS) and axis.key not in _CONTROLLERS:
+                differ = True
+
+        best = []
+        for name in _BEST_BY:
+            if differ and name == "worst_gamma":
+                continue
+            column = COLUMNS[name]
+            ranked = []
+            for row in self.rows:
+                number = row.numbers[name]
+                if row.good and number:
+                    # Of two that are as good, the one with the lower number.
+                    ranked.append((column.badness(number), row.number, row))
+            if ranked:
+                best.append((column, min(ranked)[-1]))
+        return best
 
     @property
     def reasons(self) -> list[tuple[State, str, list[int]]]:
@@ -203,16 +220,22 @@ class StudyView:
         )
 
 
+# A point of a Pareto plot: in front of the line between those of the front.
 _DOT: dict[str, Any] = {"ls": "none", "zorder": 3, "marker": "o", "ms": 6}
+# A point that is not certified, or does not settle.
 _HOLLOW = _DOT | {"mfc": "none", "mec": style.LIMIT, "mew": 1.2}
+# Around a point that is certified at a lower bandwidth than specified.
 _RING = _HOLLOW | {"ms": 11}
+# A good point that another one beats.
 _DOMINATED = _DOT | {"color": "#a8adb4", "mew": 0}
+# A good point that no other one beats.
 _FRONT = _DOT | {"color": style.PREDICTED, "marker": "D", "ms": 7, "mew": 0}
 
 
 @style.drawing("pareto")
 def draw_pareto(study: StudyView) -> Picture:
-    """Certified points filled (those on the front coloured and numbered), others hollow."""
+    """Pareto plots of a study: certified points filled (those on the front coloured, with their numbers),
+    others hollow."""
     plots = study.config.pareto
     picture, places = small_multiples(len(plots), min(len(plots), 2), 4.3, 0.4)
     for panel, plot, front in zip(places, plots, study.fronts, strict=True):
@@ -221,35 +244,48 @@ def draw_pareto(study: StudyView) -> Picture:
 
 
 def _draw(panel: Panel, study: StudyView, plot: ParetoPlot, front: list[int]) -> None:
-    x_column, y_column = study.column(plot.x), study.column(plot.y)
-    x_label, y_label = study.heading(plot.x), study.heading(plot.y)
+    """One plot of a study; front: numbers of the points on it."""
+    x_column = study.column(plot.x)
+    y_column = study.column(plot.y)
+    x_label = study.heading(plot.x)
+    y_label = study.heading(plot.y)
     panel.set(
         xlabel=f"{style.plain(x_label, 40)} ({x_column.better} is better)",
         ylabel=f"{style.plain(y_label, 40)} ({y_column.better} is better)",
     )
     panel.set_title(style.plain(f"{y_label} against {x_label}", 70))
+
+    # A point without one of the two numbers has no place, but it is counted.
     at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
-    there = ~np.isnan(at).any(axis=1)
-    if not there.all():
-        words = f"{np.count_nonzero(~there)} not drawn: no number here"
+    has_place = ~np.isnan(at).any(axis=1)
+    if not has_place.all():
+        words = f"{np.count_nonzero(~has_place)} not drawn: no number here"
         panel.words(words, 0.99, 0.01, across_x=True, across_y=True, horizontal="right")
+
     number = np.array([row.number for row in study.rows])
-    good, on = np.array([row.good for row in study.rows]), np.isin(number, front)
+    good = np.array([row.good for row in study.rows])
+    on_front = np.isin(number, front)
     for kind, label, look in (
         (~good, "not certified, or does not settle", _HOLLOW),
-        (good & ~on, "certified, dominated", _DOMINATED),
-        (on, "certified, on the front", _FRONT),
+        (good & ~on_front, "certified, dominated", _DOMINATED),
+        (on_front, "certified, on the front", _FRONT),
     ):
-        if (kind & there).any():
-            panel.plot(*at[kind & there].T, label=label, **look)
-    if (lower := there & np.array([row.lowered for row in study.rows])).any():
-        panel.plot(*at[lower].T, label="certified at a lower bandwidth than specified", **_RING)
-    if on.sum() > 1:
-        panel.plot(*at[on][np.lexsort(at[on].T[::-1])].T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
-    if there.any():
-        x, y = at[there].T
+        drawn = kind & has_place
+        if drawn.any():
+            panel.plot(*at[drawn].T, label=label, **look)
+    lowered = has_place & np.array([row.lowered for row in study.rows])
+    if lowered.any():
+        panel.plot(*at[lowered].T, label="certified at a lower bandwidth than specified", **_RING)
+
+    # The front as a line from left to right, points above one another from bottom to top.
+    if on_front.sum() > 1:
+        places = at[on_front]
+        along = places[np.lexsort((places[:, 1], places[:, 0]))]
+        panel.plot(*along.T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
+    if has_place.any():
+        x, y = at[has_place].T
         panel.set(xlim=pad_limits(x.min(), x.max(), 0.1), ylim=pad_limits(y.min(), y.max(), 0.1))
-        _number(panel, at[on], number[on])
+        _number(panel, at[on_front], number[on_front])
 
 
 def _number(panel: Panel, at: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> None:

@@ -11,19 +11,32 @@ from typing import Any
 from workflow.text.formats import portion, si
 from workflow.text.names import stated_name
 
+# A `diagnosis.where.dependence.Dependence` as plain values.
 Finding = Mapping[str, Any]
 
-# Units of a torque and of a force, as logs and models spell them.
-_TORQUES, _FORCES = ("N m", "Nm"), ("N",)
+# Units of a torque, as logs and models spell them.
+_TORQUES = ("N m", "Nm")
+# Units of a force, as logs and models spell them.
+_FORCES = ("N",)
+# A force per motion in the unit that its parameter has in data sheets.
+_USUAL_UNITS = {
+    "N m/(rad/s)": "N m s/rad",
+    "N/(m/s)": "N s/m",
+    "N m/(rad/s²)": "kg m²",
+    "N/(m/s²)": "kg",
+}
 # Share that a constant force explains from which on it is said beside that of the curve. Chosen, as the least
 # share of a dependence.
 _LEAST_CONSTANT = 0.1
+# Quantities of a joint's motion; others are the time, a command or a column beside them.
 _MOTIONS = ("position", "speed", "acceleration")
 
 
 def variable_words(finding: Finding) -> str:
     """The variable: "the angle of elbow", "the speed of hub", "the time", "load"."""
-    quantity, of, unit = finding["quantity"], stated_name(finding["of"]), finding.get("unit", "")
+    quantity = finding["quantity"]
+    of = stated_name(finding["of"])
+    unit = finding.get("unit", "")
     if quantity == "time":
         return "the time since the start"
     if quantity == "command":
@@ -65,14 +78,13 @@ def nature_words(finding: Finding) -> str:
         height = si(abs(slope), value_unit)
         return f"dry friction of {height}" if _resists(finding) else f"changes sign with it, by {height}"
 
-    per = f"{value_unit}/({finding['unit']})" if "/" in finding["unit"] else f"{value_unit}/{finding['unit']}"
-    per = {"N m/(rad/s)": "N m s/rad", "N/(m/s)": "N s/m", "N m/(rad/s²)": "kg m²", "N/(m/s²)": "kg"}.get(
-        per, per
-    )
-    size = si(abs(slope), per.strip("/"))
+    unit = finding["unit"]
+    slope_unit = f"{value_unit}/({unit})" if "/" in unit else f"{value_unit}/{unit}"
+    size = si(abs(slope), _USUAL_UNITS.get(slope_unit, slope_unit).strip("/"))
     if _resists(finding):
         kinds = {"position": "a spring", "speed": "viscous friction", "acceleration": "more inertia"}
         return f"{kinds[finding['quantity']]} of {size}"
+    # A force with the motion is less of what the model has; with the position it is no part of any model.
     if finding["acts"] == "force" and finding["own"] and finding["quantity"] == "speed":
         return f"less friction, by {size}"
     if finding["acts"] == "force" and finding["own"] and finding["quantity"] == "acceleration":
@@ -82,16 +94,17 @@ def nature_words(finding: Finding) -> str:
 
 def _resists(finding: Finding) -> bool:
     """Whether a force is against the motion of its own joint."""
-    own = finding["own"] and finding["quantity"] in _MOTIONS
-    return bool(finding["acts"] == "force" and own and finding["slope"] < 0)
+    of_own_motion = finding["own"] and finding["quantity"] in _MOTIONS
+    return bool(finding["acts"] == "force" and of_own_motion and finding["slope"] < 0)
 
 
 def _points(finding: Finding, value_unit: str) -> str:
     """The largest and the smallest value of the curve, where they are."""
     nodes = sorted(zip(finding["values"], finding["centres"], strict=True))
-    (least, at_least), (most, at_most) = nodes[0], nodes[-1]
+    low, at_low = nodes[0]
+    high, at_high = nodes[-1]
     unit = finding["unit"]
-    return f"{si(least, value_unit)} at {si(at_least, unit)}, {si(most, value_unit)} at {si(at_most, unit)}"
+    return f"{si(low, value_unit)} at {si(at_low, unit)}, {si(high, value_unit)} at {si(at_high, unit)}"
 
 
 def dependence_words(finding: Finding) -> str:
@@ -124,11 +137,11 @@ def dependence_words(finding: Finding) -> str:
 
 def alternatives_words(finding: Finding) -> str:
     """Other variables that explain as much, "" where there is none."""
-    others = [
-        f"{variable_words(one)} ({portion(one['share'])}, at {stated_name(one['place'])})"
-        for one in finding["also"]
+    rivals = [
+        f"{variable_words(rival)} ({portion(rival['share'])}, at {stated_name(rival['place'])})"
+        for rival in finding["also"]
     ]
-    return f"as much within its uncertainty: {', '.join(others)}" if others else ""
+    return f"as much within its uncertainty: {', '.join(rivals)}" if rivals else ""
 
 
 def dependence_line(finding: Finding) -> str:

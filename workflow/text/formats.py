@@ -15,7 +15,9 @@ from markupsafe import Markup
 
 from ident.data.foreign_files import as_typed
 
+# In place of a number that is not there.
 MISSING = "–"
+# Heights of a sparkline, low to high.
 BARS = "▁▂▃▄▅▆▇█"
 
 
@@ -28,6 +30,7 @@ def number(value: float | None, digits: int = 3) -> str:
     if math.isinf(value):
         return "unlimited" if value > 0 else "-unlimited"
     text = f"{value:.{digits}g}"
+    # Between a thousandth and a million, people write numbers out.
     if "e" in text and 1e-3 <= abs(value) < 1e6:
         text = f"{value:.0f}"
     return text
@@ -57,6 +60,7 @@ def _rounded(value: float | None, digits: int, way: str) -> float | None:
     """To significant digits, towards one side."""
     if value is None or value == 0 or not math.isfinite(value):
         return value
+    # Decimal digits as they are printed: a binary 0.3 is a little below and would round down to 0.299.
     exact = Decimal(repr(float(value)))
     return float(exact.quantize(Decimal(1).scaleb(exact.adjusted() - digits + 1), rounding=way))
 
@@ -83,7 +87,7 @@ def portion(value: float) -> str:
 
 
 def signed(value: float | None, unit: str = "", decimals: int = 2) -> str:
-    """With its sign and a fixed number of decimals."""
+    """A number with its sign and a fixed number of decimals: "+0.50 %"."""
     return MISSING if value is None else f"{value:+.{decimals}f} {unit}".rstrip()
 
 
@@ -99,6 +103,7 @@ def interval(ends: Sequence[float], digits: int | None = None) -> str:
         return f"{number(low, digits)} to {number(high, digits)}"
     if not (math.isfinite(low) and math.isfinite(high)):
         return "not known"
+    # Decimals would be a row of zeros here, or none.
     if not 1e-7 < high - low < 1e5:
         return f"{low:.6g} to {high:.6g}"
     decimals = max(0, 1 - math.floor(math.log10(high - low)))
@@ -150,7 +155,8 @@ def unit(text: str, name: str) -> str:
 def listing(items: Iterable[object]) -> str:
     """a, b and c."""
     words = [str(item) for item in items]
-    return " and ".join([part for part in (", ".join(words[:-1]), words[-1]) if part]) if words else ""
+    parts = [", ".join(words[:-1]), *words[-1:]]
+    return " and ".join(part for part in parts if part)
 
 
 def sparkline(values: Sequence[float], width: int = 60) -> str:
@@ -159,7 +165,10 @@ def sparkline(values: Sequence[float], width: int = 60) -> str:
     signal = np.asarray(values, dtype=np.float64)
     means = np.array([part.mean() for part in np.array_split(signal, min(width, signal.size))])
     span = float(np.ptp(means))
-    return "".join(BARS[round(7 * (mean - means.min()) / span)] for mean in means) if span > 0 else ""
+    if not span > 0:
+        return ""
+    highest_bar = len(BARS) - 1
+    return "".join(BARS[round(highest_bar * (mean - means.min()) / span)] for mean in means)
 
 
 def count(n: int, one: str, many: str | None = None) -> str:
@@ -169,25 +178,30 @@ def count(n: int, one: str, many: str | None = None) -> str:
 
 
 def sentence(text: str) -> str:
-    """With a capital at the start and a full stop at the end, on one line; markup stays markup."""
+    """A text on one line that begins with a capital and ends with a full stop; markup stays markup."""
     words = " ".join(text.split())
     if words:
         first = words.split(maxsplit=1)[0]
         # "hub: ...", "n_real ...", "elbow.damping ..." and "integrators = 1 ..." start with a name, and names
         # keep their case.
         named = first.endswith(":") or "_" in first or "." in first[:-1] or words.startswith(f"{first} = ")
-        words = (words[0] if named else words[0].upper()) + words[1:] + ("" if words[-1] in ".!?" else ".")
+        if not named:
+            words = words[0].upper() + words[1:]
+        if words[-1] not in ".!?":
+            words += "."
     return Markup(words) if isinstance(text, Markup) else words
 
 
 def capitalised(text: str) -> str:
-    """With a capital at the start; the rest stays as it is."""
+    """A text whose first letter is a capital; the rest stays as it is."""
     return text[:1].upper() + text[1:]
 
 
 def yes_no(state: bool | None) -> str:
     """A requirement's state in a table."""
-    return MISSING if state is None else "yes" if state else "NO"
+    if state is None:
+        return MISSING
+    return "yes" if state else "NO"
 
 
 def setting(value: Any) -> str:

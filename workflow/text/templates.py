@@ -48,9 +48,13 @@ def labelled(rows: Markup, head: Sequence[str]) -> Markup:
 
     def of_row(row: re.Match[str]) -> str:
         words = iter(Markup.escape(word) for word in head)
-        return re.sub(
-            "<td>", lambda _: f'<td data-head="{word}">' if (word := next(words, "")) else "<td>", row[0]
-        )
+
+        def labelled_cell(_: re.Match[str]) -> str:
+            # Cells behind the last word, and those of a column without one, stay as they are.
+            word = next(words, "")
+            return f'<td data-head="{word}">' if word else "<td>"
+
+        return re.sub("<td>", labelled_cell, row[0])
 
     return Markup(re.sub("<tr.*?</tr>", of_row, rows, flags=re.DOTALL))
 
@@ -87,7 +91,8 @@ class CompiledTemplates(BytecodeCache):
     def dump_bytecode(self, bucket: Bucket) -> None:
         if sys.dont_write_bytecode or bucket.code is None:
             return
-        path, code = _file(bucket), marshal.dumps(bucket.code)
+        path = _file(bucket)
+        code = marshal.dumps(bucket.code)
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(self._digest(bucket, code) + code)  # half of it would not count

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 # Relative difference of two frequencies up to which a pole pair of the nominal plant is an identified mode.
 _SAME_MODE = 0.1
 
+# Why nothing is said of a loop at its controller's limits, by the name of the obstacle.
 LIMITED_OBSTACLES = {
     "LOOP_UNSTABLE": "the nominal loop is unstable",
     "PLANT_UNSTABLE": "the plant is unstable, no controller with a limit follows every step",
@@ -24,6 +25,7 @@ LIMITED_OBSTACLES = {
     "ENDS_UNKNOWN": "the command has no end under a constant error",
 }
 
+# Why nothing is proved between the frequencies of a grid, by the name of the obstacle.
 NOT_PROVED = {
     "OWN_FREQUENCIES": "the uncertainty is known on its own frequencies only",
     "OWN_PERFORMANCE_FREQUENCIES": "the performance channel is known on its own frequencies only",
@@ -40,22 +42,24 @@ LIMITS_NOT_LOOKED_AT = "nothing is said before the design ends"
 
 def met(item: SpecificationItem) -> str:
     """Whether a requirement is met."""
-    said = "met" if item.met else "NOT met"
-    return f"{said} (enough on the grid, but not proved for all frequencies)" if item.only_unproved else said
+    words = "met" if item.met else "NOT met"
+    return (
+        f"{words} (enough on the grid, but not proved for all frequencies)" if item.only_unproved else words
+    )
 
 
 def item_value(item: SpecificationItem) -> str:
     """Number of a requirement beside the one required, and where: "0.41 against 0.5 at 12 rad/s (1.9 Hz)"."""
-    said = f"{bound(item.achieved, item.at_least)} against {si(item.required, item.unit, 4)}"
-    return said if item.omega_rad_s is None else f"{said} at {frequency(item.omega_rad_s, 4)}"
+    words = f"{bound(item.achieved, item.at_least)} against {si(item.required, item.unit, 4)}"
+    return words if item.omega_rad_s is None else f"{words} at {frequency(item.omega_rad_s, 4)}"
 
 
 def requirement(item: SpecificationItem) -> str:
     """A requirement on a plant: "hub: modulus margin: 0.41 against 0.5 at 12 rad/s (1.9 Hz): NOT met"."""
-    said = f"{item.plant}: {item.requirement}: {item_value(item)}"
+    words = f"{item.plant}: {item.requirement}: {item_value(item)}"
     if item.met and item.bound is not None:
-        said += f" ({bound(item.bound, item.at_least)} proved for all frequencies)"
-    return f"{said}: {met(item)}"
+        words += f" ({bound(item.bound, item.at_least)} proved for all frequencies)"
+    return f"{words}: {met(item)}"
 
 
 def certificate_reason(certificate: Certificate) -> str:
@@ -90,7 +94,8 @@ def grounds(certificate: Certificate) -> str:
         "for the controller alone": [item for item in items if item.about == "controller"],
         "for sampled responses": [item for item in items if item.about == "sampled responses"],
     }
-    return "; ".join(f"{len(found)} {ground}" for ground, found in by_ground.items() if found)
+    counted = [f"{len(on_ground)} {ground}" for ground, on_ground in by_ground.items() if on_ground]
+    return "; ".join(counted)
 
 
 def limited_loops(certificate: Certificate) -> str:
@@ -141,34 +146,36 @@ def damping_lost(certificate: Certificate, modes_rad_s: Sequence[float] | None =
             is_mode = modes_rad_s is None or any(
                 abs(mode / before.omega_rad_s - 1) < _SAME_MODE for mode in modes_rad_s
             )
-            damping = number(before.zeta, 2), number(after.zeta, 2)
-            if not is_mode or damping[0] == damping[1]:
+            damping_before = number(before.zeta, 2)
+            damping_after = number(after.zeta, 2)
+            # A loss that does not show in two digits is none that a reader could see.
+            if not is_mode or damping_before == damping_after:
                 continue
             left = after.zeta / before.zeta
             if left < least_share.get(place, 1):
                 least_share[place] = left
                 name = f"{plant.plant}: " if len(certificate.plants) > 1 else ""
                 lost[place] = (
-                    f"{name}the mode at {place} Hz loses damping: {damping[0]} in open loop, {damping[1]} in "
-                    "closed loop"
+                    f"{name}the mode at {place} Hz loses damping: {damping_before} in open loop, "
+                    f"{damping_after} in closed loop"
                 )
     return "; ".join(lost.values())
 
 
 def checked(certificate: Certificate) -> list[str]:
     """What a certificate stands on, a sentence a plant."""
-    found = []
+    sentences = []
     for plant in certificate.plants:
-        said = (
+        words = (
             f"{plant.plant}: nominal poles, encirclements of -1, and every ellipse at {plant.frequencies} "
             "frequencies"
         )
         if plant.all_frequencies.proved:
-            said += f"; proved in the {plant.all_frequencies.intervals} intervals between them"
+            words += f"; proved in the {plant.all_frequencies.intervals} intervals between them"
             if plant.assumed_linear:
-                said += ", on straight lines between its own frequencies"
-        found.append(said)
-    return found
+                words += ", on straight lines between its own frequencies"
+        sentences.append(words)
+    return sentences
 
 
 def not_checked(certificate: Certificate, *, sampled: bool, friction: bool = False) -> list[str]:
@@ -200,7 +207,8 @@ def not_checked(certificate: Certificate, *, sampled: bool, friction: bool = Fal
             "the command at its limits, other than steps and constant errors from rest on the nominal plants"
         )
         left += [
-            f"{loop.plant} at the limits of the command: {why}" for loop, why in _kept(certificate.limited)
+            f"{loop.plant} at the limits of the command: {why}"
+            for loop, why in _unknown_at_limits(certificate.limited)
         ]
     for resonance in certificate.resonances:
         left.append(
@@ -230,7 +238,8 @@ def not_checked_of_joints(certificate: MultivariableCertificate) -> list[str]:
         for verdict in at_limits:
             loops = () if verdict.limited is None else (verdict.limited,)
             left += [
-                f"{verdict.plant}: the loop at the limits of the command: {why}" for _, why in _kept(loops)
+                f"{verdict.plant}: the loop at the limits of the command: {why}"
+                for _, why in _unknown_at_limits(loops)
             ]
     left.append(f"anything between the operating points ({len(certificate.verdicts)} checked)")
     left += [
@@ -244,7 +253,7 @@ def not_checked_of_joints(certificate: MultivariableCertificate) -> list[str]:
     return left
 
 
-def _kept(loops: Sequence[LimitedLoop]) -> list[tuple[LimitedLoop, str]]:
+def _unknown_at_limits(loops: Sequence[LimitedLoop]) -> list[tuple[LimitedLoop, str]]:
     """Loops of which nothing is said, with the reason."""
     return [(loop, LIMITED_OBSTACLES[loop.obstacle.name]) for loop in loops if loop.obstacle is not None]
 

@@ -23,12 +23,16 @@ _LEAST_GAIN_PERCENT = 0.5
 # Relative: bandwidths are rounded to three digits, so a difference below this is none.
 _SAME_BANDWIDTH = 0.999
 
+# Said in place of the uncertainty where the design file has none.
 NOTHING_STATED = (
     "no uncertainty is specified ([uncertainty] in the design file): design and certificate hold for exactly "
     "this model"
 )
+# Why there are no posterior samples.
 NOTHING_TO_DRAW = "no uncertainty is specified: there is nothing to draw from"
+# Why there are none though there is an uncertainty.
 NOT_DRAWN = "no responses were drawn (joint_draws = 0)"
+# Why it is not known what other orders reach.
 BRACKET_NOT_ASKED = "not computed (compute = false)"
 
 
@@ -38,11 +42,11 @@ def undrawable(plant: str, own_grid: bool) -> str:
     return f"responses of {plant} cannot be sampled: its uncertainty is {known}"
 
 
-def nominal_inside(found: NominalAgreement, ellipses: int) -> str:
+def nominal_inside(agreement: NominalAgreement, ellipses: int) -> str:
     """How well the nominal model agrees with its ellipses."""
     return (
-        f"nominal model inside {found.share_inside_percent:.3g} % of the {ellipses} ellipses, at most "
-        f"{found.largest_distance:.3g} of one from the centre ({found.at_rad_s:.4g} rad/s)"
+        f"nominal model inside {agreement.share_inside_percent:.3g} % of the {ellipses} ellipses, at most "
+        f"{agreement.largest_distance:.3g} of one from the centre ({agreement.at_rad_s:.4g} rad/s)"
     )
 
 
@@ -54,27 +58,30 @@ def outcome(synthesis: SynthesisResult | MultivariableResult) -> str:
     if blocking is not None:
         active = f"{blocking.weight} of '{blocking.plant}' at {frequency(blocking.omega_rad_s, 4)}"
     if name == "NOT_CONVERGED":
-        said = "no stabilising controller was found"
+        words = "no stabilising controller was found"
         if active:
-            said += f"; the closest attempt failed on {active}"
+            words += f"; the closest attempt failed on {active}"
         fixed = getattr(getattr(synthesis, "specification", None), "fixed", None)
         if fixed is not None and fixed.kp is not None:
-            said += f"; fixed.kp = {number(fixed.kp)} may have the wrong sign, or be too large"
-        return said
-    said = "the loop is stable on the dense grid of frequencies, but a requirement is missed"
+            words += f"; fixed.kp = {number(fixed.kp)} may have the wrong sign, or be too large"
+        return words
+    words = "the loop is stable on the dense grid of frequencies, but a requirement is missed"
     if name == "MET_ON_GRID":
-        said = "every requirement is met for every plant, on the dense grid of frequencies"
+        words = "every requirement is met for every plant, on the dense grid of frequencies"
     reached = [f"γ = {at_most(synthesis.gamma, 4)}"]
     if synthesis.gamma > 1:
         reached[0] += ", at most 1 is needed"
     if active:
         reached.append(f"active constraint: {active}")
-    return f"{said} ({'; '.join(reached)})"
+    return f"{words} ({'; '.join(reached)})"
 
 
-def would_meet(found: tuple[str, float] | None) -> str:
+def would_meet(change: tuple[str, float] | None) -> str:
     """Another value of one key that a design meets; "" for none."""
-    return "" if found is None else f"; {found[0]} = {number(found[1])} would meet it"
+    if change is None:
+        return ""
+    key, value = change
+    return f"; {key} = {number(value)} would meet it"
 
 
 def draws_stable(design: JointDesign) -> str:
@@ -82,13 +89,13 @@ def draws_stable(design: JointDesign) -> str:
     if not design.unstable:
         return "no stable design: no models were drawn"
     enough = "enough" if design.reached else "NOT enough"
-    said = (
+    words = (
         f"{design.unstable[-1]} of {design.draws} models drawn from the posterior are unstable "
         f"({enough} are stable)"
     )
     if design.guards:
-        said += f"; the design takes {len(design.guards)} unstable ones into account"
-    return said
+        words += f"; the design takes {len(design.guards)} unstable ones into account"
+    return words
 
 
 def bracket_unfit(why: str) -> str:
@@ -123,6 +130,7 @@ def any_order(bracket: YoulaBracket | None, reason: str | None, gamma: float | N
             f"{at_least(bracket.floor, 4)}. That bound is approximate (limited basis, on a grid), so higher "
             "orders may still help"
         )
+    # No order comes below the floor, so that is the most there is to gain.
     left_percent = 100 * (1 - bracket.floor / gamma)
     gain = f"can gain at most {at_most(left_percent, 2)} %"
     if left_percent < _LEAST_GAIN_PERCENT:
@@ -200,40 +208,41 @@ def no_filter(why: str = "there is no controller") -> str:
 
 
 def lowered(
-    asked: Specification,
-    found: Specification | None,
+    specified: Specification,
+    designed_for: Specification | None,
     blocking: Sequence[BlockingPoint],
     certified_rad_s: float,
 ) -> str:
     """Which bandwidth is which where a lower one was taken than specified; "" elsewhere.
 
     Args:
-        asked: As it was specified.
-        found: What was designed for; None: as specified.
+        specified: What the configuration asks for.
+        designed_for: What was designed for; None: as specified.
         blocking: Active constraints of the design.
         certified_rad_s: Bandwidth that is certified; 0 for none.
     """
-    if found is None or asked.lowest_bandwidth_rad_s is None:
+    if designed_for is None or specified.lowest_bandwidth_rad_s is None:
         return ""
-    wanted = asked.bandwidth_rad_s
-    used = found.bandwidth_rad_s
+    wanted = specified.bandwidth_rad_s
+    used = designed_for.bandwidth_rad_s
     if wanted is None or used is None or used >= _SAME_BANDWIDTH * wanted:
         return ""
-    said = f"bandwidth_rad_s = {number(wanted)} was not met"
+    words = f"bandwidth_rad_s = {number(wanted)} was not met"
     if blocking:
-        said += f" (active constraint: {blocking[0].weight} at {frequency(blocking[0].omega_rad_s)})"
-    said += f"; designed for {number(used)} rad/s"
+        words += f" (active constraint: {blocking[0].weight} at {frequency(blocking[0].omega_rad_s)})"
+    words += f"; designed for {number(used)} rad/s"
     if certified_rad_s > 0:
-        said += f"; reaches at least {at_least(certified_rad_s)} rad/s"
-    return said
+        words += f"; reaches at least {at_least(certified_rad_s)} rad/s"
+    return words
 
 
-def tracking_begins(asked: Specification, found: Specification | None) -> str:
+def tracking_begins(specified: Specification, designed_for: Specification | None) -> str:
     """From where on tracking is asked, where the ellipses hold a gain of zero below; "" elsewhere."""
-    if found is None or not found.tracking_from_rad_s or asked.tracking_from_rad_s:
+    if designed_for is None or not designed_for.tracking_from_rad_s or specified.tracking_from_rad_s:
         return ""
+    begins = frequency(designed_for.tracking_from_rad_s)
     return (
-        f"tracking is asked from {frequency(found.tracking_from_rad_s)} on: below, the logs do not tell the "
+        f"tracking is asked from {begins} on: below, the logs do not tell the "
         "response from none; record slower motion (flexlink excite --band)"
     )
 

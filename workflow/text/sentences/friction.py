@@ -12,21 +12,23 @@ if TYPE_CHECKING:
 
 def friction_law(friction: FrictionFit, input_unit: str, output_unit: str) -> str:
     """Law of the friction that was identified."""
-    said = (
+    words = (
         f"Coulomb friction worth {si(friction.level, input_unit)} at the input (standard deviation "
         f"{si(friction.level_std, input_unit)}"
     )
-    said += ")" if friction.significant else ", not significant in these records)"
+    if not friction.significant:
+        words += ", not significant in these records"
+    words += ")"
     law = friction.law
     if law.excess > 0:
         fades = f"{number(law.fall)} units of position per second"
         if output_unit:
             fades = si(law.fall, f"{output_unit}/s")
-        said += f", and {si(law.excess, input_unit)} more to break away (Stribeck, fading above {fades})"
+        words += f", and {si(law.excess, input_unit)} more to break away (Stribeck, fading above {fades})"
     if friction.lag:
         lag_s = friction.lag * friction.arm.dt_s
-        said += f". The command reaches the shaft through a drive that lags by {si(lag_s, 's', 2)}"
-    return said
+        words += f". The command reaches the shaft through a drive that lags by {si(lag_s, 's', 2)}"
+    return words
 
 
 def certified_for(response: str, equivalent: EquivalentFriction | None, input_unit: str) -> str:

@@ -30,7 +30,7 @@ def signals(
     scale: Mapping[str, float],
     offset: Mapping[str, float],
 ) -> str:
-    """Of which columns, in which units, error and command of a controller are.
+    """Columns and units of a controller's error and command, in one line.
 
     Args:
         outputs: Names of columns.
@@ -40,7 +40,7 @@ def signals(
         offset: By column.
     """
 
-    def told(name: str, is_command: bool) -> str:
+    def column_words(name: str, is_command: bool) -> str:
         factor = scale.get(name, 1.0)
         add = offset.get(name, 0.0)
         if factor == 1 and not add:
@@ -48,12 +48,13 @@ def signals(
         law = f"{units[name] or 'quantity'} = {number(factor, 6)} * column"
         if add:
             law += f" + {number(add, 6)}"
+        # Whoever plays the command has to undo what the column adds.
         if add and is_command:
             law += f"; add {number(-add / factor, 6)} to it"
         return f"{name} as logged ({law})"
 
-    errors = ", ".join(told(name, False) for name in outputs)
-    commands = ", ".join(told(name, True) for name in inputs)
+    errors = ", ".join(column_words(name, False) for name in outputs)
+    commands = ", ".join(column_words(name, True) for name in inputs)
     return f"error: reference - measurement of {errors}; command: {commands}"
 
 
@@ -64,19 +65,19 @@ def signal(name: str, units: Sequence[str]) -> str:
 
 def time_base(record: Record) -> str:
     """How time was read: "time column 'Zeit [ms]': milliseconds, sampled every 2 ms, 8 s"."""
-    said = ""
+    words = ""
     column = record.time_column
     if column is not None:
-        said = f"time column '{column.name}': {_UNITS_OF_TIME[column.unit]}"
+        words = f"time column '{column.name}': {_UNITS_OF_TIME[column.unit]}"
         if column.stated:
-            said += " as given"
+            words += " as given"
             if column.in_header and column.in_header != column.unit:
-                said += f" (its name says {column.in_header})"
+                words += f" (its name says {column.in_header})"
         elif not column.in_header:
-            said += " (no unit given)"
-        said += ", "
+            words += " (no unit given)"
+        words += ", "
     step = si(1000 * record.dt_s, "ms", 4) if record.dt_s < 1 else si(record.dt_s, "s", 4)
-    return f"{said}sampled every {step}, {si(record.n_samples * record.dt_s, 's')}"
+    return f"{words}sampled every {step}, {si(record.n_samples * record.dt_s, 's')}"
 
 
 def cut_off(records: Sequence[Record], limit: float | None, unit: str) -> str:
@@ -101,27 +102,27 @@ def rate_part(from_rad_s: float | None, to_rad_s: float | None) -> str:
     return f"slow rate from {number(from_rad_s, 2)} to {si(to_rad_s, 'rad/s', 2)}"
 
 
-def loop_refused(found: Mapping[str, Value], controlled: bool) -> str:
+def loop_refused(finding: Mapping[str, Value], controlled: bool) -> str:
     """Why logs made in a loop carry no model.
 
     Args:
-        found: Values of the finding of the direct way.
+        finding: Values of the finding of the direct way.
         controlled: Whether a controller was stated.
     """
     reference = "without recorded reference"
-    if "explained_percent" in found:
-        reference = f"whose reference explains {found['explained_percent']:.2g} % of the input"
-    said = (
-        f"a loop {reference} fed back noise that moves the response by {found['times']:.2g} radii of its "
+    if "explained_percent" in finding:
+        reference = f"whose reference explains {finding['explained_percent']:.2g} % of the input"
+    words = (
+        f"a loop {reference} fed back noise that moves the response by {finding['times']:.2g} radii of its "
         "ellipses"
     )
     if controlled:
-        said += ", and the controller explains too little of the input"
-    said += "; record with a reference (flexlink excite --closed-loop LOG...)"
+        words += ", and the controller explains too little of the input"
+    words += "; record with a reference (flexlink excite --closed-loop LOG...)"
     if not controlled:
-        said += ", state closed_loop_data.controller"
+        words += ", state closed_loop_data.controller"
     direct = option(None, "closed_loop_data.method", "'direct'")
-    return f"{said}, or take the input as it is ({direct})"
+    return f"{words}, or take the input as it is ({direct})"
 
 
 def unexplained_logs(output: str, why: str, *, friction_known: bool) -> str:
