@@ -18,17 +18,21 @@ def main() -> int:
     """The command line, from loading it to its end: an interrupt is one line at any moment."""
     try:
         usable_streams()
-        if short := too_little_memory():
-            sys.stderr.write(f"flexlink: {short}\n")
+        refusal = too_little_memory()
+        if refusal:
+            sys.stderr.write(f"flexlink: {refusal}\n")
             return 2
         interrupts.watch(later=True)
         # What is imported stays: looking through it for garbage takes a seventh of the imports' time.
         gc.set_threshold(50_000)
-        from workflow.cli import main as command  # half a second, then it knows what continues
+        # Half a second, until the command line itself knows what continues.
+        from workflow.cli import main as command
 
         code = command()
-        interrupts.ignore()  # all is done and said
-    except KeyboardInterrupt:  # just now
+        # All is done and said.
+        interrupts.ignore()
+    except KeyboardInterrupt:
+        # While the command line was loaded.
         sys.stderr.write(f"flexlink: {interrupts.words()}\n")
         code = interrupts.exit_code()
     if interrupts.came():
@@ -66,7 +70,7 @@ def too_little_memory() -> str:
     return f"ulimit -v leaves {soft >> 20} MiB of memory, {wanted}"
 
 
-class _Told(io.TextIOWrapper):
+class _ForgivingStream(io.TextIOWrapper):
     """A stream whose loss ends no computation: of standard error any, of standard output a reader that has
     left. Files are written all the same, and the exit code tells."""
 
@@ -101,15 +105,19 @@ def usable_streams() -> None:
                 setattr(sys, name, os.fdopen(number, mode, encoding="utf-8", closefd=False))
     codecs.register_error("flexlink", _plainer)
     for name, forgiven in (("stdout", BrokenPipeError), ("stderr", OSError)):
-        if isinstance(old := getattr(sys, name), io.TextIOWrapper):
-            encoding, by_line = old.encoding, old.line_buffering or name == "stderr"
-            errors = "flexlink" if old.errors in ("strict", "surrogateescape") else old.errors
-            told = _Told(old.detach(), encoding, errors, line_buffering=by_line)
-            told.forgiven = forgiven
-            setattr(sys, name, told)
+        old = getattr(sys, name)
+        if not isinstance(old, io.TextIOWrapper):
+            continue
+        encoding = old.encoding
+        by_line = old.line_buffering or name == "stderr"
+        errors = "flexlink" if old.errors in ("strict", "surrogateescape") else old.errors
+        stream = _ForgivingStream(old.detach(), encoding, errors, line_buffering=by_line)
+        stream.forgiven = forgiven
+        setattr(sys, name, stream)
 
 
 def _plainer(error: UnicodeError) -> tuple[str, int]:
+    """What is written in place of characters that a stream does not have, and where it goes on."""
     assert isinstance(error, UnicodeEncodeError)
     return "".join(_PLAIN.get(c, "?") for c in error.object[error.start : error.end]), error.end
 

@@ -69,16 +69,19 @@ class _Commands(TyperGroup):
     """Options for fields of settings are made when their command is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        name, found, rest = super().resolve_command(ctx, args)
-        known = _commands().get(name or "")
-        return name, _completed(known) if hasattr(known, "of_fields") else found, rest
+        name, command, remaining = super().resolve_command(ctx, args)
+        function = _commands().get(name or "")
+        if hasattr(function, "of_fields"):
+            command = _completed(function)
+        return name, command, remaining
 
 
 @cache
 def _completed(command: Callable[..., Any]) -> Any:
-    alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    alone.command()(completed(command))
-    return typer.main.get_command(alone)
+    """A command with its options for fields of settings, as Typer makes it of an app of this one command."""
+    app_of_one = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app_of_one.command()(completed(command))
+    return typer.main.get_command(app_of_one)
 
 
 app = typer.Typer(
@@ -227,9 +230,10 @@ def run(
     """Records -> model -> ellipses -> controller -> certificate -> closed loop -> report.html."""
     need(config, *(log or []))
     typed = _stated({name: of_fields.pop(name) for name in _OF_SPECIFICATION})
-    if not log and (given := [option_name(name) for name in _stated(of_fields)]):
+    of_logs = [option_name(name) for name in _stated(of_fields)]
+    if of_logs and not log:
         raise InputError(
-            f"{given[0]} says how logs are read: name them, as in flexlink run LOG... {given[0]}"
+            f"{of_logs[0]} says how logs are read: name them, as in flexlink run LOG... {of_logs[0]}"
         )
     with _watched(quiet) as progress:
         from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
@@ -295,14 +299,17 @@ def excite(
 ) -> None:
     """Plan random-phase multisines that tell response, noise and nonlinear distortion apart."""
     stated = _stated(of_fields)
-    given: dict[str, Any] = {name: stated.pop(name) for name in ("realisations", "periods") if name in stated}
+    counts: dict[str, Any] = {
+        name: stated.pop(name) for name in ("realisations", "periods") if name in stated
+    }
     if closed_loop != bool(log):
         raise InputError("--closed-loop goes with logs of the loop: flexlink excite --closed-loop LOG... ...")
     if log:
         need(*log)
         from workflow.commands.excite import write_reference
 
-        given |= {name: stated[name] for name in ("band_Hz", "duration_s", "lead_in_s") if name in stated}
+        of_reference = ("band_Hz", "duration_s", "lead_in_s")
+        counts |= {name: stated[name] for name in of_reference if name in stated}
         summary = write_reference(
             log,
             out,
@@ -311,7 +318,7 @@ def excite(
             largest_motion=stated.get("motion"),
             rms=next(iter(stated.get("rms_V", ())), None),
             seed=seed,
-            **given,
+            **counts,
         )
         _show(summary, as_json)
         return
@@ -325,7 +332,7 @@ def excite(
     from workflow.commands.excite import write_experiment
     from workflow.tasks.experiment import ExperimentLimits
 
-    _show_files(write_experiment(_settings(ExperimentLimits, stated), out, seed=seed, **given), as_json)
+    _show_files(write_experiment(_settings(ExperimentLimits, stated), out, seed=seed, **counts), as_json)
 
 
 @app.command(short_help="What a log holds: columns, units, sampling, ranges.")
@@ -359,8 +366,8 @@ def init(
     from workflow.commands.init import init as write_configuration
 
     with _watched(quiet=False) as progress:
-        found = write_configuration(log, out, _reading(of_fields), replace_file=replace, progress=progress)
-    _show(found, as_json)
+        summary = write_configuration(log, out, _reading(of_fields), replace_file=replace, progress=progress)
+    _show(summary, as_json)
 
 
 @app.command(short_help="Identify one channel from log files; one-page report.")
@@ -395,10 +402,10 @@ def identify(
     **of_fields: Any,
 ) -> None:
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
-    given, degree = of_fields, of_fields["relative_degree"]
-    report_page, validation, export = (given.pop(name) for name in ("report", "validation", "export"))
+    degree = of_fields["relative_degree"]
+    report_page, validation, export = (of_fields.pop(name) for name in ("report", "validation", "export"))
     if degree and degree.isdigit():  # so that the settings' own complaint names what is allowed
-        given["relative_degree"] = int(degree)
+        of_fields["relative_degree"] = int(degree)
     need(*log, *(validation or []))
     from ident.data.frf_records import is_response
     from workflow.commands.logs import read_logs
@@ -406,10 +413,10 @@ def identify(
     from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
     from workflow.engine.storage import refuse_in_the_way
 
-    options = _settings(FitOptions, given)
+    options = _settings(FitOptions, of_fields)
     with _watched(quiet) as progress:
-        described = _settings(UncertaintyOptions, given)
-        loop = _settings(ClosedLoopData, {"method": given["closed_loop_data_method"]})
+        described = _settings(UncertaintyOptions, of_fields)
+        loop = _settings(ClosedLoopData, {"method": of_fields["closed_loop_data_method"]})
         # A log given twice would count its noise twice as well known, or validate what it was fitted to.
         refuse_in_the_way(
             [*log, *(validation or [])],
@@ -419,17 +426,17 @@ def identify(
                 if path
             ],
         )
-        if not any(given[name] for name in ("input_name", "output_name", "time")) and is_response(*log):
+        if not any(of_fields[name] for name in ("input_name", "output_name", "time")) and is_response(*log):
             from workflow.commands.identify_response import identify_response
 
             of_logs = {
-                **{option_name(key): given[key.replace(".", "_")] for key in _OF_LOGS},
+                **{option_name(key): of_fields[key.replace(".", "_")] for key in _OF_LOGS},
                 "--report": report_page,
                 "--validation": validation,
             }
             summary = identify_response(
                 log,
-                given["dt_s"],
+                of_fields["dt_s"],
                 level=described.level,
                 options=options,
                 out=out,
@@ -439,7 +446,7 @@ def identify(
             )
             _identified(summary, as_json, export, out)
             return
-        logs = read_logs(log, _reading(given), validation or [])
+        logs = read_logs(log, _reading(of_fields), validation or [])
         # A log that is refused does not wait for what identifies: that takes seconds to load.
         from workflow.commands.identify import identify_logs
 
@@ -447,7 +454,7 @@ def identify(
             logs,
             options=options,
             described=described,
-            band_rad_s=given["band_rad_s"],
+            band_rad_s=of_fields["band_rad_s"],
             loop=loop,
             out=out,
             report=report_page,
@@ -699,7 +706,7 @@ def diagnose(
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_settings import settings_of
 
-        found = diagnose_cases(
+        diagnosed = diagnose_cases(
             case or [settings_of(stated, "--log")],
             out,
             rig=rig,
@@ -712,21 +719,22 @@ def diagnose(
             progress=progress,
         )
     if as_json:
-        for part in found.json_parts(ascii_only=_ascii_only()):
+        for part in diagnosed.json_parts(ascii_only=_ascii_only()):
             sys.stdout.write(part)
     else:
-        _show(found.summary, as_json)
-    for line in found.complaints():
-        _complain(line, found.exit_code)
-    if found.exit_code != EXIT_OK:
-        raise typer.Exit(found.exit_code)
+        _show(diagnosed.summary, as_json)
+    for line in diagnosed.complaints():
+        _complain(line, diagnosed.exit_code)
+    if diagnosed.exit_code != EXIT_OK:
+        raise typer.Exit(diagnosed.exit_code)
 
 
 def _of_simulator(command: str, cases: Sequence[Path], of_fields: Mapping[str, Any]) -> dict[str, Any]:
     """A simulator's case as the options state it; empty beside case files. Raises InputError."""
     stated = {name: value for name, value in of_fields.items() if value}
     model: dict[str, Any] = {name: stated.pop(name) for name in ("mjcf", "fmu", "python") if name in stated}
-    log, of_logs = stated.pop("log", None), stated
+    log = stated.pop("log", None)
+    of_logs = stated
     if cases and model and log:
         raise InputError(f"{command}: {cases[0]}: write --log before each log, as --log A.csv --log B.csv")
     if model and not log:
@@ -758,11 +766,14 @@ def _c_code(prefix: str | None, single: bool | None) -> dict[str, Any]:
     from control_design.controllers.c_code import Dialect
     from workflow.engine.errors import naming
 
-    number = None if single is None else "float" if single else "double"
-    found = _stated({"prefix": prefix, "number": number})
+    number = None
+    if single is not None:
+        number = "float" if single else "double"
+    fields = _stated({"prefix": prefix, "number": number})
+    # It refuses what is no name in C, before anything is computed.
     with naming("--c-prefix"):
-        Dialect(**found)
-    return found
+        Dialect(**fields)
+    return fields
 
 
 def _stated(given: Mapping[str, Any]) -> dict[str, Any]:
@@ -776,7 +787,8 @@ def _reading(given: Mapping[str, Any]) -> Reading:
 
     stated = dict(given)
     for name in ("scale", "offset", "unwrap", "units"):
-        pairs, option = _named(option_name(name), given.get(name)), option_name(name)
+        option = option_name(name)
+        pairs = _named(option, given.get(name))
         stated[name] = pairs if name == "units" else {key: _number(option, pairs[key]) for key in pairs}
     return _settings(Reading, stated)
 
@@ -791,21 +803,20 @@ def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
     from control_design.specification import Specification
     from workflow.config.settings import Section
 
-    found = {name: None if value == NONE else value for name, value in typed.items()}
-    order = found.get("controller_order")
+    keys = {name: None if value == NONE else value for name, value in typed.items()}
+    order = keys.get("controller_order")
     if isinstance(order, str) and order.isdigit():  # a number, or "auto"
-        found["controller_order"] = int(order)
+        keys["controller_order"] = int(order)
     elif order not in (None, "auto"):
         raise InputError(
             f"{option_name('controller_order')}: expected a number of states or auto, got {order}"
         )
     # Each by itself: what contradicts the keys beside it is found where all of them are known.
     fields: dict[str, Any] = {
-        name: (Specification.model_fields[name].annotation, Specification.model_fields[name])
-        for name in found
+        name: (Specification.model_fields[name].annotation, Specification.model_fields[name]) for name in keys
     }
-    _settings(create_model("TypedSpecification", __base__=Section, **fields), found)
-    return found
+    _settings(create_model("TypedSpecification", __base__=Section, **fields), keys)
+    return keys
 
 
 def _named(option: str, stated: Sequence[str] | None) -> dict[str, str]:
@@ -935,9 +946,9 @@ def _interrupted(arguments: Sequence[str], out: Path | None = None) -> int:
     hint = ""
     if called is not None and "resume" in inspect.signature(called).parameters:
         again = [text for text in arguments if text not in ("--replace", "--resume")]
-        given = next((at for at, text in enumerate(again) if text.partition("=")[0] == "--out"), None)
-        if given is not None:
-            out = Path(again[given].partition("=")[2] or again[given + 1])
+        at_out = next((at for at, text in enumerate(again) if text.partition("=")[0] == "--out"), None)
+        if at_out is not None:
+            out = Path(again[at_out].partition("=")[2] or again[at_out + 1])
         elif out is not None:
             again += ["--out", str(out)]
         if out is not None and any((out / name).is_file() for name in _MANIFESTS):

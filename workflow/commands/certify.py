@@ -45,33 +45,43 @@ _HEADER = """\
 
 
 def worst_cases(certificate: Certificate, specification: Specification) -> dict[str, dict[str, Any]]:
-    """By plant: numbers in the units of their names, worst case over its set. least_mode_damping: of the
-    nominal loop's modes, inside the band of the damping requirement where there is one."""
+    """Worst cases over the uncertainty set of each plant, in the units of their names.
+
+    Parameters
+    ----------
+    certificate : Certificate
+    specification : Specification
+        Its band of the damping requirement, where there is one, limits the modes that count.
+
+    Returns
+    -------
+    dict
+        By plant, by name. `least_mode_damping` is that of the nominal loop's modes, 1 without any.
+    """
     low, high = specification.mode_band_rad_s or (0.0, math.inf)
-    return {
-        verdict.plant: {
+    numbers_by_plant: dict[str, dict[str, Any]] = {}
+    for verdict in certificate.plants:
+        margins = verdict.worst_margins
+        zetas = [mode.zeta for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
+        numbers_by_plant[verdict.plant] = {
             "certified": certificate.certified,
             "gamma": verdict.worst_weighted,
-            "modulus_margin": verdict.worst_margins.modulus,
-            "gain_margin_dB": 20 * math.log10(verdict.worst_margins.gain_up),
-            "phase_margin_deg": math.degrees(verdict.worst_margins.phase_rad),
-            "delay_margin_s": verdict.worst_margins.delay_s,
+            "modulus_margin": margins.modulus,
+            "gain_margin_dB": 20 * math.log10(margins.gain_up),
+            "phase_margin_deg": math.degrees(margins.phase_rad),
+            "delay_margin_s": margins.delay_s,
             "bandwidth_rad_s": verdict.bandwidth_rad_s,
-            "least_mode_damping": min(
-                (mode.zeta for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high),
-                default=1.0,
-            ),
+            "least_mode_damping": min(zetas, default=1.0),
         }
-        for verdict in certificate.plants
-    }
+    return numbers_by_plant
 
 
-def against(found: Mapping[str, Any], path: Path, table: str) -> dict[str, tuple[float, float, str]]:
+def against(numbers: Mapping[str, Any], path: Path, table: str) -> dict[str, tuple[float, float, str]]:
     """Numbers of a plant beside those of a baseline.
 
     Parameters
     ----------
-    found : mapping of str to number
+    numbers : mapping of str to number
         Numbers of the plant's certificate.
     path : Path
         Of the baseline.
@@ -81,52 +91,56 @@ def against(found: Mapping[str, Any], path: Path, table: str) -> dict[str, tuple
     Returns
     -------
     dict
-        By name: value found, value held, and "as before", "better" or "worse". Less than the tolerance apart
-        is as before; a smaller gamma is better, of all others a larger value.
+        By name: value of the certificate, value of the baseline, and "as before", "better" or "worse". Less
+        than the tolerance apart is as before; a smaller gamma is better, of all others a larger value.
 
     Raises
     ------
     InputError
         One line: no such table, a name or a number that is none.
     """
-    held = read_toml(path)[1].get(table)
-    if not isinstance(held, dict):
+    baseline = read_toml(path)[1].get(table)
+    if not isinstance(baseline, dict):
         raise InputError(f"{path}: no table [{table}]: write it with --write-baseline")
     compared = dict[str, tuple[float, float, str]]()
-    tolerances = held.pop("tolerance", {})
-    for name, value in held.items():
+    tolerances = baseline.pop("tolerance", {})
+    for name, value in baseline.items():
         share = tolerances.get(name, 0.0)
-        if name not in found:
-            raise InputError(f"{path}: [{table}] {name}: unknown ({meant(name, list(found), 'names')})")
+        if name not in numbers:
+            raise InputError(f"{path}: [{table}] {name}: unknown ({meant(name, list(numbers), 'names')})")
         if not (isinstance(share, int | float) and isinstance(value, int | float) and 0 <= share < 1):
             raise InputError(f"{path}: [{table}] {name}: expected a number, and a tolerance from 0 to 1")
-        within = value * (1 - share) <= found[name] <= value * (1 + share)
-        better = found[name] < value if name == "gamma" else found[name] > value
-        if within:
+        number = numbers[name]
+        is_better = number < value if name == "gamma" else number > value
+        if value * (1 - share) <= number <= value * (1 + share):
             verdict = "as before"
-        elif better:
+        elif is_better:
             verdict = "better"
         else:
             verdict = "worse"
-        compared[name] = found[name], value, verdict
-    forgotten = tolerances.keys() - held.keys()
+        compared[name] = number, value, verdict
+    # A tolerance of no number is a misspelt name: its number would be held to the last digit.
+    forgotten = tolerances.keys() - baseline.keys()
     if forgotten:
         raise InputError(f"{path}: [{table}.tolerance] {min(forgotten)}: no such number in [{table}]")
     return compared
 
 
-def write_baseline(path: Path, found: Mapping[str, Mapping[str, Any]]) -> None:
+def write_baseline(path: Path, numbers_by_plant: Mapping[str, Mapping[str, Any]]) -> None:
     """Write the numbers of each plant into a baseline.
 
-    path: of the file; found: numbers by plant. Tolerances, and what else is in the file, are kept; of a table
-    that is there only the numbers it holds are written. Raises InputError.
+    Tolerances, and what else is in the file, are kept; of a table that is there only the numbers it holds are
+    written: what somebody took out is not to be compared. Raises InputError.
     """
     document = tomlkit.parse(read_toml(path)[0] if path.exists() else _HEADER)
-    for name, numbers in found.items():
+    for name, numbers in numbers_by_plant.items():
         earlier = document.get(name, {})
         table = tomlkit.table()
-        for key in [key for key in numbers if not earlier or key in earlier]:
-            table.add(key, numbers[key] if isinstance(numbers[key], bool) else float(f"{numbers[key]:.6g}"))
+        for key, number in numbers.items():
+            if earlier and key not in earlier:
+                continue
+            # Six digits, far below any tolerance: others change from machine to machine.
+            table.add(key, number if isinstance(number, bool) else float(f"{number:.6g}"))
         table.add("tolerance", earlier.get("tolerance", _TOLERANCES))
         document[name] = table
     storage.write_text(path, tomlkit.dumps(document))
@@ -135,9 +149,27 @@ def write_baseline(path: Path, found: Mapping[str, Mapping[str, Any]]) -> None:
 def certify_controller(
     paths: Sequence[Path], file: DesignFile | None, files: CommandFiles, *, progress: Progress | None = None
 ) -> RunSummary:
-    """Certify a controller for one or several plants (files: `workflow.tasks.design_source`), and hold its
-    worst cases against a baseline; `certified` only where none is worse. file: None takes the specification
-    of a run directory. Raises InputError."""
+    """Certify a controller for one or several plants, and hold its worst cases against a baseline.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Of the plants, as in `workflow.tasks.design_source`; a single run directory has a controller, too.
+    file : DesignFile or None
+        None takes the specification of a run directory.
+    files : CommandFiles
+        Controller, baseline, and where a new baseline is to be written.
+    progress : Progress, optional
+
+    Returns
+    -------
+    RunSummary
+        `certified` only where no number is worse than that of the baseline.
+
+    Raises
+    ------
+    InputError
+    """
     controller = files.controller
     baseline = files.baseline
     written = files.write_baseline
@@ -182,18 +214,25 @@ def certify_controller(
     assert done.certificate is not None
 
     # Worst cases beside the baseline; a new one is written only where all is certified.
-    found = worst_cases(done.certificate, specification)
-    held = {} if baseline is None else {name: against(found[name], baseline, name) for name in found}
+    worst = worst_cases(done.certificate, specification)
+    compared: dict[str, dict[str, tuple[float, float, str]]] = {}
+    if baseline is not None:
+        compared = {plant: against(numbers, baseline, plant) for plant, numbers in worst.items()}
     if written is not None and done.certified:
-        write_baseline(written, found)
-    worse = [
-        (name, key, *told) for name, of in held.items() for key, told in of.items() if told[2] == "worse"
-    ]
+        write_baseline(written, worst)
+    worse = []
+    comparisons: dict[str, dict[str, dict[str, Any]]] = {}
+    for plant, by_name in compared.items():
+        comparisons[plant] = {}
+        for name, (value, held, verdict) in by_name.items():
+            comparisons[plant][name] = {"value": value, "held": held, "verdict": verdict}
+            if verdict == "worse":
+                worse.append((plant, name, value, held, verdict))
     doubts = [words(doubt) for doubt in done.certificate.warnings]
     numbers = engineers_numbers(law)
     return RunSummary(
         title=f"certificate of {controller}",
-        sections=certify_sections(sources, law, done.certificate, found, held),
+        sections=certify_sections(sources, law, done.certificate, worst, compared),
         numbers={
             "plants": [{"plant": source.plant.name, "origin": source.origin} for source in sources],
             "controller": str(controller),
@@ -201,14 +240,8 @@ def certify_controller(
             "certificate": codec.plain(done.certificate),
             "certificate_conditions": doubts,
             "certified": done.certified,
-            "worst_cases": found,
-            "baseline": {
-                name: {
-                    key: dict(zip(("value", "held", "verdict"), told, strict=True))
-                    for key, told in of.items()
-                }
-                for name, of in held.items()
-            },
+            "worst_cases": worst,
+            "baseline": comparisons,
         },
         certified=done.certified and not worse,
         verdict=guard_verdict(done, worse, baseline, written, ". Also, ".join(doubts)),

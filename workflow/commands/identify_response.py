@@ -86,8 +86,9 @@ def identify_response(
     # Files are written together at the end, so that a refusal leaves none.
     written: dict[Path, bytes] = {}
     if out is not None or export is not None:
-        ends = response.omega_rad_s[response.omega_rad_s > 0]
-        omega = np.geomspace(ends[0], ends[-1], FREQUENCIES)
+        # Between the ends of what was measured; frequency 0 has no logarithm.
+        positive = response.omega_rad_s[response.omega_rad_s > 0]
+        omega = np.geomspace(positive[0], positive[-1], FREQUENCIES)
         if out is not None:
             nominal = nominal_near(fit.posterior, fit.model.poles, omega)
             written[out] = storage.npz_bytes(codec.to_arrays(IdentifiedPlant(nominal, fit.posterior, level)))
@@ -95,8 +96,13 @@ def identify_response(
             written[export] = model_bytes(export, ModelFile(fit.model, fit.posterior.at(omega, level)))
     interrupts.check()
     storage.write_together(written)
+
     poles = fit.model.poles
     dt_s = fit.model.dt_s
+    modes = []
+    for omega_rad_s, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True):
+        frequency_Hz = omega_rad_s / (2 * np.pi)
+        modes.append({"omega_rad_s": omega_rad_s, "frequency_Hz": frequency_Hz, "damping": zeta})
     return RunSummary(
         title=f"frequency response {paths[0].name}",
         sections=response_sections(fit, response),
@@ -104,10 +110,7 @@ def identify_response(
             "order": fit.model.order,
             "dt_s": dt_s,
             "real_poles_per_s": codec.plain(poles.decay_per_s(dt_s)),
-            "modes": [
-                {"omega_rad_s": omega, "frequency_Hz": omega / (2 * np.pi), "damping": zeta}
-                for omega, zeta in zip(poles.omega_rad_s(dt_s).tolist(), poles.zeta().tolist(), strict=True)
-            ],
+            "modes": modes,
             "chi_square": fit.rss,
             "degrees_of_freedom": fit.degrees_of_freedom,
             "verdicts": [words(item) for item in fit.verdicts],

@@ -22,17 +22,33 @@ def look(
     decimal: str | None = None,
     out: Path | None = None,
 ) -> RunSummary:
-    """Columns, units, sampling, ranges, clipping and quantisation of one log; out: the same as a page.
+    """Columns, units, sampling, ranges, clipping and quantisation of one log.
 
-    Raises InputError.
+    Parameters
+    ----------
+    log : Path
+    time, time_unit, decimal : str, optional
+        How the file is read, where it does not tell.
+    out : Path, optional
+        Page with the same, as HTML.
+
+    Returns
+    -------
+    RunSummary
+        Its verdict is the command that goes on from here.
+
+    Raises
+    ------
+    InputError
     """
     storage.refuse_in_the_way([log], [] if out is None else [("--out", out)])
-    found = look_at(log, time, time_unit, decimal)
-    command = _next(found, options_typed(time_unit, decimal))
+    log_look = look_at(log, time, time_unit, decimal)
+    command = _next(log_look, options_typed(time_unit, decimal))
     if out is not None:
-        from workflow.report.rendering import render_described  # loads all that draws: a second
+        # It loads all that draws, which takes a second.
+        from workflow.report.rendering import render_described
 
-        storage.write_text(out, render_described(look_page(found, command)).html)
+        storage.write_text(out, render_described(look_page(log_look, command)).html)
     columns = {
         column.name: {
             "unit": column.unit,
@@ -42,47 +58,49 @@ def look(
             "clipped_share": column.clipped,
             "step": column.step,
         }
-        for column in found.columns
+        for column in log_look.columns
     }
-    parts = {name: codec.plain(getattr(found, name)) for name in ("rows", "layout", "time", "response")}
+    parts = {name: codec.plain(getattr(log_look, name)) for name in ("rows", "layout", "time", "response")}
     return RunSummary(
         title=str(log),
-        sections=look_sections(found),
+        sections=look_sections(log_look),
         numbers=parts | {"columns": columns},
         verdict=command,
         report_path=None if out is None else str(out),
     )
 
 
-def _next(found: LogLook, options: Sequence[str]) -> str:
+def _next(log_look: LogLook, options: Sequence[str]) -> str:
     """The command that goes on from here, or what has to be done before.
 
     options: of `look`, to be given again.
     """
-    log = " ".join([path_as_typed(found.path), *options])
-    if found.response is not None:
-        return _after_response(found.response, path_as_typed(found.path))
-    if found.roles is None:
-        return found.unclear
-    roles = found.roles
-    used = found.taken_as.values()
-    why = [column.why for column in found.columns if column.name in used and column.values is None]
-    if found.time and found.time.why:
-        why.append(found.time.why)
-    elif found.time and found.time.option == "split":
-        why.append(f"{found.time.gap_place}: {found.time.missing} rows are missing, split the file there")
+    log = " ".join([path_as_typed(log_look.path), *options])
+    if log_look.response is not None:
+        return _after_response(log_look.response, path_as_typed(log_look.path))
+    if log_look.roles is None:
+        return log_look.unclear
+    roles = log_look.roles
+    used = log_look.taken_as.values()
+    why = [column.why for column in log_look.columns if column.name in used and column.values is None]
+    if log_look.time and log_look.time.why:
+        why.append(log_look.time.why)
+    elif log_look.time and log_look.time.option == "split":
+        missing = log_look.time.missing
+        why.append(f"{log_look.time.gap_place}: {missing} rows are missing, split the file there")
     if why:
-        return f"{found.path}, {why[0]}"
-    doubted = [str(doubt.values["options"]) for doubt in found.doubts if "options" in doubt.values]
-    if roles.reference or roles.doubts:  # made in closed loop
+        return f"{log_look.path}, {why[0]}"
+    doubted = [str(doubt.values["options"]) for doubt in log_look.doubts if "options" in doubt.values]
+    # A log made in a loop needs more than one channel's model: `run` tells which way is right.
+    if roles.reference or roles.doubts:
         return " ".join(["flexlink run", log, *doubted, "--out runs/arm"])
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     typed = [f"{option} {as_typed(name)}" for option, name in named.items() if name]
     if not roles.time:
         typed.append("--dt-s SECONDS")
-    if found.time and found.time.option.startswith("--"):
-        typed.append(found.time.option)
-    for doubt in found.doubts:
+    if log_look.time and log_look.time.option.startswith("--"):
+        typed.append(log_look.time.option)
+    for doubt in log_look.doubts:
         if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output:
             period = f"{doubt.values['period']:.17g}"
             typed.append(f"--unwrap {as_typed(f'{roles.output}={period}')}")

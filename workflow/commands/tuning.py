@@ -68,6 +68,22 @@ _STEP_SAMPLES = 200, 1 << 14
 _SHOWN = 1e-4
 # Distance from 0 up to which the Nyquist curve is shown.
 _NEAR = 3.0
+# A worst case larger than this is none: an ellipse that reaches -1 gives an infinite one.
+_UNBOUNDED = 1e200
+# Modes of a smaller damping ratio get frequencies of their own: others are as wide as the usual grid's steps.
+_LIGHTLY_DAMPED = 0.3
+# Least damping ratio that frequencies around a mode are chosen by: a smaller peak is narrower than they tell.
+_LEAST_DAMPING = 1e-3
+# Frequencies of the pictures over frequency, and more of them at each mode: a curve as smooth as the screen.
+_FREQUENCIES = 150
+# Frequencies at each mode of these pictures.
+_AT_MODE = 12
+# Frequencies of the Nyquist curve, which bends at each of them.
+_NYQUIST_FREQUENCIES = 400
+# Frequencies at each mode of the Nyquist curve: a mode is a circle there.
+_NYQUIST_AT_MODE = 30
+# Pictures over frequency begin at the bandwidth divided by this, or lower: tracking is seen in it.
+_BELOW_BANDWIDTH = 30
 # Ellipses that are drawn along it.
 _ELLIPSES = 60
 # Corners of each of them.
@@ -435,18 +451,19 @@ def _grid(plant: UncertainPlant, law: Controller, n_log: int, per_mode: int) -> 
     if plant.own_grid is not None:
         return plant.own_grid[plant.own_grid > 0]
     modes = (*plant.modes, *modes_of(closed_loop_poles(law, plant), plant.dt_s))
-    light = [
-        Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-3))
-        for mode in modes
-        if mode.zeta < 0.3 and mode.omega_rad_s < plant.nyquist_rad_s
-    ]
+    light = []
+    for mode in modes:
+        if mode.zeta < _LIGHTLY_DAMPED and mode.omega_rad_s < plant.nyquist_rad_s:
+            light.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), _LEAST_DAMPING)))
     return checked_grid(plant, light, n_log, per_mode)
 
 
 def _shown_grid(law: Controller, plant: UncertainPlant, specification: Specification) -> Real:
     """Frequencies of pictures, rad/s: from a thirtieth of the bandwidth on, or lower."""
-    omega = _grid(plant, law, 150, 12)
-    lowest = min(_SHOWN * plant.nyquist_rad_s, (specification.bandwidth_rad_s or math.inf) / 30)
+    omega = _grid(plant, law, _FREQUENCIES, _AT_MODE)
+    lowest = _SHOWN * plant.nyquist_rad_s
+    if specification.bandwidth_rad_s:
+        lowest = min(lowest, specification.bandwidth_rad_s / _BELOW_BANDWIDTH)
     return omega[omega >= lowest]
 
 
@@ -480,7 +497,7 @@ def _gains(
             "unit": curve.unit,
             "x": short(curve.omega_rad_s),
             "nominal": short(curve.nominal),
-            "worst": short(np.where(curve.worst < 1e200, curve.worst, np.nan)),
+            "worst": short(np.where(curve.worst < _UNBOUNDED, curve.worst, np.nan)),
             "limit": short(curve.limit),
         }
         for curve in curves
@@ -489,19 +506,23 @@ def _gains(
 
 def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
     """Loop K G of the centres and outlines of its ellipses, as far as they are near the origin."""
-    grid = _grid(plant, law, 400, 30)
+    grid = _grid(plant, law, _NYQUIST_FREQUENCIES, _NYQUIST_AT_MODE)
+    # A plant that is known on a grid of its own has nothing between its points.
     if plant.own_grid is None:
         grid = smooth_grid(grid, lambda omega: law.response(omega) * plant.at(omega).centre)
     ellipses = plant.at(grid)
     k = law.response(grid)
     loop = k * ellipses.centre
-    near = np.flatnonzero(np.abs(loop) < _NEAR)
-    at = near[np.unique(np.linspace(0, near.size - 1, _ELLIPSES).astype(int))] if near.size else near
+    # Ellipses at some of the frequencies, evenly spread over the part that is seen.
+    at = np.flatnonzero(np.abs(loop) < _NEAR)
+    if at.size:
+        at = at[np.unique(np.linspace(0, at.size - 1, _ELLIPSES).astype(int))]
     turn = np.exp(2j * np.pi * np.arange(_CORNERS) / _CORNERS)
     part = ellipses.subset(at)
     major = part.semi_major[:, None] * turn.real
     minor = part.semi_minor[:, None] * turn.imag
     outline = k[at, None] * (part.centre[:, None] + part.direction[:, None] * (major + 1j * minor))
+    # The curve goes on a little beyond the picture's end, so that it does not stop in sight.
     line = np.where(np.abs(loop) < 2 * _NEAR, loop, np.nan)
     return {
         "re": short(line.real),
@@ -514,13 +535,23 @@ def _words_of_structure(specification: Specification, structure: _Structure, key
     """What a structure has in place of a setting, "structure pid has order 4", with the notches and low-pass
     of the specification; key: one of `_SET_BY_STRUCTURE`."""
     if key == "integrator":
-        return f"structure {structure} has {'an' if structure in ('pi', 'pid') else 'no'} integrator"
+        article = "an" if structure in ("pi", "pid") else "no"
+        return f"structure {structure} has {article} integrator"
     of_structure = specification.model_copy(update={"structure": structure})
     return f"structure {structure} has order {order_of_structure(of_structure)}"
 
 
 def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any] | None:
-    """The page's control of a field by its JSON schema; None for a pair or a weight, which stays as it is."""
+    """The page's control of a field by its JSON schema; None for a pair or a weight, which stays as it is.
+
+    Returns
+    -------
+    dict or None
+        `name`, `words` (the description, which every field has), `value`, `optional`, `kind` (a value of
+        `_KINDS`); where the schema has them `unasked` (what an optional field is set to that is not asked
+        for), `choices` and the ends of the range, by the values of `_ENDS`.
+    """
+    # An optional field is "anyOf": its type first, then null or the constant that stands for "not asked".
     parts = schema.get("anyOf", [schema])
     setting: dict[str, Any] = {"name": name, "words": schema["description"], "value": value}
     setting["optional"] = {"type": "null"} in parts
@@ -552,4 +583,9 @@ def toml_of(file: DesignFile) -> str:
 
 
 def _finite(numbers: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in numbers.items()}
+    """Numbers for JSON, which has neither infinity nor nan: None in place of them."""
+    finite = {}
+    for name, value in numbers.items():
+        is_number = not isinstance(value, float) or math.isfinite(value)
+        finite[name] = value if is_number else None
+    return finite

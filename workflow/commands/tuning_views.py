@@ -60,7 +60,8 @@ def bode(law: Controller, plant: UncertainPlant, omega_rad_s: Real, units: tuple
     centre = plant.at(omega_rad_s).centre
     loop = controller * centre
     # A response of zero has no logarithm; it is not where the loop crosses.
-    crossover = int(np.argmin(np.abs(np.log(np.maximum(np.abs(loop), np.finfo(float).tiny)))))
+    gain = np.maximum(np.abs(loop), np.finfo(float).tiny)
+    crossover = int(np.argmin(np.abs(np.log(gain))))
     curves = []
     for symbol, unit, values, shifted in (
         ("K G", "1", loop, True),

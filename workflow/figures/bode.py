@@ -35,6 +35,10 @@ _DOTS: dict[str, Any] = {
     "alpha": 0.55,
     "mew": 0,
 }
+# Foot of an area on a log axis, which has no 0 [%]: below every ellipse.
+_FOOT = 1e-12
+# Least upper end of the sizes of ellipses [%]: the line of those as large as the response is in view.
+_LEAST_TOP = 200.0
 # Ends of parts of the frequency axis whose smallest and largest dot are drawn: a part is two dots wide.
 _PARTS = 151
 # The nominal model, thin and dashed over the ellipses.
@@ -161,9 +165,11 @@ def draw_bode(
         shown = (empirical.omega_rad_s >= omega[0]) & (empirical.omega_rad_s <= omega[-1])
         at = empirical.omega_rad_s[shown]
         response = empirical.centre[shown]
-        index = extremes(at, np.abs(response), np.geomspace(omega[0], omega[-1], _PARTS))
-        at = at[index]
-        response = response[index]
+        # It may have been taken at other frequencies altogether.
+        if at.size:
+            index = extremes(at, np.abs(response), np.geomspace(omega[0], omega[-1], _PARTS))
+            at = at[index]
+            response = response[index]
         seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
         gain.plot(x(at), seen, **_DOTS, label="straight from the records, no model", zorder=1)
         phase.plot(x(at), degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS, zorder=1)
@@ -175,16 +181,18 @@ def draw_bode(
     gain.set_title(title)
 
     # Below: how large each ellipse is beside the response.
+    # The band leaves out a frequency of 0 as well, which a log axis does not have.
     above_zero = uncertainty.omega_rad_s > 0
     relative = 100 * uncertainty.ellipse().semi_major[above_zero] / band.gain
-    size.fill_between(x(omega), np.full_like(relative, 1e-12), relative, **style.BAND)
+    size.fill_between(x(omega), np.full_like(relative, _FOOT), relative, **style.BAND)
     size.plot(x(omega), relative, color=style.UNCERTAIN, lw=1.3)
     size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
     size.set(yscale="log")
     can_be_drawn = np.isfinite(relative) & (relative > 0)
     finite = relative[can_be_drawn]
     if finite.size:
-        size.set(ylim=(10 ** np.floor(np.log10(finite.min())), max(200.0, 2 * float(finite.max()))))
+        highest = max(_LEAST_TOP, 2 * float(finite.max()))
+        size.set(ylim=(10 ** np.floor(np.log10(finite.min())), highest))
     size.set(xlabel=phase.labels[X], ylabel="ellipse / gain [%]")
     phase.set(xlabel="")
     return picture

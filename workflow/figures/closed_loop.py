@@ -15,6 +15,29 @@ from workflow.figures.subjects import FRICTION, MACHINE, RunView
 from workflow.tasks.results import LoopRuns
 from workflow.text.formats import si
 
+# Predicted runs are at rest from where they stay within this share of their range of where they end: as of a
+# settling time.
+_PREDICTED_REST = 0.02
+# The same of runs on a machine, which are noisy. Chosen.
+_MACHINE_REST = 0.15
+# A panel is this much longer than what moves in it. Chosen: some rest shows that it is over.
+_WITH_REST = 1.5
+# A panel that is cut is at least this share of its whole length: less looks like a jump.
+_LEAST_SHARE = 0.2
+# A panel is cut only where less than this share of it is left: elsewhere little is saved.
+_WORTH_CUTTING = 0.75
+# The step's panel goes on beyond the settling time by this factor, so that it is no corner of the picture.
+_BEYOND_SETTLING = 1.15
+# Share of the whole time before a disturbance that its panel shows, for where it comes from.
+_BEFORE_DISTURBANCE = 0.03
+# A disturbance nearer to either end than this many times the time before it gets no panel of its own.
+_FEWEST_MARGINS = 4
+# Share of a command's limit that a run has to reach for the limit to be drawn: else it only makes it flat.
+_NEAR_LIMIT = 0.4
+# Runs that leave the range of the prediction by more than this many times it are cut in the picture.
+_MOST_BEYOND = 3.0
+# Within this time [s] two instants are one: far below any sampling period.
+_SAME_INSTANT_S = 1e-9
 # The loop on the identified model.
 _PREDICTED: dict[str, Any] = style.PREDICTED_LINE | {"label": "predicted, nominal model"}
 # What is asked for.
@@ -83,8 +106,8 @@ def draw_closed_loop(
     with_friction : sequence of arrays
         Outputs of the lines `FRICTION`, as far as they go; the step's panel goes as far as the longest.
     settled_s : float, optional
-        The panels are cut where nothing moves any more, not before this time after the step; None: all is
-        shown, but beside a disturbance, whose panel takes over where it begins.
+        The panels are cut where nothing moves any more, not before this time after the step; None: the step
+        is shown whole, until the disturbance begins where there is one.
     onto : tuple of Picture and Panel, optional
         Drawn on in place of a new picture; of one row and column.
     """
@@ -137,14 +160,16 @@ def draw_closed_loop(
             runs += with_friction
         if others is not None:
             runs.append(getattr(others, kind))
-        low, high = height(wanted_range, runs, 3.0)
+        low, high = height(wanted_range, runs, _MOST_BEYOND)
 
         # The command's limits, where it comes near enough for them to matter.
         limits: tuple[float, ...] = ()
         if kind == "command" and command_limit is not None:
             limits = (-command_limit, command_limit)
         for limit in limits:
-            if 0.4 * abs(limit) < np.sign(limit) * (low if limit < 0 else high):
+            # How far the command goes towards this limit.
+            reached = -low if limit < 0 else high
+            if _NEAR_LIMIT * abs(limit) < reached:
                 low = min(low, limit)
                 high = max(high, limit)
                 for panel in row:
@@ -204,9 +229,9 @@ def _windows(
 ) -> tuple[float | None, list[_Window]]:
     """When the disturbance begins, and the panels: step and disturbance apart.
 
-    Each is as long as something moves, the step at least until `settled_s` after it (None: the step is not
-    cut). Lines with friction go on to `friction_s`, where they settle later than the others, and the step's
-    panel with them.
+    Each is as long as something moves, the step at least until `settled_s` after it (None: the step is shown
+    whole, until the disturbance begins where there is one). Lines with friction go on to `friction_s`, where
+    they settle later than the others, and the step's panel with them.
     """
     start = float(time_s[0])
     stop = float(time_s[-1])
@@ -215,34 +240,40 @@ def _windows(
 
     def shown(first: float, last: float, least: float, title: str) -> _Window:
         part = slice(int(np.searchsorted(time_s, first)), int(np.searchsorted(time_s, last)))
-        # Predicted runs may leave 2 % of their range, the others (noisy) 15 %.
         quiet = max(
             _quiet_from(time_s[part], getattr(runs, kind)[:, part], tolerance)
-            for runs, tolerance in zip(all_runs, (0.02, 0.15), strict=False)
+            for runs, tolerance in zip(all_runs, (_PREDICTED_REST, _MACHINE_REST), strict=False)
             for kind in labels
         )
-        # Cut only where much is saved; some rest after the motion shows that it is over.
-        end = max(first + max(1.5 * (quiet - first), 0.2 * (last - first)), least)
+        length = last - first
+        end = max(first + max(_WITH_REST * (quiet - first), _LEAST_SHARE * length), least)
         # The first sample of the disturbance is not of the step's panel.
-        uncut = last if last == stop else last - 1e-9
+        uncut = last if last == stop else last - _SAME_INSTANT_S
         if least > uncut:
             return _Window(first, max(uncut, min(least, friction_s)), uncut, title)
-        return _Window(first, end if end < first + 0.75 * (last - first) else uncut, uncut, title)
+        if end < first + _WORTH_CUTTING * length:
+            return _Window(first, end, uncut, title)
+        return _Window(first, uncut, uncut, title)
+
+    least_s = np.inf
+    if settled_s is not None:
+        least_s = step_s + _BEYOND_SETTLING * settled_s
 
     if disturbance is None or not disturbance.any():
         if settled_s is None:
             return None, [_Window(start, stop, stop, "Reference step")]
-        return None, [shown(start, stop, step_s + 1.15 * settled_s, "Reference step")]
+        return None, [shown(start, stop, least_s, "Reference step")]
 
     moving = np.flatnonzero(disturbance != disturbance[0])
     onset = float(time_s[moving[0]]) if moving.size else start
-    margin = 0.03 * (stop - start)
-    if not start + 4 * margin < onset < stop - 4 * margin:
+    before_s = _BEFORE_DISTURBANCE * (stop - start)
+    room_s = _FEWEST_MARGINS * before_s
+    if not start + room_s < onset < stop - room_s:
         return onset, [_Window(start, stop, stop, "Reference step and disturbance")]
     size = si(float(disturbance[np.argmax(np.abs(disturbance))]), style.plain(labels["command"][1], 12))
     return onset, [
-        shown(start, onset, step_s + 1.15 * (settled_s or 0.0), "Reference step"),
-        shown(onset - margin, stop, 0.0, f"Disturbance of {size} at the plant's input"),
+        shown(start, onset, least_s, "Reference step"),
+        shown(onset - before_s, stop, 0.0, f"Disturbance of {size} at the plant's input"),
     ]
 
 

@@ -14,6 +14,8 @@ from workflow.figures.description import Picture, new_picture, small_multiples
 from workflow.figures.subjects import AnyRunView
 from workflow.figures.validation import draw_free_run
 
+# Lower end of a band that reaches 0, as a share of its middle: a log axis has no 0.
+_LOWEST = 1e-2
 # Smallest frequency of the singular values, over the Nyquist frequency.
 _LOW = 1e-3
 
@@ -67,6 +69,8 @@ def draw_matrix_response(run: AnyRunView) -> Picture:
         for j, source in enumerate(joints):
             panel = grid[i, j]
             for number, point in enumerate(points):
+                # centre (F, Y, U), radius (F,), output_factor (Y, Y) and input_factor (F, U, U), at the
+                # frequencies omega_rad_s (F,).
                 shown = point.shown
                 size = np.abs(shown.centre[:, i, j])
                 # Every member of the ball deviates in this channel by at most that much.
@@ -75,15 +79,16 @@ def draw_matrix_response(run: AnyRunView) -> Picture:
                     * np.linalg.norm(shown.output_factor[i])
                     * np.linalg.norm(shown.input_factor[:, :, j], axis=1)
                 )
-                panel.fill_between(
-                    shown.omega_rad_s, np.maximum(size - off, 1e-2 * size), size + off, **style.BAND,
-                    label=None if number else "ball",
-                )  # fmt: skip
-                panel.plot(
-                    shown.omega_rad_s, size, **style.MODEL_LINE, label=None if number else "model, per point"
-                )
-            panel.set(xscale="log", yscale="log", xlim=(shown.omega_rad_s[0], shown.omega_rad_s[-1]))
-            panel.set_title(f"{source.input} to {output.output}", size=9.5)
+                omega = shown.omega_rad_s
+                is_first = number == 0
+                # A log axis has no 0.
+                low = np.maximum(size - off, _LOWEST * size)
+                panel.fill_between(omega, low, size + off, **style.BAND, label="ball" if is_first else None)
+                line_label = "model, per point" if is_first else None
+                panel.plot(omega, size, **style.MODEL_LINE, label=line_label)
+                panel.set(xlim=(omega[0], omega[-1]))
+            panel.set(xscale="log", yscale="log")
+            panel.set_title(style.plain(f"{source.input} to {output.output}", 60), size=9.5)
             unit = style.ratio_unit(
                 run.results.records.unit(output.output), run.results.records.unit(source.input)
             )
@@ -110,7 +115,7 @@ def draw_singular_values(run: AnyRunView) -> Picture:
             (sizes[:, 0], style.MODEL_LINE, "largest"), (sizes[:, -1], style.PREDICTED_LINE, "smallest")
         ):  # fmt: skip
             panel.fill_between(
-                omega, np.maximum(each - off, 1e-2 * each), each + off, **style.BAND,
+                omega, np.maximum(each - off, _LOWEST * each), each + off, **style.BAND,
                 label=None if number or label == "largest" else "over the ball",
             )  # fmt: skip
             panel.plot(omega, each, **line, label=None if number else label)

@@ -42,7 +42,7 @@ from workflow.figures.description import (
     Words,
 )
 from workflow.figures.style import decibels
-from workflow.figures.ticks import number, power_of_ten
+from workflow.figures.ticks import DECIBEL_STEPS, MOST_DECIBELS, number, power_of_ten
 
 # 1600 pixels at the width of a page: sharp on screens of high density.
 _PNG_DPI = 160
@@ -316,9 +316,10 @@ def _decibel_axis(axes: Axes) -> None:
     """A second gain axis on the right, in dB, for axes whose y is an absolute gain on a log scale."""
     factor: Any = 1 / 20
     right = axes.secondary_yaxis("right", functions=(decibels, lambda level: 10 ** (level * factor)))
-    right.set_yscale("linear")  # levels are even where gains are logarithmic
+    # Levels are even where gains are logarithmic.
+    right.set_yscale("linear")
     axis = _second(right.yaxis, "[dB]")
-    axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 4, 10]))
+    axis.set_major_locator(MaxNLocator(MOST_DECIBELS, steps=DECIBEL_STEPS))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda level, _: number(level)))
 

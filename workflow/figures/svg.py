@@ -36,7 +36,7 @@ from workflow.figures.description import (
     X,
     Y,
 )
-from workflow.figures.ticks import DECIBEL_STEPS, Ticks, linear_ticks, log_ticks, ticks_of
+from workflow.figures.ticks import DECIBEL_STEPS, MOST_DECIBELS, Ticks, linear_ticks, log_ticks, ticks_of
 
 # Units of an SVG to the inch: points, so that sizes of letters are those of print.
 POINT = 72
@@ -83,6 +83,10 @@ _UNSEEN_LOG = 0.05
 # How much more is left out on a narrow screen: lines off by a quarter of a point, a third of a pixel there. A
 # finger points no nearer, and such a picture is one more in the page: so it weighs a quarter less.
 _COARSER = 2.5
+# Numbers of an axis at most: of more, none is read faster.
+_MOST_NUMBERS = 9
+# Width of a number in Hz with the space around it [pt].
+_HERTZ_PT = 27
 # How often every second point of a line is looked at; each time leaves at least half of them. Ten leave a
 # thousandth of a straight line, and later ones find little.
 _THINNINGS = 10
@@ -401,7 +405,7 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
     along = box[2] - box[0]
     up = box[3] - box[1]
     size = panel.tick_size
-    y_ticks = ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, 9)))
+    y_ticks = ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, _MOST_NUMBERS)))
     if panel.y.named is not None:
         longest = _LONGEST_NAME * picture.width_in * POINT
         words = [_wrapped(word, size[Y], longest) for word in y_ticks.words]
@@ -423,16 +427,16 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
     )
     if panel.hertz:
         low, high = np.array(panel.x.limits()) / (2 * np.pi)
-        frame.hertz = log_ticks(float(low), float(high), int(np.clip(along / 27, 1, 9)))
+        frame.hertz = log_ticks(float(low), float(high), int(np.clip(along / _HERTZ_PT, 1, _MOST_NUMBERS)))
     if panel.decibel:
         low, high = 20 * np.log10(panel.y.limits())
-        frame.decibel = linear_ticks(float(low), float(high), 6, DECIBEL_STEPS)
+        frame.decibel = linear_ticks(float(low), float(high), MOST_DECIBELS, DECIBEL_STEPS)
     return frame
 
 
 def _fitting(axis: Axis, length: float, size: float) -> Ticks:
     """The ticks of an axis with as many numbers as fit along a length [pt] in letters of a size [pt]."""
-    count = int(np.clip(length / (3 * size), 1, 9))
+    count = int(np.clip(length / (3 * size), 1, _MOST_NUMBERS))
     while True:
         ticks = ticks_of(axis, count)
         widest = max((text_width(word, size) for word in ticks.words), default=0.0)

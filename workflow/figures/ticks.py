@@ -17,6 +17,8 @@ _STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
 _WHOLE_STEPS = (1.0, 2.0, 5.0, 10.0)
 # Steps of the decibel axis: 3 or 5 dB would not meet the 20 dB of a decade.
 DECIBEL_STEPS = (1.0, 2.0, 4.0, 10.0)
+# Numbers of a decibel axis at most, about: it stands beside another one, which has its own.
+MOST_DECIBELS = 6
 # Below a factor of 60 from end to end 1, 2, 5, 10 read better than powers of ten, of which there would be
 # one.
 _FEW = 60.0

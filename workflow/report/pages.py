@@ -35,10 +35,28 @@ def write_report(
 ) -> Path:
     """Draw every picture into `figures/`, and write `report.html`: all of them or none.
 
-    also: kinds of file beside SVG, pdf or png. is_design: the page will not stand among the run's files, and
-    names none of them. Pictures of an earlier report that this run no longer has are
-    removed. Returns the path of the page. Raises InputError when a stage the report cannot do without is
-    missing, or the disk refuses.
+    Pictures of an earlier report that this run no longer has are removed.
+
+    Parameters
+    ----------
+    results : RunResults
+    config : RunConfig or JointsConfig
+    progress : callable, optional
+        Called with the share done and the name of each picture.
+    also : iterable of str
+        Kinds of file beside SVG: pdf, png.
+    is_design : bool
+        The page will not stand among the run's files, and names none of them.
+
+    Returns
+    -------
+    Path
+        Of the page.
+
+    Raises
+    ------
+    InputError
+        A stage the report cannot do without is missing, or the disk refuses.
     """
     run = results.run
     view = RunView if isinstance(config, RunConfig) else AnyRunView
@@ -49,23 +67,27 @@ def write_report(
         title=title_of(config, run),
         first=first,
         parts=parts,
-        study=(run.path.parent.parent / "study.html").is_file(),  # of which this run is a point
+        # A point of a study lies in the study's directory, two levels below its page.
+        study=(run.path.parent.parent / "study.html").is_file(),
     )
     return _write(run, page, also)
 
 
 def _write(run: RunDirectory, page: RenderedPage, also: Iterable[str]) -> Path:
+    """Write page and pictures into a run directory; the path of the page."""
     run.figures_path.mkdir(exist_ok=True)
     files = {
         run.figures_path / f"{name}.svg": svg_file(made, page.looks) for name, made in page.pictures.items()
     }
     if also:
-        from workflow.figures.matplotlib_figure import saved  # half a second to load
+        # matplotlib takes half a second to load.
+        from workflow.figures.matplotlib_figure import saved
 
         for name, made in page.pictures.items():
             further = saved(made.picture, also)
             files |= {run.figures_path / f"{name}.{kind}": content for kind, content in further.items()}
     storage.write_together({**files, run.report_path: page.html.encode()})
+    # Only now: what an earlier page shows is there until the new one is whole.
     for stale in sorted(run.figures_path.iterdir()):
         if stale.suffix in (".svg", ".png", ".pdf") and stale not in files:
             stale.unlink()
@@ -84,6 +106,7 @@ def page_of(config: AnyConfig, also: Iterable[str] = ()) -> Stage:
     return replace(stage, run=partial(write_page, also=also)) if also else stage
 
 
+# The last stage of a run.
 REPORT = Stage(
     "report",
     tuple(stage.name for stage in STAGES),
@@ -100,17 +123,19 @@ def identify_page(
     result: LogIdentification, inputs: Mapping[str, str], progress: Callable[[float, str], None] | None = None
 ) -> str:
     """One self-contained HTML page; inputs are the files with their SHA-256. Same results, same page."""
-    options, channel = result.options, log_channel(result)
+    options = result.options
+    channel = log_channel(result)
     versions = [(name, metadata.version(name)) for name in ("flexlink", "numpy", "scipy", "nlopt")]
     records = [
         *(RunRecord(record, "estimation", None, "") for record in result.measured),
         *(RunRecord(record, "validation", None, "") for record in result.fresh_records),
     ]
-    changed = [
-        (name, value)
-        for name, field in type(options).model_fields.items()
-        if (value := getattr(options, name)) != field.default
-    ]
+    # What is as it always is says nothing about this model.
+    changed = []
+    for name, field in type(options).model_fields.items():
+        value = getattr(options, name)
+        if value != field.default:
+            changed.append((name, value))
     stated = [*changed, *versions, ("python", sys.version.split()[0])]
     page = render_page(
         "report.html.j2",

@@ -18,6 +18,9 @@ from workflow.figures.style import drawings
 from workflow.figures.svg import COMMON_STYLE, Drawn, drawn, style_of
 from workflow.text.templates import environment
 
+# Pictures that are taken to come still. Chosen: it shapes the progress bar only.
+_EXPECTED_PICTURES = 6
+
 
 @dataclass(frozen=True)
 class RenderedPage:
@@ -47,7 +50,7 @@ def render_page(
 
     def draw(name: str, caption: str, file: str, *what: Any) -> Embedded | None:
         if progress is not None:
-            progress(len(pictures) / (len(pictures) + 6), name)
+            progress(len(pictures) / (len(pictures) + _EXPECTED_PICTURES), name)
         picture = drawings()[name](*what)
         if picture is None:
             return None

@@ -76,10 +76,10 @@ def headline(study: StudyView) -> str:
         words += f", {lower} of them at a lower bandwidth than specified"
     if counts.get("does not settle"):
         words += " and settling"
-    for state, (one, several) in _NOT_GOOD.items():
+    for state, (singular, plural) in _NOT_GOOD.items():
         points = counts.get(state, 0)
         if points:
-            words += f", {points} {one if points == 1 else several}"
+            words += f", {points} {singular if points == 1 else plural}"
     return words
 
 
@@ -232,7 +232,7 @@ def _points_section(study: StudyView) -> PageSection:
         "S: predicted for the nominal loop; measured on the arm as identified, with friction.",
         tuple(is_settled(row) for row in study.in_order),
     )
-    more = (
+    files = (
         "table.csv and table.json have more numbers with every digit. Each point is a run directory: "
         "flexlink report DIR/points/NUMBER writes its page."
     )
@@ -240,7 +240,7 @@ def _points_section(study: StudyView) -> PageSection:
         "points",
         "All points",
         "Points",
-        (certificate, Fold("Closed loop over time", (over_time,)), Text(more)),
+        (certificate, Fold("Closed loop over time", (over_time,)), Text(files)),
         open=len(study.rows) <= MOST_UNFOLDED,
     )
 

@@ -158,7 +158,11 @@ class ConditionBench:
         )
 
     def payloads(self) -> list[ConditionRun]:
-        """0, 100 and 200 % of the rated payload: that of the rig and its effects, or a tenth of the link."""
+        """0, 100 and 200 % of the rated payload: that of the rig and its effects, or a tenth of the link.
+
+        A tenth is chosen: an arm without a payload is there to carry some, and this one it does not notice
+        much.
+        """
         link = self.rig.link
         tenth = 0.1 * link.density_kg_m3 * link.width_m * link.thickness_m * link.length_m
         extra = float(self.effects.get("tip_payload", {}).get("mass_kg", 0.0))
@@ -169,6 +173,7 @@ class ConditionBench:
                 f"payload {percent} %",
                 conditions.payload(1e3 * rated * percent / 100),
                 effects=without,
+                # It sets the value.
                 rig=self.rig.perturbed({"payload.mass_kg": rated * percent / 100}),
             )
             for percent in (0, 100, 200)
