@@ -62,7 +62,8 @@ _OF_SPECIFICATION = (
 )
 _OF_LOOP = ("input_name", "output_name", "reference", "time", "time_unit", "decimal", "dt_s")
 _SIMULATOR = ("mjcf", "fmu", "python", "motion", "log", "dt_s", "repair", "resample_s")
-_MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")  # of what can be continued
+# Manifests of what can be continued.
+_MANIFESTS = ("manifest.json", "study.json", "diagnose.json", "blind.json")
 
 
 class _Commands(TyperGroup):
@@ -90,7 +91,8 @@ app = typer.Typer(
     help="From a flexible-link arm and its logs to a robust controller with a certificate.",
     context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # markup would swallow every [unit], [section] and [default] in the help
+    # Markup would swallow every [unit], [section] and [default] in the help.
+    rich_markup_mode=None,
     epilog="Exit codes: 0 done; 1 internal error; 2 something given is wrong (one line says what and where); "
     "3 the result is not certified, the report says why (of certify 1); 130, 143, 129 interrupted by Ctrl-C, "
     "SIGTERM, SIGHUP. Example: flexlink run --out "
@@ -129,7 +131,8 @@ def _limit(seconds: float | None) -> float | None:
     return seconds
 
 
-TimeLimit = Annotated[  # a command has but to name it
+# A command has but to name it as a parameter.
+TimeLimit = Annotated[
     float | None,
     typer.Option(
         min=1e-3,
@@ -236,7 +239,8 @@ def run(
             f"{of_logs[0]} says how logs are read: name them, as in flexlink run LOG... {of_logs[0]}"
         )
     with _watched(quiet) as progress:
-        from workflow.commands.run import run_from_files  # a word comes first: it takes its time to load
+        # Progress says a word before it: it takes its time to load.
+        from workflow.commands.run import run_from_files
 
         summary = run_from_files(
             config,
@@ -404,7 +408,8 @@ def identify(
     """Identify one channel from log files: poles, modes, ellipses, fit, residual tests, one-page report."""
     degree = of_fields["relative_degree"]
     report_page, validation, export = (of_fields.pop(name) for name in ("report", "validation", "export"))
-    if degree and degree.isdigit():  # so that the settings' own complaint names what is allowed
+    # As a number, so that the settings' own complaint names what is allowed.
+    if degree and degree.isdigit():
         of_fields["relative_degree"] = int(degree)
     need(*log, *(validation or []))
     from ident.data.frf_records import is_response
@@ -630,7 +635,8 @@ def study(
     with _watched(quiet) as progress:
         from workflow.study.settings import load_study
 
-        file = load_study(config)  # one that is refused does not wait for what computes: seconds
+        # One that is refused does not wait for what computes: seconds.
+        file = load_study(config)
         from workflow.study.work import run_study
 
         summary = run_study(
@@ -701,7 +707,8 @@ def diagnose(
     if len(case) == 1 and not {"mjcf", "fmu", "python"} & set(case_document(case[0])[1]):
         from workflow.diagnose.case_files import load_case
 
-        load_case(case[0], rig)  # what is refused does not wait for what diagnoses to be loaded: seconds
+        # What is refused does not wait for what diagnoses to be loaded: seconds.
+        load_case(case[0], rig)
     with _watched(quiet) as progress:
         from workflow.diagnose.command import diagnose_cases
         from workflow.diagnose.simulator_settings import settings_of
@@ -756,7 +763,8 @@ def _one_of(jobs: int | None, scheduler: str | None) -> None:
 
 
 def _watched(quiet: bool) -> TerminalProgress:
-    from workflow.console import TerminalProgress  # rich takes a moment to load
+    # Rich takes a moment to load.
+    from workflow.console import TerminalProgress
 
     return TerminalProgress(quiet=quiet)
 
@@ -796,7 +804,8 @@ def _reading(given: Mapping[str, Any]) -> Reading:
 def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
     """Keys of [specification] as options state them, each within its range; None of what is not to be asked.
     Raises InputError naming the option."""
-    if not typed:  # the settings are slow to load
+    # The settings are slow to load.
+    if not typed:
         return {}
     from pydantic import create_model
 
@@ -805,7 +814,8 @@ def _specified(typed: Mapping[str, Any]) -> dict[str, Any]:
 
     keys = {name: None if value == NONE else value for name, value in typed.items()}
     order = keys.get("controller_order")
-    if isinstance(order, str) and order.isdigit():  # a number, or "auto"
+    # A number, or "auto".
+    if isinstance(order, str) and order.isdigit():
         keys["controller_order"] = int(order)
     elif order not in (None, "auto"):
         raise InputError(
@@ -890,7 +900,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         # An error is one line. Called from Python (tests!) warnings stay what the caller made of them.
         warnings.simplefilter("ignore")
     if argv is None:
-        one_thread()  # read by the libraries when they load, which is after this line
+        # Libraries read it when they load, which is after this line.
+        one_thread()
     if not arguments:
         arguments = ["--help"]
     try:
@@ -907,10 +918,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     except CommandInterruptedError as error:
         return _interrupted(arguments, error.out)
     except Exception as error:
-        if interrupts.came():  # this is what a library has made of it
+        # A library has made an error of its own of the interrupt.
+        if interrupts.came():
             return _interrupted(arguments)
         if isinstance(error, OSError) and error.filename is None:
-            with suppress(OSError):  # standard output goes nowhere, at the last flush neither
+            # Standard output goes nowhere, at the last flush neither.
+            with suppress(OSError):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if debug:
             traceback.print_exc()
@@ -972,18 +985,22 @@ def _explain(error: Exception) -> tuple[str, int]:
             f"{called}: {key} has no option: write {key} = ... in a case file (.toml) with model "
             f"and log = [...], and call {called} on that (docs/simulators.md)"
         ), EXIT_BAD_INPUT
-    if hasattr(error, "format_message"):  # typer's own: unknown option, missing argument ...
+    # Typer's own: unknown option, missing argument ...
+    if hasattr(error, "format_message"):
         return f"{error.format_message() or 'no command given'} ({_help(error)})", EXIT_BAD_INPUT
-    if isinstance(error, OSError):  # a file that none of ours asks about, a pipe or a terminal
+    # A file that none of ours asks about, a pipe or a terminal.
+    if isinstance(error, OSError):
         what = "cannot use " if error.filename else "cannot write the output: "
         return what + describe_os_error(error), EXIT_BAD_INPUT
     if isinstance(error, MemoryError):
         return f"out of memory ({error}); shorter records, delays and searches need less", EXIT_INTERNAL
-    cause = error.__cause__ if isinstance(error, typer.Abort) else error  # what typer makes of an EOFError
+    # Typer makes an Abort of an EOFError.
+    cause = error.__cause__ if isinstance(error, typer.Abort) else error
     return f"internal error: {type(cause).__name__}: {cause} (--debug shows where)", EXIT_INTERNAL
 
 
 def _complain(message: str, code: int) -> int:
-    with suppress(OSError):  # the exit code says it all the same
+    # The exit code says it all the same.
+    with suppress(OSError):
         print(f"flexlink: {one_line(message)}", file=sys.stderr)  # noqa: T201
     return code

@@ -87,7 +87,8 @@ def write_design_page(
     InputError
         A stage of the run is missing or damaged, or the page cannot be written.
     """
-    from workflow.report.pages import write_report  # loads what draws: a second
+    # Loads what draws: a second.
+    from workflow.report.pages import write_report
 
     design, certify, achievable, prefilter = designed
     changed: dict[str, Any] = {name: getattr(asked, name) for name in _OF_DESIGN_FILE}

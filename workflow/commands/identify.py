@@ -125,7 +125,8 @@ def identify_logs(
     # Files are written together at the end, so that a refusal leaves none.
     written: dict[Path, bytes] = {}
     if report is not None:
-        from workflow.report.pages import identify_page  # only a page needs what draws
+        # Only a page needs what draws.
+        from workflow.report.pages import identify_page
 
         with progress.stage("report") as update:
             inputs = {str(path): storage.sha256_of_file(path) for path in logs.files}

@@ -187,7 +187,8 @@ def _earlier(path: Path, out: Path | None, logs: Sequence[Path]) -> RunDirectory
         No run is there, or of another version; it is the new run itself; or it was made from other logs.
     """
     earlier = RunDirectory.open(path)
-    earlier.config_document()  # refused where it is damaged
+    # Refused where it is damaged.
+    earlier.config_document()
     if out is not None and out.exists() and out.resolve() == path.resolve():
         raise InputError(f"--out {out}: the run of --from, which stays as it is; choose another --out")
     if logs:

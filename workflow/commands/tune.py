@@ -176,7 +176,8 @@ class _Request(BaseHTTPRequestHandler):
         return False
 
     def _refuse(self, status: HTTPStatus, said: str) -> None:
-        self.close_connection = True  # its content may not have been read
+        # Its content may not have been read.
+        self.close_connection = True
         self._answer(status, json.dumps({"error": said}), "application/json")
 
     def _answer(self, status: HTTPStatus, text: str, kind: str, nonce: str = "") -> None:

@@ -163,7 +163,7 @@ def share_at_ends(command: Real) -> float:
     levels, level_of, counts = np.unique(command, return_inverse=True, return_counts=True)
     if levels.size == 1:
         return 1.0
-    share = float(counts[[0, -1]].sum() / command.size)
+    share = float((counts[0] + counts[-1]) / command.size)
     if share <= _LIMITED or levels.size <= _MOST_LEVELS:
         return 0.0
 
@@ -174,13 +174,16 @@ def share_at_ends(command: Real) -> float:
     at_end = np.isin(level_of[begins], [0, levels.size - 1])
 
     # A staircase holds its inner levels as long as its ends.
-    held = level_of[begins[~at_end & (lengths >= np.max(lengths[at_end]) / _LONGER)]]
+    least_held = np.max(lengths[at_end]) / _LONGER
+    is_held = ~at_end & (lengths >= least_held)
+    held = level_of[begins[is_held]]
     usual = np.median(counts[held]) if held.size else 1
-    if max(counts[[0, -1]]) <= _LONGER * usual:
+    if max(counts[0], counts[-1]) <= _LONGER * usual:
         return 0.0
 
     # A command that settles at a set point comes to it in small steps; one that is cut stops in full motion.
-    last_steps = np.abs(steps[begins[at_end & (begins > 0)] - 1])
+    came_there = at_end & (begins > 0)
+    last_steps = np.abs(steps[begins[came_there] - 1])
     if not last_steps.size or np.median(last_steps) <= _MET * np.sqrt(np.mean(steps**2)):
         return 0.0
     return min(share, _MOST_OF_A_MOVING_ONE)

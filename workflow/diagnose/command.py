@@ -253,7 +253,8 @@ def load_any_case(
     file, document = case_document(place)
     if not is_simulator(document):
         return load_case(place, rig)
-    if place.is_dir():  # a folder may come from anybody; a model can run code and read any file
+    # A folder may come from anybody; a model can run code and read any file.
+    if place.is_dir():
         raise InputError(f"{file}: names a simulator's model; name {CASE_FILE} itself to load it")
     return load_simulator_case(settings_of(document, str(file)), file.parent, str(file))
 

@@ -23,7 +23,8 @@ from workflow.engine import codec, storage
 from workflow.engine.errors import InputError
 from workflow.engine.store import Store
 
-LAYOUT_VERSION = 1  # the first; a directory of another one is not resumed
+# The first; a directory of another one is not resumed.
+LAYOUT_VERSION = 1
 MANIFEST = "diagnose.json"
 _ENDINGS = (".json", ".html", ".rig.toml", ".effects.toml", ".next.csv", ".xml")
 

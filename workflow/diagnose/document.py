@@ -12,7 +12,8 @@ from workflow.diagnose.simulator_case import SimulatorCase
 from workflow.engine import codec
 
 FORMAT = "flexlink-diagnosis-1"
-LEAST_SHOWN = 1e-4  # sets of effects less probable than this are left out, and no runner-up competes
+# Sets of effects less probable than this are left out, and no runner-up competes.
+LEAST_SHOWN = 1e-4
 
 
 def completeness_of(diagnosis: Diagnosis, remains: Where) -> dict[str, Any]:

@@ -113,7 +113,8 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
         return stated.replace(" ", "").replace("²", "2").replace("/", "_")
 
     units: dict[str, str] = {}
-    if effect.name.endswith(".sensor_offset"):  # of MuJoCo, whose other sizes have units
+    # Only MuJoCo's offsets of sensors come here: its other sizes have units.
+    if effect.name.endswith(".sensor_offset"):
         units["output"] = unit(effect.name.removesuffix(".sensor_offset"))
     elif isinstance(place, Body):
         motion = int(place.motion)

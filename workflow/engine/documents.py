@@ -27,11 +27,13 @@ _ANY_TEXT = (".txt", ".dat", ".json")
 def read_text(path: Path, most_bytes: int = MOST_BYTES) -> str:
     """UTF-8 text of a file. Raises InputError naming it."""
     with cannot("read", path), open(path, "rb", opener=at_once) as stream:
-        content = stream.read(most_bytes + 1)  # pipes have no size: one byte more than is allowed
+        # Pipes have no size: one byte more than is allowed.
+        content = stream.read(most_bytes + 1)
     if len(content) > most_bytes:
         raise InputError(f"{path}: larger than {most_bytes / 2**20:g} MiB")
     try:
-        return content.decode("utf-8-sig")  # editors on Windows like to put a mark in front
+        # Editors on Windows like to put a mark in front.
+        return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not UTF-8 text (byte {error.start})") from error
 
@@ -48,7 +50,8 @@ def read_toml(path: Path) -> tuple[str, dict[str, Any]]:
     # A log in its place is told by its ending, before its content is taken for TOML.
     ending = Path(path.name.lower().removesuffix(".gz")).suffix
     if ending not in (".toml", *_ANY_TEXT) and path.is_file():
-        from ident.data.record_files import READERS  # numpy, which a configuration can do without
+        # It loads numpy, which a configuration can do without.
+        from ident.data.record_files import READERS
 
         if ending in READERS:
             from ident.data.foreign_files import path_as_typed

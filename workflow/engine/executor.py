@@ -182,7 +182,8 @@ class ThisProcess(Executor):
     """
 
     def __init__(self) -> None:
-        super().__init__(futures.Executor(), 1)  # a pool that takes nothing
+        # A pool that takes nothing.
+        super().__init__(futures.Executor(), 1)
 
     def run(self, tasks: Sequence[Task[R]], watch: Watch | None = None) -> Iterator[tuple[int, R | Failure]]:
         """Position and result of every task, in their order. Raises KeyboardInterrupt."""
@@ -193,10 +194,10 @@ class ThisProcess(Executor):
                     watch(index, share, word)
 
             with threadpool_limits(1):
-                found = _done(task, report)
+                result = _done(task, report)
             # A compiled library may have made a result out of an interrupt.
             interrupts.check()
-            yield index, found
+            yield index, result
 
 
 def workers(
@@ -217,7 +218,8 @@ class LocalProcesses(Executor):
     def __init__(self, jobs: int, preload: Sequence[str] = ()) -> None:
         if jobs < 1:
             raise ValueError(f"jobs must be at least 1, got {jobs}")
-        super().__init__(futures.ThreadPoolExecutor(jobs), jobs)  # a thread waits for each process
+        # A thread waits for each process.
+        super().__init__(futures.ThreadPoolExecutor(jobs), jobs)
         self._context: ForkServerContext | SpawnContext
         if sys.platform.startswith("linux"):
             # Forked off a process that has loaded the libraries (seconds) and done nothing else; first
@@ -278,14 +280,16 @@ def _begin(process: BaseProcess) -> None:
                     forkserver.ensure_running()
             return process.start()
         except (EOFError, ConnectionError):
-            time.sleep(0.5)  # until the dead one is known to be dead
+            # Until the dead one is known to be dead.
+            time.sleep(0.5)
     raise StageError("no process can be begun: the one they are forked off dies each time (out of memory?)")
 
 
 @contextmanager
 def _interrupts_wait() -> Iterator[None]:
     """Interrupts come through only at the end; processes begun inside do not see them."""
-    resource_tracker.ensure_running()  # its own start would let them through
+    # It would start by itself later, and let interrupts through.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -364,7 +368,8 @@ class DaskCluster(Executor):
             with futures.ThreadPoolExecutor(1) as aside:
                 aside.submit(asyncio.run, _call(distributed, address)).result()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # differing versions of packages: the code digest is checked
+                # Differing versions of packages: the code digest is checked.
+                warnings.simplefilter("ignore")
                 self._client: Any = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         except Exception as error:  # a wrong address ends in whatever its parts are read with
             self._restore()
@@ -394,7 +399,8 @@ class DaskCluster(Executor):
         self._asked_s = self._heard_s = self._staffed_s = time.monotonic()
         for result in super().run(tasks, watch):
             yield result
-            self._heard_s = self._staffed_s = time.monotonic()  # what finishes tells of both
+            # What finishes tells of both.
+            self._heard_s = self._staffed_s = time.monotonic()
 
     def _see_that_it_lives(self) -> None:
         if time.monotonic() - self._asked_s < _ASK_S:

@@ -18,5 +18,6 @@ def _tell(kind: type[BaseException], error: BaseException, trace: TracebackType 
 
 
 sys.excepthook = _tell
-if SAFE_PATH.items() <= os.environ.items():  # what a user's simulation starts is the user's
+# What a user's simulation starts is the user's.
+if SAFE_PATH.items() <= os.environ.items():
     del os.environ["PYTHONSAFEPATH"]

@@ -70,7 +70,8 @@ def write_together(contents: Mapping[Path, bytes]) -> None:
                 os.replace(whole, places[path])
     except BaseException:
         for leftover in temporary.values():
-            with suppress(OSError):  # what went wrong first is what is said
+            # What went wrong first is what is said.
+            with suppress(OSError):
                 leftover.unlink(missing_ok=True)
         raise
     # The renaming itself is on the disk once the folder is flushed.
@@ -237,7 +238,8 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
     import fcntl
 
     for place in below:
-        if place.is_symlink():  # files of others must not be written or deleted through it
+        # Files of others must not be written or deleted through it.
+        if place.is_symlink():
             raise InputError(f"{place}: a link; a {what} keeps its files in its own directory")
     no_link = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW
     with os.fdopen(os.open(directory / "lock", no_link, 0o666), "w") as stream:

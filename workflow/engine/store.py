@@ -78,7 +78,8 @@ class Store:
             what = f"no {self.what} is there" if resume or replace else "not empty"
             raise InputError(f"{self.path}: {what} (it holds {min(strangers)!r}); choose another --out")
         if not has_manifest and not any(any((self.path / name).iterdir()) for name in held & {*self.folders}):
-            held -= {*self.folders}  # of a command that ended before it had begun
+            # Folders of a command that ended before it had begun do not count.
+            held -= {*self.folders}
         if held and not (resume or replace):
             raise InputError(
                 f"{self.path}: not empty, an earlier {self.what} is there; choose another --out, continue it "

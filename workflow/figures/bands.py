@@ -198,7 +198,8 @@ def smooth_grid(omega_rad_s: Real, locus: Callable[[Real], Complex]) -> Real:
     """
     omega = np.asarray(omega_rad_s, dtype=np.float64)
     value = locus(omega)
-    fresh = np.ones(omega.size - 1, dtype=np.bool_)  # steps that were not looked into
+    # Steps that were not looked into.
+    fresh = np.ones(omega.size - 1, dtype=np.bool_)
     for _ in range(_REFINEMENTS):
         start = np.flatnonzero(fresh)
         middle = np.sqrt(omega[start] * omega[start + 1])

@@ -257,7 +257,8 @@ def _mark_margins(gain: Panel, phase: Panel, loop: ResponseBand) -> None:
 
     The margins are those that python-control finds; one that does not exist is left out.
     """
-    import control  # here, because it brings a plotting library with it
+    # Imported here: it brings a plotting library with it.
+    import control
 
     margins = control.stability_margins((loop.gain, loop.phase_deg, loop.omega_rad_s))
     factor, degrees, _, at_phase, at_gain, _ = (float(value) for value in margins)

@@ -202,14 +202,18 @@ class Panel:
         self.title = ""
         self.title_bold = True
         self.title_size = 10.5
-        self.title_raised = 0.0  # pt, above words that stand over the panel
+        # In pt, above words that stand over the panel.
+        self.title_raised = 0.0
         self.labels = ["", ""]
         self.label_size = [9.5, 9.5]
         self.tick_size = [9.0, 9.0]
         self.grid_lines = [True, True]
-        self.equal = False  # a unit is as long in x as in y
-        self.hertz = False  # a second frequency axis above, in Hz, where x is in rad/s
-        self.decibel = False  # a second gain axis on the right, in dB, where y is an absolute gain
+        # A unit is as long in x as in y.
+        self.equal = False
+        # A second frequency axis above, in Hz, where x is in rad/s.
+        self.hertz = False
+        # A second gain axis on the right, in dB, where y is an absolute gain.
+        self.decibel = False
         self.visible = True
         self.colour_bar = False
         x.panels.append(self)

@@ -51,7 +51,8 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Picture:
         above.set(title=f"{style.plain(worst.name, 30)}: {words}", ylabel=f"{words} [{unit}]")
         below.set(xlabel="time [s]", ylabel=f"residual [{unit}]")
         above.x.margin = 0.01
-        if runs:  # a free run may fall over, far away from what was measured
+        # A free run may fall over, far away from what was measured.
+        if runs:
             far = np.ptp(measured)
             for panel, low, high in ((above, np.min(measured), np.max(measured)), (below, 0.0, 0.0)):
                 bottom, top = panel.y.limits()
@@ -129,7 +130,8 @@ def draw_residual_spectra(found: Diagnosis) -> Picture:
 
 def _spectrum(signals: Sequence[Real], dt_s: float) -> tuple[Real, Real]:
     """Welch's estimate over all records, relative to white noise of unit variance."""
-    from scipy.signal import welch  # half a second to load, which only this picture needs
+    # Half a second to load, which only this picture needs.
+    from scipy.signal import welch
 
     length = min(_SEGMENT, *(s.size for s in signals))
     total = np.zeros(length // 2 + 1)

@@ -183,7 +183,8 @@ def draw_mode_shapes(run: AnyRunView) -> Picture | None:
     """Which joint moves how much in each mode of the first operating point."""
     point = run.results.identify.points[0]
     shaped = [(omega, zeta, moved) for omega, zeta, moved in point.modes if moved is not None]
-    if not shaped or len(run.config.joints) == 1:  # which moves as it moves
+    # A single joint moves as its shape does.
+    if not shaped or len(run.config.joints) == 1:
         return None
     picture, panels = small_multiples(len(shaped), min(len(shaped), 3), 2.1, 0.6, sharey=True)
     for panel, (omega, zeta, moved) in zip(panels, shaped, strict=True):

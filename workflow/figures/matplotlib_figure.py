@@ -53,7 +53,8 @@ _SAMPLE_IN = 0.75
 
 # Settings of matplotlib that make its figures look like those of a page.
 _RC: Any = {
-    "font.family": ["DejaVu Sans"],  # ships with matplotlib: the same picture on every machine
+    # Ships with matplotlib: the same picture on every machine.
+    "font.family": ["DejaVu Sans"],
     "font.size": 9.5,
     "axes.titlesize": 10.5,
     "axes.titleweight": "bold",
@@ -74,14 +75,17 @@ _RC: Any = {
     "xtick.color": "#333333",
     "ytick.color": "#333333",
     "path.simplify": True,
-    "path.simplify_threshold": 0.05,  # values are read off these lines
-    "svg.fonttype": "none",  # text stays text: it is found, copied and read aloud
+    # Values are read off these lines.
+    "path.simplify_threshold": 0.05,
+    # Text stays text: it is found, copied and read aloud.
+    "svg.fonttype": "none",
     "svg.hashsalt": "flexlink",
     "figure.facecolor": "white",
     "savefig.facecolor": "white",
     "axes.unicode_minus": True,
     "axes.formatter.use_mathtext": False,
-    "text.parse_math": False,  # a dollar sign in a column name is a dollar sign
+    # A dollar sign in a column name is a dollar sign.
+    "text.parse_math": False,
     "axes.formatter.limits": (-4, 4),
     "figure.constrained_layout.h_pad": 0.06,
     "figure.constrained_layout.w_pad": 0.06,
@@ -170,7 +174,8 @@ def saved(picture: Picture, kinds: Iterable[str]) -> dict[str, bytes]:
             dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
             figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
             files[kind] = buffer.getvalue()
-    interrupts.check()  # compiled parts of matplotlib make anything of one
+    # Compiled parts of matplotlib make anything of one.
+    interrupts.check()
     return files
 
 
@@ -199,7 +204,8 @@ def _draw_panel(picture: Picture, panel: Panel, axes: Axes) -> None:
             getattr(axes, f"set_{name}scale")("linear" if axis.kind == "lin" else "log")
         else:
             getattr(axes, f"set_{name}scale")("symlog", linthresh=axis.kind)
-        getattr(axes, f"set_{name}lim")(*axis.limits())  # which ends any scaling by what is drawn
+        # Stated limits end any scaling by what is drawn.
+        getattr(axes, f"set_{name}lim")(*axis.limits())
     for mark in panel.marks:
         _draw_mark(mark, axes)
     for which, axis in enumerate((panel.x, panel.y)):

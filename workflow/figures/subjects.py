@@ -349,7 +349,8 @@ class RunView(AnyRunView):
     def forms(law: Law) -> dict[str, Any]:
         """Zeros, poles and gain in z of a law with one input and output, its numerator and denominator with
         the highest power first, and its second-order sections, as lists of scipy.signal."""
-        from scipy import signal  # here: it takes its time to load
+        # Imported here: it takes its time to load.
+        from scipy import signal
 
         system = law.to_control()
         here = np.exp(1j)

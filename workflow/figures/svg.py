@@ -880,7 +880,8 @@ def _read(picture: Picture, frame: _Frame, shared: list[int]) -> dict[str, Any]:
     panel = frame.panel
     return {
         "box": [round(float(value), 2) for value in frame.box],
-        "near": panel.equal,  # a plane: values belong to points, not to an x
+        # A plane: values belong to points, not to an x.
+        "near": panel.equal,
         "x": _scale(panel.x),
         "y": _scale(panel.y),
         "second": False,

@@ -124,7 +124,8 @@ class StudyDirectory(Store):
                 entry.unlink()
         for point in points:
             link = self.points_path / str(point.number)
-            if (self.points_path / point.name).is_dir() and not link.exists():  # a copied study has folders
+            # A copied study has folders.
+            if (self.points_path / point.name).is_dir() and not link.exists():
                 link.symlink_to(point.name, target_is_directory=True)
 
     def plant_files(self, point: Point) -> dict[str, bytes]:

@@ -46,7 +46,9 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         state = "keeps moving"
 
     if isinstance(config, JointsConfig):
-        if state == "keeps moving":  # which is not told from resting beside the reference
+        # Several joints have no check of tracking: a run at rest beside the reference looks like one that
+        # moves.
+        if state == "keeps moving":
             state = "does not settle"
         why = summarise(results, config).verdict
         return PointRow(point.number, point.name, point.values, state, why, numbers)

@@ -228,7 +228,8 @@ class PointMaker:
         """The base itself, whose plant the others begin with; it is no point of the study."""
         self._made -= 1
         point = self.make({})
-        assert isinstance(point, Point)  # the base was checked when it was loaded
+        # The base was checked when it was loaded.
+        assert isinstance(point, Point)
         return point
 
     def _name(self, values: Mapping[str, Any], digest: str) -> str:

@@ -264,7 +264,8 @@ def with_values(
                     raise ValueError(f"{key}: {where} is no list")
                 if part >= len(here):
                     raise ValueError(f"{key}: {where} has {len(here)} entries, counted from 0")
-                default = None  # of a list that is stated, or was copied whole
+                # A list that is stated, or was copied whole, has no default.
+                default = None
                 where = f"{where}[{part}]"
             else:
                 if not isinstance(here, dict):

@@ -191,7 +191,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
 
 
 def _simulated(stage: StageInput) -> SimulatedSource:
-    assert isinstance(stage.config.source, SimulatedSource)  # or the configuration had been refused
+    # Any other source was refused with the configuration.
+    assert isinstance(stage.config.source, SimulatedSource)
     return stage.config.source
 
 

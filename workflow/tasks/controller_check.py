@@ -39,13 +39,27 @@ if TYPE_CHECKING:
 
 Real = npt.NDArray[np.float64]
 
-_BANDWIDTH_SHARE = 0.1  # of the first flexible mode
-_MODULUS_MARGIN = 0.5  # the usual one: gain margin 2, phase margin 29 degrees
-_ORDER = 2  # a loop far below the first mode needs a lead and no more
-_STARTS = 2  # the second shows whether the first is an optimum
-_ENOUGH = 0.9  # gamma at which the search for a controller ends
-_SHORTEST, _LONGEST = 400, 3000
-_SEED = 2006  # any; the same for both controllers
+# Bandwidth asked for, as a share of the first flexible mode: far below it any arm has a controller.
+_BANDWIDTH_SHARE = 0.1
+# The usual one: gain margin 2, phase margin 29 degrees.
+_MODULUS_MARGIN = 0.5
+# A loop far below the first mode needs a lead and no more.
+_ORDER = 2
+# The second shows whether the first is an optimum.
+_STARTS = 2
+# Gamma at which the search for a controller ends.
+_ENOUGH = 0.9
+# Samples of a trial at least: its step, its push and the rest after both are seen.
+_SHORTEST = 400
+# Samples of a trial at most: a loop that settles later than this is slow enough as it is.
+_LONGEST = 3000
+# Size of the push in the middle of a trial, as a share of the records' RMS voltage. Chosen: it is seen beside
+# the step and saturates nothing.
+_PUSH = 0.2
+# Parts of a trial of which one is the push, and the last one of each half decides whether the loop settles.
+_PARTS = 20
+# Any; the same for both controllers.
+_SEED = 2006
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,16 +118,17 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     Raises NoControllerError where a plant allows no controller of this kind.
     """
     machines = sampled_linear_machine(case.rig, ()), sampled_linear_machine(rig, effects)
-    plants = [_plant(*named) for named in zip(("nominal parameters", "repaired"), machines, strict=True)]
+    names = ("nominal parameters", "repaired")
+    plants = [_plant(name, machine) for name, machine in zip(names, machines, strict=True)]
     specification = _specification(case, plants[0])
     designs = [_designed(plant, specification) for plant in plants]
     certificates = [certify(k, [p], specification) for k, p in zip(designs, plants, strict=True)]
     trial = ControllerTrial.of(case, designs[0], plants[0])
     arm = _WatchedArm(rig, effects)
     runs = []
-    for controller, plant, both, certificate in zip(designs, plants, machines, certificates, strict=True):
+    for controller, plant, machine, certificate in zip(designs, plants, machines, certificates, strict=True):
         margin = certificate.plants[0].nominal_margins.modulus
-        runs.append(trial.run(controller, LinearMachine(both), plant.name, "its own model", margin))
+        runs.append(trial.run(controller, LinearMachine(machine), plant.name, "its own model", margin))
         # On the arm: one over the largest |S| measured there.
         input_rms = rms_of([e.voltage_V for e in case.estimation])
         plan = plan_sensitivity(controller, plant, input_rms, trial.time_s.size // 2)
@@ -129,7 +144,8 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
 
 def _plant(name: str, both: control.StateSpace) -> UncertainPlant:
     """The hub channel of a linear machine with both outputs, for the design."""
-    import control  # here, because it brings a plotting library with it
+    # Imported here: it brings a plotting library with it.
+    import control
 
     hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
     try:
@@ -165,12 +181,12 @@ def _step(case: Case) -> float:
 def _designed(plant: UncertainPlant, specification: Specification) -> Controller:
     options = SynthesisOptions(starts=_STARTS, sufficient_gamma=_ENOUGH)
     try:
-        found = synthesise([plant], specification, options, rng=np.random.default_rng(_SEED))
+        synthesis = synthesise([plant], specification, options, rng=np.random.default_rng(_SEED))
     except SpecificationError as error:
         raise NoControllerError(str(error)) from error
-    if found.outcome is Outcome.NOT_CONVERGED:
+    if synthesis.outcome is Outcome.NOT_CONVERGED:
         raise NoControllerError(f"{plant.name}: no start led to a stable loop")
-    return found.controller
+    return synthesis.controller
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,7 +208,7 @@ class ControllerTrial:
         return cls(
             time_s=np.asarray(k * dt, dtype=np.float64),
             reference_rad=np.where(k >= round(LEAD_IN * k.size), _step(case), 0.0),
-            disturbance_V=np.where((k >= half) & (k < half + k.size // 20), 0.2 * voltage, 0.0),
+            disturbance_V=np.where((k >= half) & (k < half + k.size // _PARTS), _PUSH * voltage, 0.0),
             arm_m=case.rig.hub.radius_m + case.rig.link.length_m,
         )
 
@@ -208,20 +224,31 @@ class ControllerTrial:
     def run(
         self, controller: Controller, machine: SampledMachine, design: str, on: str, margin: float
     ) -> Run:
-        """machine: its last output is the tip position."""
-        found = simulate(controller, machine, self.reference_rad, input_disturbance=self.disturbance_V)
-        tip, n = found.output[:, -1], self.time_s.size
+        """What a controller does in this trial.
+
+        Args:
+            controller: The law.
+            machine: Its last output is the tip position.
+            design: What the controller was designed on, in words.
+            on: What it runs on, in words.
+            margin: Modulus margin of the loop.
+        """
+        loop = simulate(controller, machine, self.reference_rad, input_disturbance=self.disturbance_V)
+        tip = loop.output[:, -1]
+        n = self.time_s.size
         error = (self.reference_m - tip) / (self.arm_m * self.step_rad)
-        ends = [found.measured[stop - n // 20 : stop] for stop in (n // 2, n)]
+        # Before the push and at the end nothing may move any more.
+        ends = [loop.measured[stop - n // _PARTS : stop] for stop in (n // 2, n)]
+        settles = all(np.ptp(end) <= SETTLED * self.step_rad for end in ends)
         return Run(
             design=design,
             machine=on,
             cost_s=float(np.sum(error**2)) * controller.dt_s,
             modulus_margin=margin,
-            peak_command_V=float(np.max(np.abs(found.command))),
-            settles=bool(all(np.ptp(end) <= SETTLED * self.step_rad for end in ends)),
+            peak_command_V=float(np.max(np.abs(loop.command))),
+            settles=bool(settles),
             tip_m=tip,
-            command_V=found.command,
+            command_V=loop.command,
         )
 
 
@@ -258,7 +285,9 @@ def _with_lag(a: Real, b: Real, c: Real, lag_s: float) -> tuple[Real, Real, Real
     """The acting voltage as a further state."""
     n = a.shape[0]
     wide = np.zeros((n + 1, n + 1))
-    wide[:n, :n], wide[:n, n:], wide[n, n] = a, b, -1 / lag_s
+    wide[:n, :n] = a
+    wide[:n, n:] = b
+    wide[n, n] = -1 / lag_s
     column = np.zeros((n + 1, 1))
     column[n] = 1 / lag_s
     return wide, column, np.hstack([c, np.zeros((c.shape[0], 1))])
@@ -266,30 +295,38 @@ def _with_lag(a: Real, b: Real, c: Real, lag_s: float) -> tuple[Real, Real, Real
 
 def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> control.StateSpace:
     """Exact under a held input that arrives late: past samples of the voltage become states."""
+    # A delay of whole samples may come out of the division a rounding error below.
     whole = int(path.delay_s / dt_s * (1 + 1e-12))
     late = max(path.delay_s - whole * dt_s, 0.0)
     n = a.shape[0]
     first, early = _held(a, b, late)
     second, now = _held(a, b, dt_s - late)
-    past = whole + int(late > 0)
+    past = whole
+    if late > 0:
+        past += 1
     # columns[:, k]: effect of the voltage commanded k samples ago.
     columns = np.zeros((n, past + 1))
     columns[:, whole] += now[:, 0]
     if late > 0:
         columns[:, whole + 1] += (second @ early)[:, 0]
-    A, B = np.zeros((n + past, n + past)), np.zeros((n + past, 1))
-    A[:n, :n], A[:n, n:], B[:n] = second @ first, columns[:, 1:], columns[:, :1]
+    A = np.zeros((n + past, n + past))
+    B = np.zeros((n + past, 1))
+    A[:n, :n] = second @ first
+    A[:n, n:] = columns[:, 1:]
+    B[:n] = columns[:, :1]
     if past:
         B[n] = 1.0
         A[n + 1 :, n:-1] = np.eye(past - 1)
-    import control  # here, because it brings a plotting library with it
+    # Imported here: it brings a plotting library with it.
+    import control
 
     return control.ss(A, B, np.hstack([c, np.zeros((c.shape[0], past))]), np.zeros((c.shape[0], 1)), dt_s)
 
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
     """e^(a t) and the integral of e^(a s) b over (0, t)."""
-    from scipy.signal import cont2discrete  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    from scipy.signal import cont2discrete
 
     step, held, *_ = cont2discrete((a, b, np.zeros((1, len(a))), np.zeros((1, b.shape[1]))), time_s, "zoh")
     return step, held

@@ -280,7 +280,8 @@ def undrawable(plants: Sequence[UncertainPlant]) -> str | None:
 
 def joint_numbers(found: SampledResponses) -> dict[str, Any]:
     """Numbers for JSON and tables; shares with Wilson intervals at 95 %."""
-    from scipy.stats import binomtest  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    from scipy.stats import binomtest
 
     joint = found.joint
     if joint is None:
@@ -396,7 +397,8 @@ def model_answer(
     model: RationalWeight, reference: npt.NDArray[np.float64], dt_s: float
 ) -> npt.NDArray[np.float64]:
     """Answer (T,) of the reference model, by Tustin's map as the design sees it, to a reference (T,)."""
-    import scipy.signal  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    import scipy.signal
 
     discrete = scipy.signal.bilinear(model.numerator, model.denominator, 1.0 / dt_s)
     return np.asarray(scipy.signal.lfilter(*discrete, reference), dtype=np.float64)

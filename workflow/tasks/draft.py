@@ -253,7 +253,8 @@ def informed(draft: Draft, channel: IdentifiedChannel, uncertain: UncertainChann
 
 def _moved(records: Sequence[Record], look: FirstLook) -> float:
     """Rms of the output in the band that the logs tell: an integrating machine in open loop walks away."""
-    from scipy.signal import butter, sosfiltfilt  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    from scipy.signal import butter, sosfiltfilt
 
     signals = [record.output[:, 0] for record in records]
     if look.told_rad_s is None:

@@ -201,7 +201,8 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
     With the command clipped there the rigid motion explains most of what it left unexplained before. None
     where no limit does that, or there is no rigid motion.
     """
-    from scipy.optimize import minimize_scalar  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    from scipy.optimize import minimize_scalar
 
     motion = look.motion
     told_rad_s = look.told_rad_s
@@ -342,7 +343,8 @@ def rigid_motion(
     -----
     Neglected: noise in the output's derivatives.
     """
-    from scipy.signal import butter, sosfiltfilt  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    from scipy.signal import butter, sosfiltfilt
 
     dt_s = records[0].dt_s
     low, high = (

@@ -237,7 +237,8 @@ class FrictionLoop:
 
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller
-        import control  # here, because it brings a plotting library with it
+        # Imported here: it brings a plotting library with it.
+        import control
 
         answer = control.step_response(law.to_control(), np.arange(samples) * law.dt_s).outputs
         size = self.friction.breakaway / float(np.max(np.abs(answer)))
@@ -485,7 +486,8 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
     None where the logs do not tell it: a law that does not repeat the recorded command is not the one that
     ran, nor is one that ran at another step than the arm is stepped.
     """
-    import scipy.signal  # here: it takes its time to load
+    # Imported here: it takes its time to load.
+    import scipy.signal
 
     timing = stage.results.records.timing
     law = None if timing is None else timing.law

@@ -421,7 +421,8 @@ def with_stated_controller(
         numerator = list(loop.controller.numerator)
         denominator = list(loop.controller.denominator)
     else:
-        from workflow.tasks.system_files import read_controller  # what reads systems is slow to load
+        # What reads systems is slow to load.
+        from workflow.tasks.system_files import read_controller
 
         assert loop.controller_file is not None
         numerator, denominator = read_controller(loop.controller_file, measured[0].dt_s)

@@ -274,7 +274,8 @@ def _time(
         steps = np.diff(stamps)
         period = float(np.median(steps))
         output = None
-        with suppress(ValueError):  # cells that hold no number are said of their own column
+        # Cells that hold no number are said of their own column.
+        with suppress(ValueError):
             output = table.columns([name, moved], rows_of)[moved] if moved else None
         if output is not None:
             refuse_step(str(table.path), period, output[:, None], column)

@@ -408,5 +408,6 @@ def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:
         # Nothing of value is there yet, and a half-filled directory would refuse the corrected attempt.
         run.discard()
         return
-    with suppress(InputError):  # what went wrong first is what is said
+    # What went wrong first is what is said.
+    with suppress(InputError):
         run.record_status(f"failed: {one_line(error) or type(error).__name__}")

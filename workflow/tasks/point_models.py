@@ -80,7 +80,8 @@ class PointModel:
 
         gain_error: share by which the gain of each input may be off, 0 for none.
         """
-        import control  # here, because it brings a plotting library with it
+        # Imported here: it brings a plotting library with it.
+        import control
 
         Li = control.ss(
             self.Li_a, self.Li_b, self.Li_c, self.Li_d, self.model.dt_s, remove_useless_states=False

@@ -41,7 +41,8 @@ def realise(posterior: ResponsePosterior, coefficients: RealArray) -> control.St
     if not posterior.unstable.order:
         return stable
     drawn = inverse_all_pass(posterior.unstable.moved(coefficients[n + direct + taps :]))
-    import control  # here, because it brings a plotting library with it
+    # Imported here: it brings a plotting library with it.
+    import control
 
     return control.ss(*drawn, stable.dt, remove_useless_states=False) * stable
 
@@ -85,7 +86,8 @@ def simulate_plant(
                 "a plant with a direct term needs at least one sample of computational delay in the loop"
             )
         controller = replace(controller, computational_delay_samples=delay - 1)
-        import control  # here, because it brings a plotting library with it
+        # Imported here: it brings a plotting library with it.
+        import control
 
         plant = plant * control.ss([[0.0]], [[1.0]], [[1.0]], [[0.0]], plant.dt)
         if input_disturbance is not None:

@@ -131,7 +131,8 @@ def simulated_records(
         key = "points"
         make = partial(simulate_point, config, source)
     else:
-        assert isinstance(source, SimulatedSource)  # or nobody would have asked
+        # Nobody asks for any other source.
+        assert isinstance(source, SimulatedSource)
         make = partial(simulate_record, source, seed=config.run.seed)
     for index, entry in enumerate(entries):
         progress(index / len(entries), entry.name)
@@ -223,7 +224,8 @@ def loop_of_arm(
 ) -> dict[str, Any]:
     """Keywords of `simulate` and `measure_sensitivity` for the simulated arm of a run: the machine with
     further effects, which output is measured, and the steps of the converters."""
-    assert isinstance(config.source, SimulatedSource)  # or the configuration had been refused
+    # Any other source was refused with the configuration.
+    assert isinstance(config.source, SimulatedSource)
     return {
         "machine": encoded_arm(config.source, effects, rng, rig=rig),
         "clip": FINITE,

@@ -137,7 +137,8 @@ STAGES: tuple[Stage, ...] = (
             "specification": True,
             "synthesis": True,
             "certificate": {"calibrate"},
-            "closed_loop": {"reference_step", "measurement_step"},  # of the step that is to settle
+            # The step that is to settle has this length.
+            "closed_loop": {"reference_step", "measurement_step"},
             **_PURPOSES,
             **_JOINTS,
         },
@@ -145,7 +146,8 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         "achievable_performance",
-        (*_PLANT, "design"),  # which chooses the bandwidth
+        # The design chooses the bandwidth.
+        (*_PLANT, "design"),
         find_achievable,
         2.5,
         uses={"specification": True, "achievable_performance": True, **_PURPOSES},

@@ -81,7 +81,8 @@ def setting_in_uncertainty(key: str, value: object = None) -> str:
     return f"{setting} in [channels.uncertainty]" if setting.startswith(key) else setting
 
 
-@pass_context  # or Jinja would compile what one speaker says into the template
+# Without it Jinja would compile what one speaker says into the template.
+@pass_context
 def option(_: Any, key: str, value: object = None) -> str:
     """`setting_name` for templates."""
     return setting_name(key, value)

@@ -95,7 +95,8 @@ class CompiledTemplates(BytecodeCache):
         code = marshal.dumps(bucket.code)
         with contextlib.suppress(OSError):
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(self._digest(bucket, code) + code)  # half of it would not count
+            # Half of it would not count.
+            path.write_bytes(self._digest(bucket, code) + code)
 
     def _digest(self, bucket: Bucket, code: bytes) -> bytes:
         return hashlib.sha256(f"{self._made_by} {bucket.checksum}".encode() + code).digest()
