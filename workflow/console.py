@@ -110,8 +110,10 @@ class TerminalProgress(progress.Progress):
         total_s = sum(self._expected.values())
         if not total_s or self._worked_s < _LEAST_SHARE * total_s:
             return ""
+        # Speed so far: as much work as expected is taken for granted at first, so that it does not jump.
         spent_s = self._reported_s - self._began_s - self._compiled_s
         left_s = (total_s - self._worked_s) * ((spent_s + _PRIOR_S) / (self._worked_s + _PRIOR_S))
+        # Kernels are compiled once: what is left of that counts until it is over.
         if self._compiled_s:
             left_s += max(COMPILING_S - self._compiled_s, 0.0)
         left_s -= time.monotonic() - self._reported_s
@@ -148,8 +150,10 @@ class TerminalProgress(progress.Progress):
         self._watch_compiler()
 
     def _worked(self, worked_s: float) -> None:
+        """Note how much of the expected work is done [s]; a report of no progress is none."""
         if worked_s != self._worked_s:
-            self._worked_s, self._reported_s = worked_s, time.monotonic()
+            self._worked_s = worked_s
+            self._reported_s = time.monotonic()
 
     def note(self, line: str) -> None:
         self._say(line)

@@ -98,6 +98,7 @@ def completed(function: Callable[..., Any]) -> Callable[..., Any]:
     def called(**given: Any) -> Any:
         return function(**given)
 
+    # Typer reads signature and annotations of what it is given, and `function` knows nothing of the fields.
     called.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [each.replace(kind=each.KEYWORD_ONLY) for each in parameters]
     )
@@ -151,12 +152,14 @@ def _kind(annotation: Any) -> Any:
     """What the command line takes for a field; settings check the rest."""
     if _is_mapping(annotation):
         return list[str]
+    # Numbers with a range are Annotated, each in its own way: the type beneath counts.
     kinds = [
         getattr(kind, "__origin__", kind) if hasattr(kind, "__metadata__") else kind
         for kind in (annotation, *get_args(annotation))
     ]
     pairs = [kind for kind in kinds if get_origin(kind) is tuple]
     if pairs:
+        # (float, ...) is an option that may be repeated, (float, float) one that takes two numbers.
         return list[get_args(pairs[0])[0]] if Ellipsis in get_args(pairs[0]) else pairs[0]  # type: ignore[misc]
     # A field that takes a number or a word is typed as text, and its settings tell which it is.
     plain = [kind for kind in kinds if kind in (bool, int, float, Path)]

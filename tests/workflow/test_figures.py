@@ -20,7 +20,7 @@ from ident.data.record import Record
 from ident.uncertainty import FrequencyUncertainty
 from plant import paper_link
 from tests.workflow import report_examples as example
-from workflow.describe.run import summarise
+from workflow.describe.run_page import page_of_run
 from workflow.figures import style
 from workflow.figures.bands import (
     degrees_near,
@@ -62,9 +62,8 @@ def pictures(name: str = "hub", unit: str = "V") -> Mapping[str, Figure]:
     with tempfile.TemporaryDirectory() as folder:
         run = RunResults(example.build_run(Path(folder) / "run", settings))
         view = RunView(settings, run, run.run.manifest())
-        page = rendering.render_page(
-            "report.html.j2", title="", run=view, study=False, certified=summarise(run, settings).certified
-        )
+        first, parts = page_of_run(view)
+        page = rendering.render_page("report.html.j2", title="", first=first, parts=parts, study=False)
     asked = settings.specification
     curves = sensitivity_curves(example.plant(), example.controller(), asked, OMEGA, input_unit=unit)
     drawn = {stem: made.picture for stem, made in page.pictures.items() if "-2-" not in stem}

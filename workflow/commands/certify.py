@@ -37,6 +37,8 @@ _TOLERANCES = {
     "bandwidth_rad_s": 0.02,
     "least_mode_damping": 0.02,
 }
+# Of the random starts where no run states one. Any number: it is fixed so that results repeat.
+_SEED = 2006
 # Head of a baseline that is written for the first time.
 _HEADER = """\
 # Worst cases and margins over the uncertainty set, by plant. No certificate may be worse by more than its
@@ -208,7 +210,7 @@ def certify_controller(
             plants,
             specification,
             asked.certificate,
-            stage_rng(2006 if config is None else config.run.seed, "certify"),
+            stage_rng(_SEED if config is None else config.run.seed, "certify"),
             between_own_points=asked.plant.between_points,
         )
     assert done.certificate is not None

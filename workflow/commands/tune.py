@@ -71,6 +71,10 @@ class TuneServer(ThreadingHTTPServer):
             sys.stderr.write(f"flexlink tune: {type(error).__name__}: {one_line(error)}\n")
 
     def page(self, nonce: str) -> str:
+        """The page as HTML.
+
+        nonce: of its scripts, as the policy in the head of the answer has it: no other script runs.
+        """
         session = self.session
         settings = _of_script(session.settings())
         unit = session.output_unit

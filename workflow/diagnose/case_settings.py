@@ -16,7 +16,10 @@ from workflow.config.settings import Section, check, repeated
 from workflow.engine.documents import read_toml
 from workflow.engine.errors import InputError
 
-CASE_FILE, RIG_FILE = "case.toml", "rig.toml"
+# The case file in a case folder.
+CASE_FILE = "case.toml"
+# The rig file beside it, unless the case file names another one.
+RIG_FILE = "rig.toml"
 
 
 class Column(Section):
@@ -44,11 +47,13 @@ class Column(Section):
 
 
 def _moves(column: Column) -> Column:
+    """A column that says something of its quantity; a scale of 0 makes it a constant."""
     if column.scale == 0:
         raise ValueError("scale must not be 0")
     return column
 
 
+# A column with scale and offset, or its name alone.
 ColumnChoice = Annotated[
     Column, BeforeValidator(lambda v: {"column": v} if isinstance(v, str) else v), AfterValidator(_moves)
 ]
@@ -93,11 +98,13 @@ def _known_effect(name: str) -> str:
 
 
 def _hub_first(names: tuple[Output, ...]) -> tuple[Output, ...]:
+    """Outputs in the order in which a rig has them, the hub angle first."""
     if "hub_angle_rad" not in names or repeated(names) is not None:
         raise ValueError(f"expected hub_angle_rad and others, each once; got {', '.join(names) or 'none'}")
     return tuple(name for name in get_args(Output) if name in names)
 
 
+# It becomes the name of files: no path, and nothing that a shell reads otherwise.
 CaseName = Annotated[
     Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=80)] | None,
     Field(description="names the output files; letters, digits, '_', '-' and '.'"),

@@ -57,6 +57,7 @@ class DiagnosisRun:
     @property
     def exit_code(self) -> int:
         """Internal error over bad input over a fit that did not converge over success."""
+        # The worst one counts: whoever runs many cases looks at the code first.
         if any(not failure.bad_input for _, failure in self.failures):
             return EXIT_INTERNAL
         if self.failures:
@@ -136,7 +137,9 @@ def diagnose_cases(
             directory.discard_if_empty()
             failure = failures[0][1]
             raise (InputError if failure.bad_input else StageError)(failure.reason)
+        # Read from the files, in which a resumed run has those of earlier ones as well.
         documents = Answers(directory, [machine.name for machine in machines])
+        # One case is its own overview.
         page = out / f"{work[0].name}.html"
         if len(places) > 1:
             page = out / "index.html"

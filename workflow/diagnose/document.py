@@ -60,6 +60,7 @@ def document_of(
     by_probability = sorted(diagnosis.sets.items(), key=lambda item: -item[1])
     sets = [{"effects": names, "probability": p} for names, p in by_probability if p >= LEAST_SHOWN]
 
+    # Keys stand in the order of their importance, for whoever opens the file.
     document = {
         "format": FORMAT,
         "case": loaded.case.name,

@@ -78,9 +78,12 @@ def following(diagnosis: Diagnosis) -> Following:
     A proposed experiment is as long as the longest record, within the largest voltage, angle and deflection
     of all of them.
     """
+    # Without a fit nothing is known that an experiment could decide.
     if diagnosis.detail_verdict == "not_converged" or diagnosis.nothing_tried:
         return Following("time")
 
+    # Where an effect that others imitate is still possible, the cause may have one of their names: they are
+    # separated like any named answers.
     imitated = {kind.look_alike_of for kind in LOOK_ALIKES.values()}
     if diagnosis.verdict == "unknown" and not imitated & set(diagnosis.ambiguous_with):
         if diagnosis.unlisted:

@@ -61,6 +61,7 @@ def files_of(
             beside, files = _of_simulator(loaded, diagnosis, out)
     else:
         beside, files = _of_rig(loaded, diagnosis, made_from["options"]["controller"], report)
+    # Hashes of the other files: a case counts as done where all of them are as they were written.
     document = document_of(loaded, diagnosis, beside)
     document["made_from"] = made_from
     document["files"] = {name: storage.sha256_of_bytes(content) for name, content in files.items()}

@@ -55,7 +55,11 @@ class SimulatorCase:
 
 
 def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) -> SimulatorCase:
-    """Model and logs relative to `folder`. Raises InputError: one line naming the file and what is wrong."""
+    """A case of a simulator's model and logs, which are relative to `folder`.
+
+    Raises InputError: one line naming the file (or `source`, which says where the settings come from) and
+    what is wrong.
+    """
     model = folder / settings.model
     if not model.is_file():
         raise InputError(f"{source}: no such model file: {model}")
@@ -87,6 +91,7 @@ def load_simulator_case(settings: SimulatorSettings, folder: Path, source: str) 
         plant = replace(plant, tolerances={**plant.tolerances, **settings.tolerances})
         plant = _chosen(plant, settings)
         case = PlantCase(name, plant, experiments)
+    # Equal settings and files, equal hash: a resumed diagnosis is held to it.
     hashes = [storage.sha256_of_file(path) for path in (model, *paths)]
     return SimulatorCase(
         case,
@@ -109,9 +114,11 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
     outputs = plant.output_names
 
     def unit(name: str) -> str:
+        # As the end of a name: "kg m²/s" is written kgm2_s.
         stated = unit_of(name) or plant.units.get(name, "")
         return stated.replace(" ", "").replace("²", "2").replace("/", "_")
 
+    # The kind of each size (force, position, reading) -> the unit that the model gives it.
     units: dict[str, str] = {}
     # Only MuJoCo's offsets of sensors come here: its other sizes have units.
     if effect.name.endswith(".sensor_offset"):
@@ -120,6 +127,7 @@ def _with_units(effect: PlantEffect, plant: Plant, inputs: Sequence[str]) -> dic
         motion = int(place.motion)
         # A motion that nobody measures has no name.
         moved = unit(outputs[motion]) if motion < len(outputs) else ""
+        # A body's place has the unit of its speed without the seconds.
         position = moved.removesuffix("_s") if place.motion_is == "speed" else moved
         units["force"] = unit(inputs[place.force or 0])
         units["position"] = position
@@ -188,6 +196,7 @@ def _chosen(plant: Plant, settings: SimulatorSettings) -> Plant:
                 f"{listing(list(effects))}"
             )
         size, *further = effects[name].parameters
+        # Between the bounds: an end of the range is no place to start from.
         starts = tuple(geometric(low, high, _STARTS_IN_BOUNDS + 2)[1:-1])
         bounded = replace(size, low=low, high=high, starts=starts)
         effects[name] = replace(effects[name], parameters=(bounded, *further))

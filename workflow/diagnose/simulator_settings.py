@@ -10,6 +10,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from workflow.config.settings import Section, check
 from workflow.diagnose.case_settings import CaseName, ColumnChoice
 
+# Keys that name a model, one of them in each case; also which simulator runs it.
 KINDS = ("mjcf", "fmu", "python")
 
 
@@ -58,10 +59,12 @@ class SimulatorSettings(Section):
 
     @property
     def logs(self) -> tuple[str, ...]:
+        """Log files in their order; the last one is for validation."""
         return (self.log,) if isinstance(self.log, str) else self.log
 
     @property
     def model(self) -> str:
+        """File of the model, whatever its kind."""
         return str(self.mjcf or self.fmu or self.python)
 
 
@@ -71,4 +74,5 @@ def is_simulator(document: Mapping[str, Any]) -> bool:
 
 
 def settings_of(document: Mapping[str, Any], source: str) -> SimulatorSettings:
+    """A case file's content, checked. source: named in errors. Raises InputError."""
     return check(SimulatorSettings, dict(document), source=source)

@@ -109,6 +109,7 @@ def _cell(text: str) -> str:
 def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     """Numbers of the good points that no other good point beats in one column without losing in the other."""
     names = (plot.x, plot.y)
+    # A point without one of the two numbers is on no front.
     placed = [row for row in rows if row.good and None not in [row.numbers[name] for name in names]]
     x, y = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
     # beats[j, i]: j is nowhere worse than i, and somewhere better.
@@ -193,6 +194,7 @@ class StudyView:
     @property
     def reasons(self) -> list[tuple[State, str, list[int]]]:
         """State and reason of the points that miss something; points of one design miss the same items."""
+        # Points of one design share its verdict, word for word.
         together: dict[tuple[State, str], list[int]] = {}
         for row in self.rows:
             if row.state != "certified":

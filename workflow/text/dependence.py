@@ -47,6 +47,7 @@ def variable_words(finding: Finding) -> str:
     words = of.split()
     names_motion = words[-1:] in (["angle"], ["position"], ["speed"])
     moving = " ".join(words[:-1] if names_motion else words)
+    # Speed and acceleration are of the thing that moves: "the speed of hub", not of "hub angle".
     if quantity != "position":
         return f"the {quantity} of {moving}" if moving else f"the {quantity}"
     if (names_motion and words[-1] != "speed") or of.endswith("deflection"):
@@ -58,7 +59,8 @@ def variable_words(finding: Finding) -> str:
 
 def missing_words(finding: Finding) -> str:
     """What depends on it: "missing torque at elbow", "error of the reading of tip"."""
-    place, unit = stated_name(finding["place"]), finding["value_unit"]
+    place = stated_name(finding["place"])
+    unit = finding["value_unit"]
     if finding["acts"] == "reading":
         return f"error of the reading of {place}"
     if unit in _TORQUES:
@@ -72,6 +74,7 @@ def nature_words(finding: Finding) -> str:
     """What kind of force it is: "a spring of 7.8 N m/rad", "dry friction of 0.2 N m", else two points."""
     value_unit = finding["value_unit"].replace("Nm", "N m")
     slope = finding["slope"]
+    # A curve that is neither a line nor a jump has no size of its own.
     if slope is None:
         return _points(finding, value_unit)
     if finding["shape"] == "jump":
