@@ -130,6 +130,13 @@ def test_titles_units_and_a_legend_nothing_cut_off_and_nothing_overlapping(names
         is_whole(figure)
 
 
+def test_a_response_at_other_frequencies_is_no_part_of_a_bode_picture():
+    posterior = example.posterior(example.model())
+    elsewhere = posterior.at(OMEGA[-5:])
+    picture = draw_bode(posterior.at(OMEGA[:10]), "hub", "rad / V", empirical=elsewhere)
+    has_titles_units_and_a_legend(figure_of(picture))
+
+
 def is_whole(figure: Figure) -> None:
     with house_style():
         figure.draw_without_rendering()
