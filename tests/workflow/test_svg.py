@@ -121,7 +121,7 @@ def test_a_line_is_drawn_at_its_values():
     panel.set(xlim=(0, 4), ylim=(0, 10))
     made, page = page_of(picture)
     left, top, right, bottom = made.plot["axes"][0]["box"]
-    (path,) = page.findall(".//g[@class='m']/path")
+    (path,) = page.findall(".//g[@class='m']//path")
     first, second = points_of(path.get("d"))
     wanted = np.array([[0, 0], [0.25, 0.5], [0.5, 0.1], [0.75, 0.2], [1, 0.9]])
     places = np.array([left, bottom]) + wanted * np.array([right - left, top - bottom])
@@ -135,7 +135,7 @@ def test_what_lies_outside_of_a_panel_is_not_written():
     panel.plot(x, np.cos(x), ls="none", marker="x")
     panel.set(xlim=(0, 1))
     _, page = page_of(picture)
-    (line,) = page.findall(".//g[@class='m']/path")
+    (line,) = page.findall(".//g[@class='m']//path")
     (dots,) = page.findall(".//path[@class='p']")
     assert len(points_of(line.get("d"))[0]) < 25
     assert len(points_of(dots.get("d"))[0]) <= 24
@@ -207,6 +207,25 @@ def test_long_names_and_labels_leave_room_for_bars_on_a_narrow_screen():
     # On a wide screen a name of this length stands on one line.
     assert 'class="y en"' in made.body
     assert "<tspan" not in made.body
+
+
+def test_a_narrow_part_shows_the_lines_of_the_whole_at_the_same_values():
+    """It writes none of its own: those of the whole stand in its panel, corner on corner."""
+    made, page = page_of(everything(1.0, "Two panels and more"))
+    lines = {group.get("id"): group for group in page.iter("g") if group.get("id")}
+    shown = []
+    for part in made.narrow:
+        again = ElementTree.fromstring(part.svg)
+        assert not again.findall(".//g[@class='m']/path")
+        for place, axes in enumerate(part.plot["axes"]):
+            for use in again.find(f"./g[@class='a{place}']").iter("use"):
+                shown.append(use.get("href")[1:])
+                of_panel = next(k for k in range(9) if page.find(f"./g[@class='a{k}']//*[@id='{shown[-1]}']"))
+                whole = made.plot["axes"][of_panel]
+                a, _, _, d, e, f = map(float, re.findall(r"-?[\d.]+(?:e-?\d+)?", use.get("transform")))
+                corners = np.reshape(whole["box"], (2, 2)) * [a, d] + [e, f]
+                assert corners.ravel() == pytest.approx(axes["box"], abs=0.05)
+    assert sorted(shown) == sorted(lines)
 
 
 @pytest.mark.parametrize("scale", [1e-7, 3e6])
@@ -314,7 +333,7 @@ def test_bars_begin_where_they_are_said_to():
     panel.set(ylim=(0, 6))
     made, page = page_of(picture)
     _, top, _, bottom = made.plot["axes"][0]["box"]
-    ends = [points_of(path.get("d"))[0][:, 1] for path in page.findall(".//g[@class='m']/path")]
+    ends = [points_of(path.get("d"))[0][:, 1] for path in page.findall(".//g[@class='m']//path")]
     share = [(bottom - end) / (bottom - top) for end in ends]
     found = np.array([[6 * part.min(), 6 * part.max()] for part in share])
     np.testing.assert_allclose(found, [[0, 3], [1, 5], [2, 4]], atol=0.01)

@@ -4,7 +4,8 @@ Lengths are in points, y down. A page gives looks classes and stands the legend 
 its script reads values, zooms and hides from the classes of the groups: `aN` of the N-th pair of axes, in it
 `kE` of what stands under entry E of the legend, `d` of other data, `t` and `u` of words at a place in the
 data (of `u` only x is), `x` and `y` of an axis; inside of `kE` and `d` a group `m` of outlines and paths `p`
-with a marker at every point.
+with a marker at every point. Where a picture is laid out again for a narrow screen, its outlines stand in a
+group `v` with an id, which the narrow one shows again, stretched into its own panel.
 """
 
 from __future__ import annotations
@@ -73,16 +74,13 @@ _OTHER_WIDTH = 0.65
 _SUPERSCRIPT_WIDTH = 0.42
 # How much wider bold letters are: the mean over the letters above, from the same font.
 _BOLD = 1.105
-# Points of a line that are nearer than this to the line without them are left out [pt]: a seventh of a pixel
-# where a page is 1000 pixels wide, and less than a thousandth of a panel's height. Twice as much saves a
-# tenth of a page.
-_UNSEEN = 0.1
-# The same on a logarithmic axis, where a tenth of a point may be 1 % of the value that the script reads
-# there.
+# Points of a line that are nearer than this to the line without them are left out [pt]: a third of a pixel
+# where a page is 1000 pixels wide, and a few thousandths of a panel's height. Half as much adds a tenth to a
+# page.
+_UNSEEN = 0.2
+# As much of a line on a logarithmic axis [pt], where a tenth of a point may be 1 % of the value that the
+# script reads there.
 _UNSEEN_LOG = 0.05
-# How much more is left out on a narrow screen: lines off by a quarter of a point, a third of a pixel there. A
-# finger points no nearer, and such a picture is one more in the page: so it weighs a quarter less.
-_COARSER = 2.5
 # Numbers of an axis at most: of more, none is read faster.
 _MOST_NUMBERS = 9
 # Width of a number in Hz with the space around it [pt].
@@ -122,6 +120,8 @@ _AFTER_SAMPLE = 7.0
 _AFTER_ENTRY = 16.0
 # Letters of a legend [pt]: as of the numbers.
 _LEGEND_SIZE = 9.0
+# A blank that a path does not need: in "1.5 .3" the second point can only begin another number.
+_BLANK_BETWEEN_POINTS = re.compile(r"(\.\d+) (?=\.)")
 # What all pictures have in common; looks of data are added to it.
 COMMON_STYLE = (
     "svg *{stroke-linejoin:round}"
@@ -131,6 +131,22 @@ COMMON_STYLE = (
     ".p{fill:none;stroke:none}.lb{font-size:9.5px;fill:#000}.ti{font-weight:bold;font-size:10.5px;fill:#000}"
     ".se{font-size:8.5px;fill:#666}.mi{text-anchor:middle}.en{text-anchor:end}"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """Where a panel stands in the picture that writes its lines.
+
+    Attributes
+    ----------
+    name : str
+        What the ids of its groups of lines begin with.
+    box : (4,) array
+        Left, top, right, bottom [pt].
+    """
+
+    name: str
+    box: Real
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,8 +225,6 @@ class _Frame:
         Whether numbers stand at x and at y.
     title, x_label : str
         In as many lines as fit into the picture.
-    coarser : float
-        How much more of its lines is left out than on a wide screen.
     """
 
     panel: Panel
@@ -222,7 +236,6 @@ class _Frame:
     numbered: tuple[bool, bool] = (True, True)
     title: str = ""
     x_label: str = ""
-    coarser: float = 1.0
 
     @property
     def width(self) -> float:
@@ -244,8 +257,8 @@ class _Frame:
         """A line (N, 2) as it is written: without points that are not seen; in y to a tenth where the axis is
         linear, which is 0.03 % of a panel's height."""
         if self.panel.y.kind != "lin":
-            return thinned(points, _UNSEEN_LOG * self.coarser)
-        points = thinned(points, _UNSEEN * self.coarser)
+            return thinned(points, _UNSEEN_LOG)
+        points = thinned(points, _UNSEEN)
         return np.column_stack([points[:, X], np.round(points[:, Y], 1)])
 
     def number_room(self, which: int) -> float:
@@ -423,7 +436,6 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
             bold=panel.title_bold,
         ),
         x_label=_wrapped(panel.labels[X], panel.label_size[X], picture.width_in * POINT - 2 * _PAD),
-        coarser=_COARSER if picture.width_in <= NARROW_WIDTH_IN else 1.0,
     )
     if panel.hertz:
         low, high = np.array(panel.x.limits()) / (2 * np.pi)
@@ -455,8 +467,14 @@ def path_of(points: Real, *, closed: bool = False, start: tuple[int, int] = (0, 
     """Points (N, 2) [pt] as a path of relative steps, to a tenth in x and a hundredth in y. start: where the
     path before it ended, in hundredths."""
     steps = np.diff(_hundredths(points), axis=0, prepend=np.array([start]))
-    text = " ".join(map(_short, steps.ravel().tolist())).replace(" -", "-")
-    return f"m{text}{'z' if closed else ''}"
+    return f"m{_joined(steps.ravel().tolist())}{'z' if closed else ''}"
+
+
+def _joined(hundredths: list[int]) -> str:
+    """Numbers as a path has them: a sign, and the point of a number after one with a point, part as a blank
+    does."""
+    text = " ".join(map(_short, hundredths)).replace(" -", "-")
+    return _BLANK_BETWEEN_POINTS.sub(r"\1", text)
 
 
 def _hundredths(points: Real) -> Any:
@@ -570,11 +588,30 @@ class _Writer:
         Looks of the page by what they say; new ones are added.
     entries : dict
         What the legend names, of all panels that it stands for.
+    whole : dict
+        Of a part for a narrow screen: `written` of the whole picture, whose lines it shows again.
+    shows_again : bool
+        Whether such parts follow: then groups of lines have ids.
+
+    Attributes
+    ----------
+    written : dict
+        Where each panel, by its id(), has been written.
     """
 
     def __init__(
-        self, picture: Picture, number: str, classes: dict[str, str], entries: dict[str, Mark]
+        self,
+        picture: Picture,
+        number: str,
+        classes: dict[str, str],
+        entries: dict[str, Mark],
+        *,
+        whole: Mapping[int, _Place] | None = None,
+        shows_again: bool = False,
     ) -> None:
+        self.whole = whole or {}
+        self.written: dict[int, _Place] = {}
+        self.shows_again = shows_again
         self.picture = picture
         self.number = number
         self.classes = classes
@@ -592,6 +629,7 @@ class _Writer:
     def panel(self, place: int, frame: _Frame) -> str:
         """The group of a panel, its second axes not included."""
         clip = f"f{self.number}-c{place}"
+        self.written[id(frame.panel)] = _Place(clip, frame.box)
         corners = frame.box[[0, 1, 2, 1, 2, 3, 0, 3]].reshape(4, 2)
         parts = [
             f'<clipPath id="{clip}"><path d="{path_of(corners, closed=True)}"/></clipPath>',
@@ -599,8 +637,8 @@ class _Writer:
             self.axis(frame, Y),
         ]
         drawn = [mark for mark in frame.panel.layered() if not isinstance(mark, Words | Arrow)]
-        for name, marks in groupby(drawn, self.group_name):
-            parts.append(self.data(list(marks), name, clip, frame))
+        for k, (name, marks) in enumerate(groupby(drawn, self.group_name)):
+            parts.append(self.data(list(marks), name, clip, frame, k))
         left, top, right, bottom = frame.box
         spine = np.array([[left, top], [left, bottom], [right, bottom]])
         parts.append(f'<path class="fr" d="{path_of(spine)}"/>')
@@ -619,8 +657,8 @@ class _Writer:
             entry = self.entry_of_look.get(looks.key(mark))
         return "d" if entry is None else f"k{entry}"
 
-    def data(self, marks: list[Mark], name: str, clip: str, frame: _Frame) -> str:
-        """A group of data: what can be stretched in a group of its own, then markers."""
+    def data(self, marks: list[Mark], name: str, clip: str, frame: _Frame, k: int) -> str:
+        """The k-th group of data of a panel: what can be stretched in a group of its own, then markers."""
         stretched: list[str] = []
         dots: list[str] = []
         for mark in marks:
@@ -632,7 +670,14 @@ class _Writer:
                 dots += markers
             elif isinstance(mark, Rule | Span):
                 stretched.append(self.across(mark, frame))
-        moving = f'<g class="m">{"".join(stretched)}</g>' if stretched else ""
+        moving = "".join(stretched)
+        whole = self.whole.get(id(frame.panel))
+        if moving and whole is not None:
+            moving = f'<use href="#{whole.name}-{k}" transform="{_stretch(whole.box, frame.box)}"/>'
+        elif moving and self.shows_again:
+            moving = f'<g id="{clip}-{k}" class="v">{moving}</g>'
+        if moving:
+            moving = f'<g class="m">{moving}</g>'
         return f'<g class="{name}" clip-path="url(#{clip})">{moving}{"".join(dots)}</g>'
 
     def area(self, mark: Area, frame: _Frame) -> list[str]:
@@ -910,6 +955,14 @@ def _scale(axis: Axis) -> list[Any]:
     return [*(float(f"{end:.7g}") for end in axis.limits()), axis.kind]
 
 
+def _stretch(before: Real, after: Real) -> str:
+    """The transformation that takes what stands in a box (left, top, right, bottom) [pt] into another."""
+    scale = (after[2:] - after[:2]) / (before[2:] - before[:2])
+    shift = after[:2] - scale * before[:2]
+    # Lines are as far as 1000 pt from the origin: six digits of the scale keep a thousandth of a point.
+    return f"matrix({scale[X]:.6g} 0 0 {scale[Y]:.6g} {shift[X]:.5g} {shift[Y]:.5g})"
+
+
 def _strokes(places: Real, which: int, first: float, last: float) -> str:
     """Straight strokes across an axis at places along it, there and back in turn."""
     ends = np.array([first, last])
@@ -919,7 +972,7 @@ def _strokes(places: Real, which: int, first: float, last: float) -> str:
         begin, end = ends[::-1] if number % 2 else ends
         corners = np.array([[begin, place], [end, place]] if which else [[place, begin], [place, end]])
         start, stop = _hundredths(corners)
-        step = " ".join(map(_short, (start - at).tolist())).replace(" -", "-")
+        step = _joined((start - at).tolist())
         path.append(f"m{step}{'h' if which else 'v'}{_short(int((stop - start)[1 - which]))}")
         at = stop
     return "".join(path)
@@ -995,16 +1048,19 @@ def drawn(picture: Picture, label: str, number: int, classes: dict[str, str]) ->
     classes: looks of the page by what they say, added to."""
     entries = picture.legend()
     height = picture.height_in * POINT - _legend_height(picture)
-    made, frames = _written(picture, label, height, _Writer(picture, str(number), classes, entries))
-    for k, part in enumerate(_narrow_parts(picture, frames, height)):
-        writer = _Writer(part, f"{number}n{k}", classes, entries)
-        made.narrow.append(_written(part, label, height, writer)[0])
+    frames = _laid_out(picture, height)
+    parts = _narrow_parts(picture, frames, height)
+    writer = _Writer(picture, str(number), classes, entries, shows_again=bool(parts))
+    made = _written(picture, label, height, frames, writer)
+    # A part for a narrow screen shows the lines of the whole again: a second copy would weigh as much.
+    for k, part in enumerate(parts):
+        of_part = _Writer(part, f"{number}n{k}", classes, entries, whole=writer.written)
+        made.narrow.append(_written(part, label, height, _laid_out(part, height), of_part))
     return made
 
 
-def _written(picture: Picture, label: str, height: float, writer: _Writer) -> tuple[Drawn, list[_Frame]]:
-    """A picture of this height [pt] without its legend, as laid out and written, and its panels in place."""
-    frames = _laid_out(picture, height)
+def _written(picture: Picture, label: str, height: float, frames: list[_Frame], writer: _Writer) -> Drawn:
+    """A picture of this height [pt] without its legend as it is written, its panels being in their places."""
     body, read = writer.body(frames)
     plot = {
         "axes": read,
@@ -1014,7 +1070,7 @@ def _written(picture: Picture, label: str, height: float, writer: _Writer) -> tu
         "legend": list(writer.entries),
     }
     samples = [(writer.sample(mark), words) for words, mark in writer.entries.items()]
-    return Drawn(picture, label, body, samples, plot), frames
+    return Drawn(picture, label, body, samples, plot)
 
 
 def _narrow_parts(picture: Picture, frames: list[_Frame], height: float) -> list[Picture]:

@@ -125,7 +125,13 @@ class Plot {
     const found = [];
     for (const group of this.svg.querySelectorAll(`.a${j} > [class^=k], .a${j} > .d`)) {
       const entry = group.getAttribute("class").slice(1), lines = [], marks = [];
-      for (const path of group.querySelectorAll(".m > path")) lines.push(...runs(path));
+      for (const path of group.querySelectorAll(".m path")) lines.push(...runs(path));
+      // A part for a narrow screen shows lines of the whole picture in its own place.
+      for (const again of group.querySelectorAll(".m > use")) {
+        const [a, , , d, e, f] = again.getAttribute("transform").slice(7, -1).split(" ").map(Number);
+        for (const path of document.querySelectorAll(again.getAttribute("href") + " path"))
+          lines.push(...runs(path).map(line => line.map(([x, y]) => [a * x + e, d * y + f])));
+      }
       for (const path of group.querySelectorAll(".p")) marks.push(...places(path));
       found.push({entry, words: entry ? this.plot.legend[entry] : "", lines, marks});
     }
