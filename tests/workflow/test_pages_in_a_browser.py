@@ -219,6 +219,34 @@ def test_report_of_a_run(browser, faults_seen, tmp_path):
     assert shape_faults(browser, path, screens=2.5, words=450) == []
 
 
+@pytest.mark.parametrize("width", [1280, 400])
+def test_a_page_without_its_script_shows_numbers_tables_and_the_first_picture(browser, tmp_path, width):
+    """Where a browser runs no script: on the first screen at once, in folded parts once they are opened."""
+    settings = example.config(channels=1)
+    path = write_report(RunResults(example.build_run(tmp_path / "run", settings)), settings)
+    browser.call("Emulation.setScriptExecutionDisabled", value=True)
+    try:
+        browser.open(path, width)
+        assert browser.ask("document.querySelectorAll('.tools').length") == 0  # the script has not run
+        seen = "[...document.querySelectorAll('{}')].filter(item => item.checkVisibility()).length"
+        assert browser.ask(seen.format(".numbers dd")) > 2
+        drawn = (
+            "[...document.querySelectorAll('.plot > svg')].filter(item => item.checkVisibility())[0]"
+            ".querySelectorAll('.m path, .m use').length"
+        )
+        assert browser.ask(drawn) > 2
+        for summary in range(browser.ask("document.querySelectorAll('summary').length")):
+            browser.ask(f"document.querySelectorAll('summary')[{summary}].parentElement.open = true")
+        assert browser.ask(seen.format("td")) > 20
+        empty = (
+            "[...document.querySelectorAll('figure')].filter(figure => ![...figure.querySelectorAll('svg')]"
+            ".some(image => image.checkVisibility() && image.getBoundingClientRect().height > 50)).length"
+        )
+        assert browser.ask(empty) == 0
+    finally:
+        browser.call("Emulation.setScriptExecutionDisabled", value=False)
+
+
 def test_the_shape_of_a_page_is_measured(browser, tmp_path):
     """Every fault is found on a page that has them all."""
     path = tmp_path / "long.html"

@@ -34,6 +34,7 @@ from workflow.text.formats import (
     MISSING,
     at_least,
     at_most,
+    both_frequencies,
     bound,
     count,
     decibels,
@@ -287,8 +288,7 @@ def _in_python_control(view: RunView) -> Fold:
     about_delay = "Without computational delay both are the same."
     if delay:
         about_delay = (
-            "The margins of this page are about K_with_delay. K_without_delay is what the processor runs: "
-            f"the machine adds {count(delay, 'sample')} of delay."
+            f"The margins of this page are about K_with_delay, with {count(delay, 'sample')} of delay."
         )
     factor = f"{view.loop_factor} * " if view.loop_factor != 1 else ""
     typed = (
@@ -343,13 +343,13 @@ def _requirements_table(certificate: Certificate, view: RunView, *, several: boo
                 f"{name} {gave_way_beside(item.requirement, view.gave_way)}".rstrip(),
                 si(item.required, item.unit),
                 unit(bound(item.achieved, item.at_least), item.unit),
-                frequency(item.omega_rad_s),
+                both_frequencies(item.omega_rad_s),
                 bound(item.bound, item.at_least),
                 reached,
             )
         )
     return Table(
-        ("requirement", "required", "achieved", "at", "proved", "met?"),
+        ("requirement", "required", "achieved", "at [rad/s (Hz)]", "proved", "met?"),
         tuple(rows),
         "Weighted gains |W ...| must be 1 or less. Achieved: on the dense grid of frequencies. Proved: bound "
         "at all frequencies.",

@@ -46,14 +46,13 @@ from workflow.describe.loop_metrics import LOOP_METRICS
 from workflow.engine import codec
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, MeasuredPeak, RunResults
 from workflow.text.formats import (
+    both_frequencies,
     capitalised,
     count,
     extent,
-    frequency,
     listing,
     number,
     percent,
-    sentence,
     setting,
     share,
     si,
@@ -455,11 +454,13 @@ def _metrics_table(check: LoopCheck, output_unit: str) -> Table:
 
 
 def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
-    """|S| as it was measured on the arm, beside the predicted and the certified one."""
+    """|S| as it was measured on the arm, beside the predicted and the certified one.
+
+    That it exceeds what is certified stands on the first screen.
+    """
     found = check.sensitivity
     if found is None:
         return []
-    effects = view.config.closed_loop.effects
     large, small = found.measured[0], found.measured[1]
     agrees = abs(large.off_nominal_percent) <= _AGREES_PERCENT
     certified = "no bound certified"
@@ -487,25 +488,15 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
             f"With a tenth of the excitation the peak is {percent(abs(apart), 2)} "
             f"{'lower' if apart < 0 else 'higher'} than predicted: {why}"
         )
-    beyond = [
-        sentence(measured_beyond_text(item, effects)) for item in measured_beyond(view.results, view.config)
-    ]
-    caption = "|S| measured on the arm."
-    if effects:
-        names = listing(effect["name"] for effect in effects)
-        caption += (
-            f" The arm of the closed-loop check differs from the one the records came from ({names}): the "
-            "certificate does not cover it."
-        )
     rows = [
         (
             row.name,
             si(row.reference_rms, view.output_unit),
             f"{number(row.peak, 4)} ± {number(row.peak_std, 2)}",
-            frequency(row.peak_omega_rad_s),
-            signed(row.off_nominal_percent, "%"),
-            signed(row.off_certified_percent, "%"),
-            share(row.limited_fraction, 2),
+            both_frequencies(row.peak_omega_rad_s),
+            signed(row.off_nominal_percent),
+            signed(row.off_certified_percent),
+            number(100 * row.limited_fraction, 2),
         )
         for row in found.measured
     ]
@@ -513,15 +504,14 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
         "measured on",
         "reference, rms",
         "peak of |S| [1]",
-        "at",
-        "from nominal",
-        "from certified",
-        "at a limit",
+        "at [rad/s (Hz)]",
+        "from nominal [%]",
+        "from certified [%]",
+        "at a limit [%]",
     )
     return [
         Remarks(tuple(said_of), "good" if agrees else "warning", "Sensitivity measured on the arm"),
-        Remarks(tuple(beyond), "warning"),
-        Picture("measured-sensitivity", caption, (view,)),
+        Picture("measured-sensitivity", "|S| measured on the arm.", (view,)),
         Table(
             head,
             tuple(rows),
@@ -540,9 +530,9 @@ def _condition_blocks(check: LoopCheck, view: RunView) -> list[Block]:
     rows = [
         (
             f"{run.name}: {run.words}",
-            percent(run.largest_difference_percent),
-            percent(run.overshoot_percent, 2),
-            percent(run.error_left_percent, 2),
+            number(run.largest_difference_percent),
+            number(run.overshoot_percent, 2),
+            number(run.error_left_percent, 2),
             number(run.peak_command),
             yes_no(run.settled),
         )
@@ -550,17 +540,16 @@ def _condition_blocks(check: LoopCheck, view: RunView) -> list[Block]:
     ]
     head = (
         "condition",
-        "largest difference",
-        "overshoot",
-        "error left",
+        "largest difference [%]",
+        "overshoot [%]",
+        "error left [%]",
         f"largest command [{view.input_unit or 'as logged'}]",
         "settles?",
     )
     table = Table(
         head,
         tuple(rows),
-        "One run each, in per cent of the step; for the push, of the predicted swing. Difference: from the "
-        "prediction.",
+        "One run each; % of the step; for the push, of the predicted swing. Difference: from the prediction.",
         tuple(run.settled for run in check.conditions),
     )
     picture = Picture(

@@ -7,7 +7,7 @@ import math
 from control_design.analysis.certificate import PlantVerdict
 from control_design.controllers.engineers_numbers import ControllerNumbers
 from workflow.describe.facts import Block, Heading, Row, Section, Table, said, worded
-from workflow.text.formats import MISSING, count, decibels, frequency, margin, sentence, si
+from workflow.text.formats import MISSING, both_frequencies, count, decibels, frequency, margin, sentence, si
 
 
 def controller_section(numbers: ControllerNumbers | None, delay_samples: int, signals: str = "") -> Section:
@@ -69,16 +69,17 @@ def crossover_table(plant: PlantVerdict) -> list[Block]:
     rows = []
     for each in found.gain:
         phase = margin(math.degrees(each.phase_margin_rad))
-        rows.append(("gain", frequency(each.omega_rad_s), phase, margin(1000 * each.delay_margin_s), MISSING))
+        rows.append(
+            ("gain", both_frequencies(each.omega_rad_s), phase, margin(1000 * each.delay_margin_s), MISSING)
+        )
     for crossing in found.phase:
         rises = crossing.gain_margin > 1
         gain = f"may {'rise by' if rises else 'fall to'} {decibels(crossing.gain_margin, rises)}"
-        rows.append(("phase", frequency(crossing.omega_rad_s), MISSING, MISSING, gain))
-    head = ("crossover", "at", "phase margin [deg]", "delay margin [ms]", "gain margin")
-    caption = (
-        f"{plant.plant}: every crossover of the loop at the centres of the ellipses. A negative phase "
-        "margin: so much lead brings the loop to -1."
-    )
+        rows.append(("phase", both_frequencies(crossing.omega_rad_s), MISSING, MISSING, gain))
+    head = ("crossover", "at [rad/s (Hz)]", "phase margin [deg]", "delay margin [ms]", "gain margin")
+    caption = f"{plant.plant}: every crossover of the loop at the centres of the ellipses."
+    if any(each.phase_margin_rad < 0 for each in found.gain):
+        caption += " A negative phase margin: so much lead brings the loop to -1."
     return [Table(head, tuple(rows), caption)]
 
 
@@ -95,7 +96,7 @@ def controller_blocks(
     if delay_samples:
         delay = (
             f"Without the computational delay of {count(delay_samples, 'sample')}, which the machine adds: "
-            "K_without_delay of the files; the margins are about K_with_delay."
+            "K_without_delay of the files."
         )
     units = f" {sentence(signals)}" if signals else ""
     caption = (

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from itertools import groupby
 from typing import TYPE_CHECKING, get_args
 
 from ident.data.distortion import Distortion
@@ -21,7 +23,7 @@ from workflow.describe.facts import (
     said,
     worded,
 )
-from workflow.tasks.results import RecordsResult
+from workflow.tasks.results import RecordsResult, RunRecord
 from workflow.text.findings.sentences import words
 from workflow.text.formats import count, listing, number, sentence, setting, si
 from workflow.text.sentences.records import cut_off, signal, time_base
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 # A command that is held for less than this share of a row changes between two rows.
 _HELD_THROUGH = 0.999
 
+# A record of a series: "4 V rms, realisation 3".
+_NUMBERED = re.compile(r"(?P<name>.*\D)(?P<number>\d+)")
 ROLES: tuple[Role, ...] = get_args(Role)
 
 
@@ -76,23 +80,11 @@ def records_page(view: AnyRunView) -> PageSection:
     simulated = config.source.kind != "files"
     inputs = list(dict.fromkeys(column.input for column in config.columns))
     outputs = list(dict.fromkeys(column.output for column in config.columns))
-    rows = [
-        (
-            number_of,
-            item.name,
-            item.role,
-            item.record.n_samples,
-            number(item.duration_s),
-            "open" if item.record.reference is None else "closed",
-            "; ".join(text for text in (item.condition, item.remark) if text),
-        )
-        for number_of, item in enumerate(items, 1)
-    ]
     head = ("no.", "record", "used for", "samples", "length [s]", "loop", "condition, remark")
     blocks: list[Block] = [
         Text(_about_records(view, simulated=simulated)),
         Picture("records", "All records on one time axis.", (items, inputs, outputs)),
-        Table(head, tuple(rows)),
+        Table(head, tuple(_record_rows(items))),
         *_limit_blocks(view, several=several),
     ]
     effects = getattr(config.source, "effects", ())
@@ -116,6 +108,41 @@ def records_page(view: AnyRunView) -> PageSection:
             )
         )
     return PageSection("records", "Excitation and records", "Records", tuple(blocks))
+
+
+def _record_rows(items: Sequence[RunRecord]) -> list[tuple[str, ...]]:
+    """A row for each record, or for several in a row that are alike in all but the number in their name."""
+
+    def said_of(item: RunRecord) -> tuple[str, ...]:
+        return (
+            item.role,
+            str(item.record.n_samples),
+            number(item.duration_s),
+            "open" if item.record.reference is None else "closed",
+            "; ".join(text for text in (item.condition, item.remark) if text),
+        )
+
+    def series_of(numbered: tuple[int, RunRecord]) -> tuple[object, ...]:
+        place, item = numbered
+        match = _NUMBERED.fullmatch(item.name)
+        if match is None:
+            return item.name, place, said_of(item)
+        # Equal in a series whose numbers rise by one from row to row.
+        return match["name"], int(match["number"]) - place, said_of(item)
+
+    rows = []
+    for _, group in groupby(enumerate(items, 1), series_of):
+        series = list(group)
+        first_place, first = series[0]
+        last_place, last = series[-1]
+        if len(series) == 1:
+            rows.append((str(first_place), first.name, *said_of(first)))
+            continue
+        last_number = _NUMBERED.fullmatch(last.name)
+        assert last_number is not None
+        names = f"{first.name} to {last_number['number']}"
+        rows.append((f"{first_place} to {last_place}", names, *said_of(first)))
+    return rows
 
 
 def _about_records(view: AnyRunView, *, simulated: bool) -> str:

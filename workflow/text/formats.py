@@ -124,6 +124,13 @@ def frequency(omega_rad_s: float | None, digits: int = 3) -> str:
     return f"{number(omega_rad_s, digits)} rad/s ({number(hertz(omega_rad_s), digits)} Hz)"
 
 
+def both_frequencies(omega_rad_s: float | None) -> str:
+    """rad/s with Hz in brackets, for a column whose head names these units."""
+    if omega_rad_s is None:
+        return MISSING
+    return f"{number(omega_rad_s)} ({number(hertz(omega_rad_s))})"
+
+
 def hertz(omega_rad_s: float) -> float:
     """rad/s as Hz."""
     return omega_rad_s / (2 * math.pi)
