@@ -299,16 +299,17 @@ def _in_python_control(view: RunView) -> Fold:
         f"*control.stability_margins(control.frd({factor}ss(G) * ss(K[name]), numpy.geomspace(1e-4, 1, 9999) "
         '* numpy.pi / G["dt_s"]))[:3])'
     )
-    found = view.model_margins()
+    margins_of = view.model_margins()
     printed = "".join(
-        f"{name} {' '.join(number(value, 4) for value in values)}\n" for name, (values, _) in found.items()
+        f"{name} {' '.join(number(value, 4) for value in values)}\n"
+        for name, (values, _) in margins_of.items()
     )
     at_ends = [
         Text(
             f"{name} has its gain margin, {number(values[0], 4)}, at the end of the frequencies (zero or "
             "Nyquist). python-control does not look there and prints another."
         )
-        for name, (values, at_end) in found.items()
+        for name, (values, at_end) in margins_of.items()
         if at_end
     ]
     blocks: list[Block] = [
@@ -359,24 +360,24 @@ def _requirements_table(certificate: Certificate, view: RunView, *, several: boo
 
 def _samples_of(view: RunView) -> list[Block]:
     """For how many models drawn from the posterior the worst case holds."""
-    found = view.results.certify.sampled
-    joint = found.joint
+    drawn_models = view.results.certify.sampled
+    joint = drawn_models.joint
     if joint is None:
-        return [Text(sentence(found.reason))] if found.reason else []
+        return [Text(sentence(drawn_models.reason))] if drawn_models.reason else []
     blocks: list[Block] = [Heading("Models drawn from the posterior")]
-    more = sentence(calibration(found))
-    too_few_held = joint.level > joint.given_level and not found.calibrated
+    calibration_words = sentence(calibration(drawn_models))
+    too_few_held = joint.level > joint.given_level and not drawn_models.calibrated
     if too_few_held:
-        blocks.append(Remarks((more,), "warning"))
-    elif more:
-        blocks.append(Text(more))
-    shares = joint_numbers(found)
+        blocks.append(Remarks((calibration_words,), "warning"))
+    elif calibration_words:
+        blocks.append(Text(calibration_words))
+    shares = joint_numbers(drawn_models)
     held = " to ".join(share(end) for end in shares["held_interval"])
     stable = " to ".join(share(end) for end in shares["stable_interval"])
-    given = share(joint.given_level)
+    given_level = share(joint.given_level)
     rows = (
         (
-            f"worst case of the {given} ellipses",
+            f"worst case of the {given_level} ellipses",
             at_most(joint.gamma_given, 4),
             f"{share(joint.coverage_given)} ({held})",
         ),
@@ -386,7 +387,7 @@ def _samples_of(view: RunView) -> list[Block]:
             share(joint.coverage),
         ),
         ("stable loop", MISSING, f"{share(joint.stable_share)} ({stable})"),
-        (f"inside the {given} ellipse at every frequency", MISSING, share(joint.simultaneous_given)),
+        (f"inside the {given_level} ellipse at every frequency", MISSING, share(joint.simultaneous_given)),
     )
     head = ("statement", "gamma [1]", f"share of {joint.draws} samples")
     return [*blocks, Table(head, rows, "Brackets: 95 % interval.")]

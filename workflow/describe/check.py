@@ -17,7 +17,8 @@ _MOST_LISTED = 20
 # An output that moves by less than so many times its noise is doubtful. Chosen: a twentieth of noise is what
 # a good log has.
 LEAST_MOTION = 20.0
-# From this size on nothing was found that shows.
+# A least size from here on says that the candidate does nothing: it is inf then, and no size of a machine, in
+# whatever unit, comes near this.
 NOTHING_SHOWS = 1e9
 
 
@@ -134,7 +135,11 @@ def _log_section(log: LogSeen, dt_s: float, units: Mapping[str, str]) -> Section
 
 
 def _hidden_rows(telling: Telling, candidates: Candidates) -> Iterator[Row]:
-    """Candidates that the logs do not show, whatever the reason."""
+    """Candidates that the logs do not show, whatever the reason.
+
+    Hidden ones show at no size of their range: from `least` on they would, inf where they do nothing. Others
+    were not tried, make the simulation fail, or were left out by a deadline.
+    """
     for name in telling.hidden[:_MOST_LISTED]:
         least = telling.least[name]
         words = "does nothing in these records"
@@ -154,9 +159,9 @@ def _hidden_rows(telling: Telling, candidates: Candidates) -> Iterator[Row]:
 def _alike_rows(telling: Telling, groups_left_out: int) -> Iterator[Row]:
     """Candidates that others make up for."""
     for group in telling.alike:
-        first, *others = group.names
-        reproduce = "together reproduce" if len(others) > 1 else "reproduces"
+        first, *other_names = group.names
+        reproduce = "together reproduce" if len(other_names) > 1 else "reproduces"
         part = probability_words(1 - group.left)
-        yield _said(first, f"{listing(others)} {reproduce} {part} of its effect")
+        yield _said(first, f"{listing(other_names)} {reproduce} {part} of its effect")
     if groups_left_out > 0:
         yield _said("more", f"{count(groups_left_out, 'group')} in the JSON answer")

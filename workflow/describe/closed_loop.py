@@ -108,8 +108,7 @@ def spread(check: LoopCheck, metric: str, unit: str) -> str:
 
 
 def largest(check: LoopCheck, metric: str, more: Sequence[float | None] = ()) -> float | None:
-    """The largest value of a metric over prediction, runs and more; None where one of them never gets "
-    "there."""
+    """The largest value of a metric over prediction, runs and more; None where one never gets there."""
     values = [getattr(row, metric) for row in (check.predicted, *check.achieved)]
     values += more
     return None if None in values else max(values)
@@ -156,7 +155,7 @@ def _settling(check: LoopCheck, output_unit: str) -> tuple[str, str]:
 
 
 def not_the_arm(check: LoopCheck | None, bandwidth_rad_s: float, effects: Sequence[Mapping[str, Any]]) -> str:
-    """That an arm on which |S| was measured has a smaller bandwidth; "" elsewhere.
+    """Says that an arm on which |S| was measured has a smaller bandwidth; "" elsewhere.
 
     Args:
         check: None: nothing was measured.
@@ -273,17 +272,16 @@ def measured_beyond(results: RunResults, config: RunConfig) -> list[MeasuredBeyo
         cause = ("model", "size")[index] if index < 2 else "effects"
         weight = specification.magnitude(plant, measured.omega_rad_s, LoopFunction.SENSITIVITY)
         limit = np.divide(1.0, weight, out=np.full_like(weight, np.inf), where=weight > 0)
-        found = MeasuredBeyond(
+        contradiction = MeasuredBeyond(
             measured, cause, limit, measured.beyond(limit), measured.beyond_bandwidth(bandwidth), bandwidth
         )
-        if found.line is not None or found.bandwidth_line is not None:
-            contradictions.append(found)
+        if contradiction.line is not None or contradiction.bandwidth_line is not None:
+            contradictions.append(contradiction)
     return contradictions
 
 
 def effects_text(effects: Sequence[Mapping[str, Any]]) -> str:
-    """Effects with their parameters: "coulomb_friction (torque_Nm = 0.04) and tip_payload (mass_kg = "
-    "0.1)"."""
+    """Effects with their parameters: "friction (torque_Nm = 0.04) and tip_payload (mass_kg = 0.1)"."""
     return listing(f"{effect['name']} ({setting(effect)})" for effect in effects)
 
 
@@ -300,19 +298,19 @@ def measured_beyond_text(found: MeasuredBeyond, effects: Sequence[Mapping[str, A
         "size": "as identified at small references, where dry friction weighs more",
         "model": "as identified: it has friction, or the model is not right",
     }[found.cause]
-    beyond = []
+    places = []
     if found.line is not None:
-        beyond.append(
+        places.append(
             f"{number(row.magnitude[found.line])} at {number(row.omega_rad_s[found.line])} rad/s "
             f"(specification: below {number(found.limit[found.line])})"
         )
     if found.bandwidth_line is not None:
-        beyond.append(
+        places.append(
             f"{number(row.magnitude[found.bandwidth_line])} at "
             f"{number(row.omega_rad_s[found.bandwidth_line])} rad/s, where every plant in the uncertainty "
             "set is below -3 dB (0.707)"
         )
-    return f"the certificate does not cover the arm {about}. Measured |S| is {' and '.join(beyond)}"
+    return f"the certificate does not cover the arm {about}. Measured |S| is {' and '.join(places)}"
 
 
 def closed_loop_page(view: RunView) -> PageSection:
@@ -325,20 +323,20 @@ def closed_loop_page(view: RunView) -> PageSection:
     blocks = _what_was_run(check, view)
     blocks.append(Picture("closed-loop", "The step and the disturbance.", (view,)))
     if check.settled_draws < check.draws:
-        there = " and is there" if check.tracking else ""
+        at_the_end = " and is there" if check.tracking else ""
         blocks.append(
             Remarks(
                 (
                     f"A run settles when it moves by less than a tenth of the step at the end of either "
-                    f"half{there}. Look at friction first (a steady-state error, a limit cycle), then at the "
-                    "size of the disturbance.",
+                    f"half{at_the_end}. Look at friction first (a steady-state error, a limit cycle), then "
+                    "at the size of the disturbance.",
                 ),
                 "warning",
             )
         )
-    more = loop_numbers(results, view.config)[ON_THE_FIRST_SCREEN:]
-    if more:
-        rows = tuple((capitalised(row.name), row.value.text, row.remark) for row in more)
+    further_rows = loop_numbers(results, view.config)[ON_THE_FIRST_SCREEN:]
+    if further_rows:
+        rows = tuple((capitalised(row.name), row.value.text, row.remark) for row in further_rows)
         blocks.append(Table(("quantity", "value", "predicted and achieved"), rows))
     blocks.append(_metrics_table(check, view.output_unit))
     blocks += _sensitivity_blocks(check, view)
@@ -446,8 +444,8 @@ def _metrics_table(check: LoopCheck, output_unit: str) -> Table:
 
     rows = []
     for metric, name, factor in metrics:
-        _, smallest, most = check.spread_of(metric)
-        values = (getattr(check.predicted, metric), smallest, most)
+        _, smallest, greatest = check.spread_of(metric)
+        values = (getattr(check.predicted, metric), smallest, greatest)
         rows.append((name, *(reached(value, factor) for value in values)))
     head = ("quantity", "predicted", f"smallest of {check.draws}", f"largest of {check.draws}")
     return Table(head, tuple(rows))
@@ -458,17 +456,18 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
 
     That it exceeds what is certified stands on the first screen.
     """
-    found = check.sensitivity
-    if found is None:
+    sensitivity = check.sensitivity
+    if sensitivity is None:
         return []
-    large, small = found.measured[0], found.measured[1]
+    large, small = sensitivity.measured[0], sensitivity.measured[1]
     agrees = abs(large.off_nominal_percent) <= _AGREES_PERCENT
     certified = "no bound certified"
-    if math.isfinite(found.certified_peak):
-        certified = f"certified at most {number(found.certified_peak, 4)}"
+    if math.isfinite(sensitivity.certified_peak):
+        certified = f"certified at most {number(sensitivity.certified_peak, 4)}"
+    predicted = number(sensitivity.nominal_peak, 4)
+    difference = percent(abs(large.off_nominal_percent), 2)
     said_of = [
-        f"Peak of |S|: predicted {number(found.nominal_peak, 4)}, {certified}. Measured and predicted are "
-        f"{percent(abs(large.off_nominal_percent), 2)} apart."
+        f"Peak of |S|: predicted {predicted}, {certified}. Measured and predicted are {difference} apart."
     ]
     if not agrees:
         said_of.append(
@@ -476,7 +475,7 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
             "validation of the model before you trust the margins."
         )
     apart = small.off_nominal_percent
-    clearly = small.peak_std < abs(apart) / 200 * found.nominal_peak  # two standard deviations
+    clearly = small.peak_std < abs(apart) / 200 * sensitivity.nominal_peak  # two standard deviations
     if check.friction is None and abs(apart) > abs(large.off_nominal_percent) and clearly:
         why = "the loop is not linear at that size."
         if apart < 0:
@@ -498,7 +497,7 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
             signed(row.off_certified_percent),
             number(100 * row.limited_fraction, 2),
         )
-        for row in found.measured
+        for row in sensitivity.measured
     ]
     head = (
         "measured on",

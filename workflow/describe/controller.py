@@ -38,7 +38,7 @@ def controller_section(numbers: ControllerNumbers | None, delay_samples: int, si
 
 
 def pid_row(numbers: ControllerNumbers | None) -> Row | None:
-    """All of a PID in one line; None for another controller."""
+    """A PID in one line; None for another controller."""
     if numbers is None or numbers.pid is None:
         return None
     return worded("controller", "; ".join(f"{name} {values}" for name, values in numbers.rows()))
@@ -63,22 +63,22 @@ def crossover_rows(plant: PlantVerdict) -> tuple[Row, ...]:
 
 def crossover_table(plant: PlantVerdict) -> list[Block]:
     """Every crossover of the loop of a plant for a page; nothing where there is none."""
-    found = plant.crossovers
-    if found is None or not (found.gain or found.phase):
+    crossovers = plant.crossovers
+    if crossovers is None or not (crossovers.gain or crossovers.phase):
         return []
     rows = []
-    for each in found.gain:
+    for each in crossovers.gain:
         phase = margin(math.degrees(each.phase_margin_rad))
         rows.append(
             ("gain", both_frequencies(each.omega_rad_s), phase, margin(1000 * each.delay_margin_s), MISSING)
         )
-    for crossing in found.phase:
+    for crossing in crossovers.phase:
         rises = crossing.gain_margin > 1
         gain = f"may {'rise by' if rises else 'fall to'} {decibels(crossing.gain_margin, rises)}"
         rows.append(("phase", both_frequencies(crossing.omega_rad_s), MISSING, MISSING, gain))
     head = ("crossover", "at [rad/s (Hz)]", "phase margin [deg]", "delay margin [ms]", "gain margin")
     caption = f"{plant.plant}: every crossover of the loop at the centres of the ellipses."
-    if any(each.phase_margin_rad < 0 for each in found.gain):
+    if any(each.phase_margin_rad < 0 for each in crossovers.gain):
         caption += " A negative phase margin: so much lead brings the loop to -1."
     return [Table(head, tuple(rows), caption)]
 

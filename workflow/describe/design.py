@@ -112,17 +112,18 @@ def calibration(found: SampledResponses) -> str:
 
 def reference_filter(result: ReferenceFilterResult) -> str:
     """What a reference filter gains, or why there is none."""
-    found = result.filter
-    if found is None:
+    designed = result.filter
+    if designed is None:
         return result.reason or ""
     gained = ""
-    if found.error_after > 0:
-        gain = found.error_before / found.error_after
+    if designed.error_after > 0:
+        gain = designed.error_before / designed.error_after
         gained = ": no improvement" if gain < _NO_IMPROVEMENT else f", {number(gain)} times smaller"
+    after = number(designed.error_after, 4)
+    before = number(designed.error_before, 4)
     return (
-        f"reference filter of order {found.order}: largest weighted model-matching error "
-        f"{number(found.error_after, 4)} with it, {number(found.error_before, 4)} without{gained} (largest "
-        f"at {frequency(found.worst_rad_s, 4)})"
+        f"reference filter of order {designed.order}: largest weighted model-matching error {after} with it, "
+        f"{before} without{gained} (largest at {frequency(designed.worst_rad_s, 4)})"
     )
 
 
@@ -293,10 +294,10 @@ def design_verdict(
             "PID: fix less of it), or improve the model where its ellipses are widest"
         )
     if certificate.certified:
-        less = gave_way_text(given_way)
+        concessions = gave_way_text(given_way)
         parts = [
             "" if asked is None else sentences.lowered(asked, design.specification, (), 0),
-            f"with {less}" if less else "",
+            f"with {concessions}" if concessions else "",
             "" if asked is None else sentences.tracking_begins(asked, design.specification),
         ]
         said_of = "; ".join([design.reason, *(part for part in parts if part)])
@@ -423,12 +424,12 @@ def _any_order_blocks(
     bracket = achievable.bracket
     text = sentence(compared) if bracket is None or gamma is None else ""
     if bracket is not None:
-        found = "no controller was found"
+        best_known = "no controller was found"
         if math.isfinite(bracket.ellipse):
-            found = f"a controller with γ = {number(bracket.ellipse, 4)} was found"
+            best_known = f"a controller with γ = {number(bracket.ellipse, 4)} was found"
         text += (
             " Of any order, structure, pole damping and delay margin: γ is at least "
-            f"{at_least(bracket.floor)} (Youla, within a basis); {found}."
+            f"{at_least(bracket.floor)} (Youla, within a basis); {best_known}."
         )
     return [Text(text.strip())]
 

@@ -344,11 +344,15 @@ def _untried_sentences(answer: Diagnosis) -> Iterator[str]:
 
 
 def _remarks_on_values(answer: Diagnosis) -> Iterator[str]:
-    """Values whose interval does not say all."""
+    """Sentences on values whose interval does not say all.
+
+    A value at an end of its searched range is not determined. `widened_by` of an effect names the stated
+    value whose tolerance makes up most of its variance, so that without it half of the width goes.
+    """
     for effect in answer.present:
         name = in_words(effect.name)
         for key, remark in effect.remarks.items():
-            yield f"{name}: {stated_name(key)} is {remark}; these records do not determine it."
+            yield f"{begun(name)}: {stated_name(key)} is {remark}; these records do not determine it."
         if effect.widened_by:
             yield (
                 f"{begun(name)}: the interval is wide mainly because {key_words(effect.widened_by)} is only "

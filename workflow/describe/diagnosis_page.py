@@ -549,7 +549,16 @@ _NO_CHECK = {
 
 
 def controller_blocks(check: ControllerCheck | None, no_check: str) -> tuple[Block, ...]:
-    """What the model error does to a controller, or why that is not known."""
+    """What the model error does to a controller, or why that is not known.
+
+    Args:
+        check: Its runs are those of the design on nominal parameters, as predicted and on the repaired model,
+            then those of the design on the repaired model.
+        no_check: Without a check, why: a key of `_NO_CHECK`, or words.
+
+    Returns:
+        Two sentences, the picture and the table of the runs; without a check one sentence.
+    """
     if check is None:
         return (Text(_NO_CHECK.get(no_check, f"No controller to compare: {no_check}.")),)
     nominal, nominal_reached, repaired, repaired_reached = check.runs

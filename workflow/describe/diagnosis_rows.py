@@ -62,9 +62,9 @@ def short_answer(document: Document) -> str:
         if document["completeness"]["probability"] < PRESENT:
             return "no candidate effect, but more remains than the threshold"
         return "no significant model error"
-    more = "" if document["completeness"]["probability"] >= PRESENT else ", and something else"
+    addition = "" if document["completeness"]["probability"] >= PRESENT else ", and something else"
     unsure = " (ambiguous)" if document["detail_verdict"] == "ambiguous" else ""
-    return names_words(present) + unsure + more
+    return names_words(present) + unsure + addition
 
 
 def repair_words(document: Document) -> str:

@@ -93,20 +93,20 @@ class DiagnosisView:
     def partial(self) -> tuple[tuple[tuple[str, ...], float], ...]:
         """Effects that explain a part of the validation error by themselves, with that share, most first."""
         closes = self.found.shares.closes if self.found.shares else ()
-        return tuple(one for one in closes if one[1] > 0)[:_MOST_PARTIAL]
+        return tuple(closing for closing in closes if closing[1] > 0)[:_MOST_PARTIAL]
 
     @property
     def left(self) -> tuple[OutputError, ...]:
         """What every model misses of every output."""
-        found = self.found
-        of_model = [left_of(found.case, found.residuals[model]) for model in found.models]
+        diagnosis = self.found
+        of_model = [left_of(diagnosis.case, diagnosis.residuals[model]) for model in diagnosis.models]
         return tuple(
             OutputError(
                 name,
                 tuple((float(share[k]), float(rms[k])) for share, rms in of_model),
-                float(found.case.noise[k]),
+                float(diagnosis.case.noise[k]),
             )
-            for k, name in enumerate(found.case.machine.output_names)
+            for k, name in enumerate(diagnosis.case.machine.output_names)
         )
 
     def bare_size(self, size: float) -> str:
@@ -142,7 +142,7 @@ def shown(found: Diagnosis) -> Diagnosis:
         white=white,
     )
     start, moved_to, end = (
-        page.size_of([one[e.name] for e in case.held_out]) for one in (before, refit, after)
+        page.size_of([residuals_of[e.name] for e in case.held_out]) for residuals_of in (before, refit, after)
     )
     return replace(page, gap_before=start, gap_refit=moved_to, gap_after=end)
 

@@ -102,7 +102,8 @@ def _bullets(view: RunView) -> list[str]:
     gamma = results.design.gamma
     order = asked.controller_order
     bullets = [
-        measured_beyond_text(found, config.closed_loop.effects) for found in measured_beyond(results, config)
+        measured_beyond_text(contradiction, config.closed_loop.effects)
+        for contradiction in measured_beyond(results, config)
     ]
     scaled = signals_where_scaled(config, results)
     if scaled:
@@ -230,7 +231,7 @@ def _doubts_about(channel: ChannelView, *, designed: bool) -> list[str]:
 
 
 def _all_settle(view: RunView) -> str:
-    """That every run settles; "" where one does not."""
+    """Says that every run settles; "" where one does not."""
     check = view.results.closed_loop.check
     if check is None or check.settled_draws != check.draws:
         return ""

@@ -318,8 +318,8 @@ def _group_words(group: Group) -> str:
         _, low, high = group.sizes[group.apart]
         words += f", {stated_name(key)} {value_words(key, low)} to {value_words(key, high)}"
     names = [file_link(f"{machine.name}.html", machine.name) for machine in group.machines[:_MOST_NAMED]]
-    more = ", …" if len(group.machines) > _MOST_NAMED else ""
-    return Markup("{} ({}{})").format(words, Markup(", ").join(names), more)
+    unnamed = ", …" if len(group.machines) > _MOST_NAMED else ""
+    return Markup("{} ({}{})").format(words, Markup(", ").join(names), unnamed)
 
 
 def causes_table(machine_groups: Sequence[Group]) -> Table:

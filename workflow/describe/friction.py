@@ -82,10 +82,10 @@ def sticking(found: FrictionCheck, output_unit: str) -> str:
 
 
 def stands_still(sine: SlowSine, output_unit: str, *, feedforward: bool) -> str:
-    """That friction holds the arm on the slow sine; "" elsewhere. feedforward: it is on in this run."""
+    """Says that friction holds the arm on the slow sine; "" where it does not. feedforward: it is on."""
     if not sine.stands_still:
         return ""
-    without, given = sine.rms
+    without, with_feedforward = sine.rms
     remedy = "friction_feedforward = true in [closed_loop]"
     if feedforward:
         remedy = "the feed-forward of this run"
@@ -93,7 +93,7 @@ def stands_still(sine: SlowSine, output_unit: str, *, feedforward: bool) -> str:
         f"{'without feed-forward' if feedforward else 'with friction'} the arm stands still on a sine of "
         f"{si(sine.amplitude, output_unit)} at {frequency(sine.omega_rad_s)}, and follows it only from about "
         f"{si(sine.moves_from, output_unit)} on; {remedy} takes the rms error of this sine from "
-        f"{si(without, output_unit)} to {si(given, output_unit)}"
+        f"{si(without, output_unit)} to {si(with_feedforward, output_unit)}"
     )
 
 
@@ -138,48 +138,50 @@ def beside_recorded(found: FrictionCheck, output_unit: str) -> str:
 
 
 def waits(check: LoopCheck) -> str:
-    """That friction lets the step settle later than the recorded loop, or much later than the linear one."""
-    found = check.friction
-    if found is None:
+    """Says that friction lets the step settle later than the recorded loop, or much later than the linear
+    one; "" where it does neither."""
+    friction = check.friction
+    if friction is None:
         return ""
-    if found.times_slower > _SLOWER:
+    if friction.times_slower > _SLOWER:
         said_of = "slower than the recorded loop with friction"
-        if math.isfinite(found.times_slower):
-            said_of += f": {number(found.times_slower, 2)} times"
+        if math.isfinite(friction.times_slower):
+            said_of += f": {number(friction.times_slower, 2)} times"
         return said_of
     return "friction holds the step back" if check.waits_for_friction else ""
 
 
 def friction_blocks(check: LoopCheck, view: RunView) -> list[Block]:
     """What the identified friction does to the loop, for a page; nothing where none was identified."""
-    found = check.friction
-    if found is None:
+    friction = check.friction
+    if friction is None:
         return []
     unit = view.output_unit
-    sizes = friction_range(found, unit)
+    sizes = friction_range(friction, unit)
     all_inside = True
-    if found.measured is not None:
-        all_inside = found.inside == len(found.sizes)
-        of_all = f"{found.inside} of {len(found.sizes)}"
+    if friction.measured is not None:
+        all_inside = friction.inside == len(friction.sizes)
+        of_all = f"{friction.inside} of {len(friction.sizes)}"
         sizes += f". {of_all} peaks measured on the arm lie in their predicted intervals"
     stands = "Every step moves the arm in the end: the integral action raises the command"
-    stuck = sticking(found, unit)
+    stuck = sticking(friction, unit)
     if stuck:
-        deflection = si(found.presliding, unit)
+        deflection = si(friction.presliding, unit)
         until = "until the command settles"
         stands = f"{stuck}: the shaft stays within its pre-sliding deflection ({deflection}) {until}"
-    stands += f". With friction {friction_step(found, unit)}"
-    level = f"{si(found.level, view.input_unit, 4)} ({interval(found.level_interval)})"
-    rest = f"Friction at standstill: {level}"
-    if found.error_at_rest > 0:
-        rest = (
-            f"Friction of {level} at standstill leaves at most {si(found.error_at_rest, unit)} of error at "
-            f"rest ({interval(found.error_interval)})"
+    stands += f". With friction {friction_step(friction, unit)}"
+    level = f"{si(friction.level, view.input_unit, 4)} ({interval(friction.level_interval)})"
+    at_rest = f"Friction at standstill: {level}"
+    if friction.error_at_rest > 0:
+        error = si(friction.error_at_rest, unit)
+        at_rest = (
+            f"Friction of {level} at standstill leaves at most {error} of error at rest "
+            f"({interval(friction.error_interval)})"
         )
-        if check.tracking and found.measured is not None:
+        if check.tracking and friction.measured is not None:
             left = max(abs(row.steady_error) for row in check.achieved)
-            rest += f"; the runs ended with {si(left, unit)} at most"
-    items = tuple(sentence(text) for text in (sizes, stands, rest, _feedforward(found, view)))
+            at_rest += f"; the runs ended with {si(left, unit)} at most"
+    items = tuple(sentence(text) for text in (sizes, stands, at_rest, _feedforward(friction, view)))
     return [
         Remarks(items, "good" if all_inside else "warning"),
         Picture(
@@ -194,7 +196,7 @@ def _feedforward(found: FrictionCheck, view: RunView) -> str:
     """What friction feed-forward does to the error on a slow sine."""
     unit = view.output_unit
     sine = found.tracking
-    without, given = sine.rms
+    without, with_feedforward = sine.rms
     state = "off: friction_feedforward = true in [closed_loop]"
     if view.config.closed_loop.friction_feedforward:
         state = "on"
@@ -207,7 +209,7 @@ def _feedforward(found: FrictionCheck, view: RunView) -> str:
     stands = ": on this one it stands still without feed-forward" if sine.stands_still else ""
     return (
         f"Friction feed-forward ({state}) takes the rms error on a sine ({si(sine.amplitude, unit)} at "
-        f"{frequency(sine.omega_rad_s)}{times}) from {si(without, unit)} to {si(given, unit)} "
+        f"{frequency(sine.omega_rad_s)}{times}) from {si(without, unit)} to {si(with_feedforward, unit)} "
         f"({si(sine.linear_rms, unit)} without friction and noise). At this frequency sines from about "
         f"{si(sine.moves_from, unit)} on move the arm{stands}"
     )

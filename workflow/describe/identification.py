@@ -154,24 +154,24 @@ def _unstable_rows(found: IdentifiedChannel, intervals: Intervals | None) -> lis
 
 def pole_blocks(channel: ChannelView, truths: Sequence[TrueMode | None] = ()) -> list[Block]:
     """Pole pairs, real and unstable poles with their intervals, for a page; beside pairs the true modes."""
-    found = channel.found
+    identified = channel.found
     known = channel.spread.intervals
     level = "" if known is None else share(known.level)
     blocks: list[Block] = []
-    if found.modes:
-        blocks.append(_pair_table(found, known, truths))
-    if found.real_poles_z:
+    if identified.modes:
+        blocks.append(_pair_table(identified, known, truths))
+    if identified.real_poles_z:
         rows = []
-        for index, place in enumerate(found.real_poles_z):
-            cells = [number(place, 6), _decay(place, found.model.dt_s)]
+        for index, place in enumerate(identified.real_poles_z):
+            cells = [number(place, 6), _decay(place, identified.model.dt_s)]
             if known is not None:
                 cells.append(interval(known.real_poles_per_s[index]) if place > 0 else MISSING)
             rows.append(tuple(cells))
         head = ["real pole z [1]", "decay rate [1/s]"] + ([f"{level} interval"] if known else [])
         blocks.append(Table(tuple(head), tuple(rows)))
-    if found.unstable_poles:
+    if identified.unstable_poles:
         rows = []
-        for index, (growth_per_s, omega_rad_s) in enumerate(found.unstable_poles):
+        for index, (growth_per_s, omega_rad_s) in enumerate(identified.unstable_poles):
             cells = [frequency(omega_rad_s) if omega_rad_s else "real", number(growth_per_s, 4)]
             if known is not None:
                 cells.append(interval(known.growth_per_s[index]))
@@ -281,39 +281,39 @@ def identification_page(view: RunView) -> PageSection:
 
 
 def _channel_blocks(channel: ChannelView, *, is_control: bool) -> list[Block]:
-    found = channel.found
-    estimation = found.fit_percent["estimation"]
+    identified = channel.found
+    estimation = identified.fit_percent["estimation"]
     how = "Fit to"
-    if found.increments:
+    if identified.increments:
         how = "Fitted to the differences from sample to sample, so that drift weighs less. Fit to those of"
     fit = f"{how} {count(len(estimation), 'record')}: {extent(estimation.values(), 3)} %"
-    if found.fit_percent["validation"]:
-        fit += f"; on validation data: {fits(found.fit_percent['validation'])}"
+    if identified.fit_percent["validation"]:
+        fit += f"; on validation data: {fits(identified.fit_percent['validation'])}"
     closed = channel.closed_loop is not None
     caption = f"Poles and zeros in the z-plane{', and poles of the closed loop' if closed else ''}."
     blocks: list[Block] = [
-        Text(f"{found.input} to {found.output}: {structure(found)}. {fit}."),
+        Text(f"{identified.input} to {identified.output}: {structure(identified)}. {fit}."),
         *pole_blocks(channel),
         Picture(
             "poles",
             caption,
-            (found.model, channel.name, channel.closed_loop, channel.spread.intervals),
+            (identified.model, channel.name, channel.closed_loop, channel.spread.intervals),
             channel.file,
         ),
-        Remarks(sentences(found.identification.warnings), "warning", "Warnings about this model"),
+        Remarks(sentences(identified.identification.warnings), "warning", "Warnings about this model"),
     ]
-    if found.closed_loop is not None:
-        blocks.append(Remarks(sentences([found.closed_loop]), "note", "Records made in closed loop"))
+    if identified.closed_loop is not None:
+        blocks.append(Remarks(sentences([identified.closed_loop]), "note", "Records made in closed loop"))
     if not is_control:
         return blocks
     surface = (
         f"Error over frequency and damping of the pair at {frequency(channel.shown_omega_rad_s)}, the other "
     )
     blocks += [
-        Remarks(sentences(found.identification.verdicts), "note", "What the data decided"),
+        Remarks(sentences(identified.identification.verdicts), "note", "What the data decided"),
         Picture("error-surface", f"{surface}poles fixed.", (channel,), channel.file),
     ]
-    if found.stabilisation is not None and found.identification.order_table:
+    if identified.stabilisation is not None and identified.identification.order_table:
         blocks.append(Text(stabilisation_text(channel)))
         blocks.append(Picture("order", ORDER_CAPTION, (channel,), channel.file))
     return blocks + order_table(channel)

@@ -90,13 +90,15 @@ def identify_sections(result: LogIdentification) -> list[Section]:
 
 def identify_first_screen(result: LogIdentification, channel: ChannelView) -> FirstScreen:
     """What the page of `flexlink identify` begins with."""
-    found = channel.found
+    identified = channel.found
     light = channel.light
     level = share(channel.spread.level)
     warned = ""
     if result.careful:
         warned = f"; {count(len(result.careful), 'warning')}"
-    headline = f"Model of order {found.model.order} with {count(len(light), 'lightly damped mode')}{warned}"
+    headline = (
+        f"Model of order {identified.model.order} with {count(len(light), 'lightly damped mode')}{warned}"
+    )
     marked = "; lightly damped modes marked" if light else ""
     picture = Picture(
         "response",
@@ -110,17 +112,17 @@ def identify_first_screen(result: LogIdentification, channel: ChannelView) -> Fi
 
 def _first_rows(result: LogIdentification, channel: ChannelView) -> tuple[Row, ...]:
     """Fit, up to three modes, size of the ellipses."""
-    found = channel.found
+    identified = channel.found
     spread = channel.spread
     fresh = channel.unseen
     if fresh:
         name, fit_percent, _ = min(fresh, key=lambda row: row[1])
         remark = f"smallest of {len(fresh)} records" if len(fresh) > 1 else name
-        if found.increments:
+        if identified.increments:
             remark += ", increments"
         rows = [Row("", "fit, validation", Quantity.of(fit_percent, "%"), remark)]
     else:
-        least = min(found.fit_percent["estimation"].values())
+        least = min(identified.fit_percent["estimation"].values())
         rows = [Row("", "fit, estimation records", Quantity.of(least, "%"), "no validation record")]
     for order, (place, mode) in enumerate(channel.light[:_SHOWN_MODES], 1):
         remark = true_mode(result.true_modes[place]) if result.true_modes else ""
@@ -147,12 +149,12 @@ def _known_to(ends: tuple[float, float]) -> str:
 
 def _bullets(result: LogIdentification, channel: ChannelView) -> list[str]:
     """Sentences on a model, the weightiest first; empty ones are left out by whoever shows them."""
-    found = channel.found
+    identified = channel.found
     spread = channel.spread
     first = result.measured[0]
     input_unit = "".join(first.input_units)
     output_unit = "".join(first.output_units)
-    bullets = [] if found.closed_loop is None else [words(found.closed_loop)]
+    bullets = [] if identified.closed_loop is None else [words(identified.closed_loop)]
     bullets += [words(item) for item in result.careful]
     worst = min(channel.unseen, key=lambda row: row[1], default=None)
     if worst is None:
@@ -163,8 +165,8 @@ def _bullets(result: LogIdentification, channel: ChannelView) -> list[str]:
     elif worst[1] < HALF_PERCENT:
         bullets.append(misses_half(worst[0]))
     bullets.append(unknown_bands(spread.bands))
-    if found.band_rad_s is not None:
-        low, high = found.band_rad_s
+    if identified.band_rad_s is not None:
+        low, high = identified.band_rad_s
         bullets.append(
             f"Fitted inside the band from {number(low)} to {number(high)} rad/s; the model does not cover "
             "other frequencies"
@@ -173,14 +175,14 @@ def _bullets(result: LogIdentification, channel: ChannelView) -> list[str]:
     bullets.append(cut_off(logs, result.input_limit, input_unit))
     real, pairs = channel.searched
     bullets.append(
-        f"{structure(found)}: {count(real, 'real pole')} and {count(pairs, 'pole pair')} were found, "
+        f"{structure(identified)}: {count(real, 'real pole')} and {count(pairs, 'pole pair')} were found, "
         f"{_why_this_order(channel)}"
     )
     about = described(result.described, result.friction, input_unit, output_unit, result.equivalent)
     bullets.append(about.replace("They describe", "The ellipses describe", 1))
     if all(test.passed for test in spread.tests):
         bullets.append("The residuals pass both tests, whiteness and independence of the input")
-    bullets += [words(item) for item in found.identification.verdicts if item not in result.careful]
+    bullets += [words(item) for item in identified.identification.verdicts if item not in result.careful]
     return bullets
 
 
@@ -220,12 +222,12 @@ def identify_page_sections(
         stated: Options that differ from their defaults, then versions.
         inputs: SHA-256 by file.
     """
-    found = channel.found
+    identified = channel.found
     spread = channel.spread
     level = share(spread.level)
     unseen = channel.unseen
     modes = pole_blocks(channel, result.true_modes)
-    if found.modes or found.real_poles_z or found.unstable_poles:
+    if identified.modes or identified.real_poles_z or identified.unstable_poles:
         modes.append(Text("Intervals include noise, initial state and unmodelled dynamics."))
     caption = (
         f"Identified response with its {level} ellipses, their size, and the response computed from the "
@@ -233,7 +235,7 @@ def identify_page_sections(
     )
     response = (Picture("bode", caption, (channel, "Response")), band_table(spread.bands))
     order: list[Block] = [Picture("order", ORDER_CAPTION, (channel,))]
-    if found.stabilisation is not None:
+    if identified.stabilisation is not None:
         order.append(Text(stabilisation_text(channel)))
     order += order_table(channel) or [Text(who_chose(channel.options))]
     fresh: list[Block] = [free_run_picture(channel)]
@@ -286,9 +288,9 @@ def _record_blocks(
     result: LogIdentification, channel: ChannelView, records: Sequence[RunRecord]
 ) -> list[Block]:
     """The logs, how their time was read, and the fit of each."""
-    found = channel.found
+    identified = channel.found
     first = result.measured[0]
-    fit_of = found.fit_percent
+    fit_of = identified.fit_percent
     rows = tuple(
         (
             place,
@@ -304,7 +306,9 @@ def _record_blocks(
     read_input = signal(first.input_names[0], first.input_units)
     read_output = signal(first.output_names[0], first.output_units)
     return [
-        Picture("records", "All records on one time axis.", (records, [found.input], [found.output])),
+        Picture(
+            "records", "All records on one time axis.", (records, [identified.input], [identified.output])
+        ),
         Text(f"Input {read_input}, output {read_output}."),
         Table(("no.", "record", "used for", "samples", "length [s]", "time", "fit [%]"), rows),
     ]

@@ -89,16 +89,19 @@ def joints_numbers(
     settled, total = loop.settled_points()
     if not total:
         return tuple(rows)
-    most = -float("inf")
+    largest = -float("inf")
     place = ""
     for run in loop.runs:
         for joint, overshoot in zip(config.joints, run.overshoot.tolist(), strict=True):
-            if overshoot > most:
-                most = overshoot
+            if overshoot > largest:
+                largest = overshoot
                 place = f"{joint.output} at {run.point}, {run.condition}"
     rows.append(
         Row(
-            "closed_loop.overshoot_percent", "overshoot", Quantity.of(100 * most, "%"), f"largest, of {place}"
+            "closed_loop.overshoot_percent",
+            "overshoot",
+            Quantity.of(100 * largest, "%"),
+            f"largest, of {place}",
         )
     )
     arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"

@@ -89,8 +89,8 @@ def records_page(view: AnyRunView) -> PageSection:
     ]
     effects = getattr(config.source, "effects", ())
     if effects:
-        told = tuple((effect["name"], setting(effect)) for effect in effects)
-        blocks.append(Table(("effect on the simulated arm", "parameters"), told))
+        effect_rows = tuple((effect["name"], setting(effect)) for effect in effects)
+        blocks.append(Table(("effect on the simulated arm", "parameters"), effect_rows))
     if not simulated:
         read = tuple(f"{item.name}: {time_base(item.record)}" for item in items)
         doubts = [sentence(words(doubt)) for item in items for doubt in item.record.doubts]
@@ -234,7 +234,7 @@ def distortion_page(channel: ChannelView) -> PageSection:
 
 def distortion_blocks(channel: ChannelView) -> list[Block]:
     """Levels of noise and distortion by band."""
-    found, known, refused = channel.distortion
+    distortions, known, refused = channel.distortion
     blocks: list[Block] = []
     if refused:
         blocks.append(Text(f"Not analysed: {refused}."))
@@ -245,11 +245,11 @@ def distortion_blocks(channel: ChannelView) -> list[Block]:
             "distortion",
             f"{about} and scatter at every frequency of the input. Points above the noise curve are "
             "nonlinear distortion.",
-            (found, channel.units),
+            (distortions, channel.units),
             channel.file,
         )
     )
-    for levels in found:
+    for levels in distortions:
         if levels.excited is None or not len(levels.bands_rad_s):
             continue
         blocks.append(_distortion_table(levels, channel.units[0]))

@@ -83,10 +83,10 @@ def with_rows(document: Mapping[str, Any], sections: Sequence[Section]) -> dict[
 def _merged(document: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(document)
     for key, value in more.items():
-        there = merged.get(key)
-        if isinstance(value, dict) and isinstance(there, dict):
-            merged[key] = _merged(there, value)
-        elif there is None:
+        present = merged.get(key)
+        if isinstance(value, dict) and isinstance(present, dict):
+            merged[key] = _merged(present, value)
+        elif present is None:
             merged[key] = value
         else:
             raise ValueError(f"the key {key!r} of a row is there already")
@@ -184,21 +184,21 @@ def joints_sections(results: Any, config: JointsConfig) -> list[Section]:
 def channel_sections(results: RunResults) -> list[Section]:
     """Model and ellipses of every channel."""
     sections = []
-    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+    for channel, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
         rows = (
-            *model_rows(found, spread.intervals, whole=False),
-            *(worded("warning", words(item)) for item in found.identification.warnings),
+            *model_rows(channel, spread.intervals, whole=False),
+            *(worded("warning", words(item)) for item in channel.identification.warnings),
             *ellipse_rows(spread, whole=False),
         )
-        sections.append(Section(f"channel {found.name}", rows))
+        sections.append(Section(f"channel {channel.name}", rows))
     return sections
 
 
 def warnings_of(results: RunResults) -> list[Finding]:
     """Warnings about the models, and residual tests that fail, channel by channel."""
     warnings: list[Finding] = []
-    for found, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
-        warnings += found.identification.warnings
+    for channel, spread in zip(results.identify.channels, results.uncertainty.channels, strict=True):
+        warnings += channel.identification.warnings
         warnings += [test.finding for test in spread.tests if not test.passed]
     return warnings
 
@@ -208,8 +208,8 @@ def first_warning(warnings: Sequence[str]) -> Row | None:
     distinct = list(dict.fromkeys(warnings))
     if not distinct:
         return None
-    more = f" ({len(distinct) - 1} more: --verbose)" if len(distinct) > 1 else ""
-    return worded("warning", f"{distinct[0]}{more}")
+    further = f" ({len(distinct) - 1} more: --verbose)" if len(distinct) > 1 else ""
+    return worded("warning", f"{distinct[0]}{further}")
 
 
 def signals_where_scaled(config: AnyConfig, results: RunResults) -> str:
@@ -260,7 +260,7 @@ def run_document(results: RunResults, config: RunConfig) -> dict[str, Any]:
     used = design.specification or config.specification
     return {
         "command_timing": timing_numbers(results.records.timing),
-        "channels": [channel_numbers(found, spread) for found, spread in pairs],
+        "channels": [channel_numbers(channel, spread) for channel, spread in pairs],
         "design": {
             "met": design.met,
             "reason": design.reason,

@@ -143,7 +143,11 @@ def band_table(bands: Sequence[Band]) -> Table:
 
 
 def unknown_bands(bands: Sequence[Band]) -> str:
-    """Bands whose ellipses are larger than the response; "" where there is none."""
+    """A warning on bands whose ellipses are larger than the response, in the median over the band.
+
+    Returns:
+        Two sentences with the bands; "" where there is none.
+    """
     ranges = [
         f"{number(band.from_rad_s)} to {number(band.to_rad_s)}"
         for band in bands
@@ -151,10 +155,10 @@ def unknown_bands(bands: Sequence[Band]) -> str:
     ]
     if not ranges:
         return ""
-    these, them = ("this band", "it") if len(ranges) == 1 else ("these bands", "them")
+    bands_named, pronoun = ("this band", "it") if len(ranges) == 1 else ("these bands", "them")
     return (
         f"From {listing(ranges)} rad/s the ellipses are larger than the response itself: gain and phase are "
-        f"not known there. Excite {these}, or keep the controller out of {them}."
+        f"not known there. Excite {bands_named}, or keep the controller out of {pronoun}."
     )
 
 
@@ -181,7 +185,7 @@ def free_run_picture(channel: ChannelView) -> Picture:
 
 
 def misses_half(record: str) -> str:
-    """That the model misses more than half of the output of a record."""
+    """A warning that the model misses more than half of the output of a record."""
     return (
         f"On {record} the model misses more than half of the output. Dry friction, drift or another "
         "operating point are common causes."
@@ -199,7 +203,7 @@ def uncertainty_page(view: RunView) -> PageSection:
 
 
 def _channel_blocks(channel: ChannelView, view: RunView) -> list[Block]:
-    found = channel.found
+    identified = channel.found
     spread = channel.spread
     is_control = channel is view.control
     level = share(spread.level)
@@ -239,9 +243,9 @@ def _channel_blocks(channel: ChannelView, view: RunView) -> list[Block]:
         )
     )
     blocks.append(Remarks((unknown_bands(spread.bands),), "warning"))
-    if channel.unseen and not found.fit_percent["validation"]:
+    if channel.unseen and not identified.fit_percent["validation"]:
         blocks.append(Text("Repeats show the noise; they do not test another input."))
-    if channel.unseen and channel.unseen[0][1] < HALF_PERCENT and not found.increments:
+    if channel.unseen and channel.unseen[0][1] < HALF_PERCENT and not identified.increments:
         blocks.append(Remarks((misses_half(channel.unseen[0][0]),), "warning"))
     blocks.append(free_run_picture(channel))
     if len(channel.unseen) > 1:
@@ -286,26 +290,26 @@ def _scatter_table(scatter: Sequence[ScatterRow]) -> Table:
 
 def untold_below_rad_s(found: FrequencyUncertainty) -> float:
     """Up to here an ellipse is wider than the gain, from the lowest frequency on; 0 where none is."""
-    told = np.flatnonzero(found.enclosing_radius() < np.abs(found.centre))
-    if told.size == 0:
+    resolved = np.flatnonzero(found.enclosing_radius() < np.abs(found.centre))
+    if resolved.size == 0:
         return float(found.omega_rad_s[-1])
-    return float(found.omega_rad_s[told[0] - 1]) if told[0] else 0.0
+    return float(found.omega_rad_s[resolved[0] - 1]) if resolved[0] else 0.0
 
 
 def uncertainty_numbers(spread: UncertainChannel) -> dict[str, Any]:
     """The ellipses of a channel for programs, arrays left out."""
-    found: dict[str, Any] = codec.plain(spread, arrays=False)
+    ellipses: dict[str, Any] = codec.plain(spread, arrays=False)
     for unwanted in ("posterior", "nominal", "frequency", "empirical"):
-        found.pop(unwanted)
+        ellipses.pop(unwanted)
     if spread.intervals is not None:
-        for row, known in zip(found["intervals"]["modes"], spread.intervals.modes, strict=True):
+        for row, known in zip(ellipses["intervals"]["modes"], spread.intervals.modes, strict=True):
             row["frequency_Hz"] = list(known.frequency_Hz)
-    for row, test in zip(found["tests"], spread.tests, strict=True):
+    for row, test in zip(ellipses["tests"], spread.tests, strict=True):
         row["verdict"] = words(test.finding)
-    for part in found["others"]:
+    for part in ellipses["others"]:
         del part["posterior"], part["nominal"]
-    found["advice"] = [words(item) for item in spread.advice]
-    return {**found, "report": codec.plain(spread.posterior.report)}
+    ellipses["advice"] = [words(item) for item in spread.advice]
+    return {**ellipses, "report": codec.plain(spread.posterior.report)}
 
 
 def channel_numbers(found: IdentifiedChannel, spread: UncertainChannel) -> dict[str, Any]:

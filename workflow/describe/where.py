@@ -229,9 +229,11 @@ def experiments_words(where: Where, floor: Floor) -> str:
     all_show = f"All {len(with_error)} experiments show the model error"
     if largest.gap.interval[0] <= CLEARLY_LARGER * smallest.gap.interval[1]:
         return f"{all_show}, about equally."
-    most = f"{_file_words(largest.experiment)} most ({floor.said(largest.gap.gap_rms)} {floor.units})"
+    largest_words = (
+        f"{_file_words(largest.experiment)} most ({floor.said(largest.gap.gap_rms)} {floor.units})"
+    )
     least = f"{_file_words(smallest.experiment)} least ({floor.said(smallest.gap.gap_rms)})"
-    return f"{all_show}, {most}, {least}."
+    return f"{all_show}, {largest_words}, {least}."
 
 
 def _file_words(experiment: str) -> str:
