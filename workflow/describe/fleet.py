@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -73,25 +74,28 @@ class FleetMachine:
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> FleetMachine:
         """What an overview keeps of a JSON answer."""
-        present = {name: document["presence"][name] for name in present_of(document)}
-        unknown = (float("nan"), float("nan"))
+        verdict = document["verdict"]
+        decided = verdict != "unknown" and document["detail_verdict"] != "not_converged"
+        effects = present_of(document)
+        sizes = {}
+        for name in effects:
+            effect = document["presence"][name]
+            for key, value in effect["parameters"].items():
+                low, high = effect["intervals"].get(key) or (math.nan, math.nan)
+                sizes[name, key] = (value, low, high)
+        values = {}
+        for key, value in document["repair"]["values"].items():
+            values[key] = (value["stated"], value["repaired"])
         return cls(
             document["case"],
-            document["verdict"],
-            document["verdict"] != "unknown" and document["detail_verdict"] != "not_converged",
-            tuple(sorted(present)),
+            verdict,
+            decided,
+            tuple(sorted(effects)),
             short_answer(document),
             explained_words(document),
             {key: document[key] for key in _NUMBERS},
-            {
-                (name, key): (value, *(effect["intervals"].get(key) or unknown))
-                for name, effect in present.items()
-                for key, value in effect["parameters"].items()
-            },
-            {
-                key: (value["stated"], value["repaired"])
-                for key, value in document["repair"]["values"].items()
-            },
+            sizes,
+            values,
         )
 
 
@@ -148,24 +152,31 @@ def _by_size(
     largest of n - 1 spacings exceeds a share g of it with probability (n - 1) (1 - g)^(n - 2) at most.
     """
     n = len(members)
+    if n < _LEAST_MACHINES:
+        return [(members, apart)]
     best: tuple[float, float, tuple[str, str]] = (_FALSE_TREND, 0.0, ("", ""))
     keys = [key for key in members[0].sizes if all(key in machine.sizes for machine in members)]
-    for key in keys if n >= _LEAST_MACHINES else ():
+    for key in keys:
         sizes = np.sort([machine.sizes[key][0] for machine in members])
-        x = np.sign(sizes) * np.log(np.abs(sizes)) if np.min(sizes) * np.max(sizes) > 0 else sizes
+        x = sizes
+        if sizes[0] * sizes[-1] > 0:
+            x = np.sign(sizes) * np.log(np.abs(sizes))
+        # The widest gap parts the machines; it counts where two or more lie on either side, nearer together.
         k = int(np.argmax(np.diff(x))) + 1
         gap = x[k] - x[k - 1]
-        if 1 < k < n - 1 and gap > max(x[k - 1] - x[0], x[-1] - x[k]):
-            chance = len(keys) * (n - 1) * (1 - gap / (x[-1] - x[0])) ** (n - 2)
+        width_below = x[k - 1] - x[0]
+        width_above = x[-1] - x[k]
+        if 1 < k < n - 1 and gap > max(width_below, width_above):
+            gap_share = gap / (x[-1] - x[0])
+            # Every size is a trial more.
+            chance = len(keys) * (n - 1) * (1 - gap_share) ** (n - 2)
             best = min(best, (float(chance), float(sizes[k]), key))
-    chance, first, key = best
+    chance, first_above, key = best
     if not chance < _FALSE_TREND:
         return [(members, apart)]
-    parts = [
-        [machine for machine in members if (machine.sizes[key][0] >= first) == large]
-        for large in (False, True)
-    ]
-    return [split for part in parts for split in _by_size(part, key)]
+    below = [machine for machine in members if machine.sizes[key][0] < first_above]
+    above = [machine for machine in members if machine.sizes[key][0] >= first_above]
+    return [*_by_size(below, key), *_by_size(above, key)]
 
 
 def serial_numbers(names: Sequence[str]) -> dict[str, int]:

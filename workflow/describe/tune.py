@@ -40,18 +40,24 @@ def tune_rows(
     """
     times_s = [step.settling_time_s for step in steps]
     reached_s = [time_s for time_s in times_s if time_s is not None]
-    settling = si(max(reached_s), "s") if len(reached_s) == len(times_s) else "never"
+    settling = "never"
+    if len(reached_s) == len(times_s):
+        settling = si(max(reached_s), "s")
+    phase_deg = math.degrees(margins.phase_rad)
+    delay_ms = 1000 * margins.delay_s
+    overshoot = max(step.overshoot_percent for step in steps)
+    peak_command = max(step.peak_command for step in steps)
     return said(
         worded("worst case γ", at_most(gamma, 4)),
         worded("modulus margin", at_least(margins.modulus)),
         worded("gain margin", decibels(margins.gain_up)),
-        worded("phase margin", f"{at_least(math.degrees(margins.phase_rad))} deg"),
-        worded("delay margin", f"{at_least(1000 * margins.delay_s)} ms"),
+        worded("phase margin", f"{at_least(phase_deg)} deg"),
+        worded("delay margin", f"{at_least(delay_ms)} ms"),
         worded("bandwidth", f"{at_least(bandwidth_rad_s)} rad/s"),
-        worded("overshoot", percent(max(step.overshoot_percent for step in steps))),
+        worded("overshoot", percent(overshoot)),
         worded("settling time to 2 %", settling),
         worded("settling time with friction, steps of half to twice the size", friction),
-        worded("peak command", si(max(step.peak_command for step in steps), input_unit)),
+        worded("peak command", si(peak_command, input_unit)),
         worded("controller order", str(order)),
         pid_row(numbers),
         worded("at the limits", limits),
