@@ -228,7 +228,7 @@ def drawn(loaded, found, coming, monkeypatch):
             value = value[level]
         assert row.value.plain == value
     rows = [(row.name, row.text) for section in one.sections for row in section.rows]
-    assert shown.text(found)
+    assert shown.describe(found)
     return document, " ".join(page.split()), rows
 
 

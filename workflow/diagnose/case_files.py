@@ -138,8 +138,9 @@ def _experiment(
     names = {quantity: entry.column(quantity, settings.columns) for quantity in (*wanted, "reference_rad")}
     with naming(str(path)):
         table = read_table(path)
-        # Most logs have no reference; a column that was stated is missed where it is not there.
-        is_stated = entry.columns.reference_rad is not None or settings.columns.reference_rad is not None
+        # Some logs have no reference: a column stated for all is that of those that have it. One stated for
+        # this log is missed where it is not there.
+        is_stated = entry.columns.reference_rad is not None
         if is_stated or names["reference_rad"].column in table.names:
             wanted.append("reference_rad")
         columns = [names[quantity].column for quantity in wanted]
