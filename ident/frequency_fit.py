@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from ident.basis.model import GobfModel
 from ident.basis.options import EmbeddingOptions, IdentOptions
@@ -25,7 +26,6 @@ from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.plausible_modes import pairs_outside, pole_warnings, poles_without_data
 from ident.data.arrays import RealArray, lock
-from ident.data.distributions import chi_square_quantile
 from ident.data.finding import TEST_LEVEL, Finding, FindingKind, distinct, finding
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.shown import Shown
@@ -243,8 +243,8 @@ def identify_frf(
             FindingKind.CHI_SQUARE,
             chi_square=fit.rss,
             degrees_of_freedom=freedom,
-            expected_low=float(chi_square_quantile(1 - TEST_LEVEL, freedom)),
-            expected_high=float(chi_square_quantile(TEST_LEVEL, freedom)),
+            expected_low=chi2.ppf(1 - TEST_LEVEL, freedom),
+            expected_high=chi2.ppf(TEST_LEVEL, freedom),
         ),
         _assumed_outside(model, band_rad_s),
     ]
@@ -362,7 +362,7 @@ def _limited_to_data(
     read_from = (fit.end.rss, fit.end.poles.order, worth)
     given_criterion = fit.data.criterion(*read_from)(fit.end.rss, fit.end.poles.order)
     given_unknowns = fit.data.n_parameters(fit.end.poles.order)
-    by_chance = float(chi_square_quantile(TEST_LEVEL, unshown_poles.order))
+    by_chance = float(chi2.ppf(TEST_LEVEL, unshown_poles.order))
     best_fit = fit
     best_criterion = np.inf
     for structure in structures:

@@ -28,6 +28,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.fft import next_fast_len
 from scipy.linalg import block_diag
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
 from scipy.special import expit, logit
 
 from ident.basis.mimo_model import residue_columns
@@ -429,8 +431,6 @@ class ModalFit:
 
         A pole outside the circle is not refused: the rows then grow.
         """
-        from scipy.signal import lfilter  # here: it takes its time to load
-
         # A real pole leaves real rows real, which is half the work.
         kind: np.dtype[Any] = rows.dtype
         denominator: list[complex] = [1.0, -np.real(pole)]
@@ -448,8 +448,6 @@ class ModalFit:
         After `MOST_EVALUATIONS` it stops where it is, without a word. SciPy raises ValueError where there are
         fewer samples of all outputs than free numbers, or where the residual is not finite.
         """
-        from scipy.optimize import least_squares  # here: it takes its time to load
-
         # SciPy asks for the residual and then for the Jacobian at the same numbers: both come from one pass.
         last: dict[bytes, tuple[RealArray, RealArray]] = {}
 

@@ -25,6 +25,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter, tf2ss
 
 from ident.basis.model import GobfModel
 from ident.basis.options import IdentOptions
@@ -34,7 +35,6 @@ from ident.checks.early_checks import refuse_few_lines
 from ident.checks.validation import SAME_RESPONSE, FreshFit, fit_on_fresh_data
 from ident.closed_loop import TwoStage, reference_to_input
 from ident.data.arrays import RealArray
-from ident.data.filters import through_filter
 from ident.data.record import Record
 from ident.fit.least_squares import fit
 from ident.fit.regression import prepare
@@ -92,7 +92,7 @@ def opened_by_loop(
         # From rest: offset and motion at the start are taken off what the free run leaves.
         motion = of_input.input[:, 0] - of_input.input[0, 0]
         error = sensitivity(motion)
-        command = through_filter(numerator, denominator, error)
+        command = lfilter(numerator, denominator, error)
         left = -fit_on_fresh_data(error_of, of_error).residual
         opened.append(
             replace(
@@ -205,8 +205,6 @@ def _loop_of(model: GobfModel, numerator: RealArray, denominator: RealArray) -> 
     Raises ValueError for a model with a direct term: the loop is
     algebraic then.
     """
-    from scipy.signal import tf2ss  # here: it takes its time to load
-
     a, b, c, d = model.state_space()
     if d[0, 0] != 0:
         raise ValueError("a free run in the loop needs a model without a direct term")

@@ -22,6 +22,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from scipy.stats import chi2
 
 from ident.basis.mimo_model import MimoModel
 from ident.basis.model import MisoModel
@@ -32,7 +33,6 @@ from ident.checks.input_checks import alike_inputs, few_samples, refuse_unusable
 from ident.checks.plausible_modes import pole_warnings
 from ident.checks.prior_tests import NuisanceTest
 from ident.data.arrays import RealArray
-from ident.data.distributions import chi_square_tail
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import fit
@@ -283,7 +283,7 @@ def _identification(
         `saved_numbers` : free numbers that the shapes save, at least one: of none it is nan.
         """
         loss = max(shaped_rss - free_rss, 0.0)
-        return float(chi_square_tail(loss / noise_power * effective_share, saved_numbers))
+        return float(chi2.sf(loss / noise_power * effective_share, saved_numbers))
 
     def refused(shaped_rss: float, saved_numbers: int) -> bool:
         """Whether noise alone hardly makes free residues fit so much better than shapes, as in

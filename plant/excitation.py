@@ -20,30 +20,6 @@ Grid = Literal["full", "odd", "odd_random"]
 # Rounding of a frequency on a line, or of a time on a sample, as a share of their spacing: within it the one
 # is meant as the other. Far above 1e-16 times the number of samples.
 _ROUNDING = 1e-9
-# Bits of a shift register of so many bits that are added to the one that leaves it, counted from there: with
-# them the period is the longest there is, 2^n - 1 (primitive polynomials, as of scipy.signal.max_len_seq,
-# which loads for longer than it computes).
-_TAPS = {
-    2: (1,),
-    3: (2,),
-    4: (3,),
-    5: (3,),
-    6: (5,),
-    7: (6,),
-    8: (7, 6, 1),
-    9: (5,),
-    10: (7,),
-    11: (9,),
-    12: (11, 10, 4),
-    13: (12, 11, 8),
-    14: (13, 12, 2),
-    15: (14,),
-    16: (15, 13, 4),
-    17: (14,),
-    18: (11,),
-    19: (18, 17, 14),
-    20: (17,),
-}
 
 
 def prbs(
@@ -97,11 +73,11 @@ def prbs(
         raise ValueError(
             f"the register needs {register_length} bits that are not all zero; got {register.tolist()}"
         )
+    from scipy.signal import max_len_seq  # here: every command would wait for it
+
     n_values = -(-n_samples // hold_samples)
-    bits = register.tolist()
-    for k in range(n_values - register_length):
-        bits.append(bits[k] ^ sum(bits[k + tap] for tap in _TAPS[register_length]) % 2)
-    held_bits = np.repeat(bits[:n_values], hold_samples)[:n_samples]
+    bits, _ = max_len_seq(register_length, state=register, length=n_values)
+    held_bits = np.repeat(bits, hold_samples)[:n_samples]
     signs = np.where(held_bits == 1, 1.0, -1.0)
     return amplitude_V * signs
 

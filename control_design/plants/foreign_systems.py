@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeGuard
 import numpy as np
 
 from control_design.plants.transfer import of_polynomials
-from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.keywords import WrongArgumentError, refuse_rate
 
 if TYPE_CHECKING:
     import control
+
+    from ident.data.frequency_uncertainty import FrequencyUncertainty
 
 # Classes of several inputs and outputs, which have functions of their own. By name: importing them here would
 # close a circle.
@@ -96,6 +97,9 @@ def measured_response(system: control.FrequencyResponseData, what: str = "the fr
     what: its name in a refusal. Raises WrongArgumentError as `state_space` for several signals and a system
     without a sampling time.
     """
+    # Here, because ellipses load numerical libraries that a log which is refused does not need.
+    from ident.data.frequency_uncertainty import FrequencyUncertainty
+
     _refuse(system, what)
     order = np.argsort(system.omega, kind="stable")
     omega = np.asarray(system.omega)[order]

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from diagnosis.fit.coordinates import effects_at
 from diagnosis.fit.descent import Fit
@@ -52,8 +53,6 @@ def solver_spread(
         In units of the noise's, record by record, sample by sample, all outputs, as `ResidualModel.of` has
         them. Zero where no effect is non-smooth.
     """
-    from scipy.ndimage import uniform_filter1d  # here: it takes its time to load
-
     records = model.case.estimation if experiments is None else experiments
     outputs = model.case.noise.size
     sizes = [len(record.output) * outputs for record in records]

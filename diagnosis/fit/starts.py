@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.linalg import cho_factor, cho_solve
+from scipy.signal import czt
 
 from diagnosis.fit.descent import Fit, follow_linearly
 from diagnosis.fit.records import FittedStart, RecordsToFit
@@ -310,8 +311,6 @@ def _loudest_lines(records: RecordsToFit, around: Fit, lines: Real, response: Re
     (L',) array
         `BEST_LINES` of the lines in their order, among them the `SLOW_LINES` lowest.
     """
-    from scipy.signal import czt  # here: it takes its time to load
-
     samples = len(response)
     noise = records.case.noise
     size = next_fast_len(2 * samples, real=True)

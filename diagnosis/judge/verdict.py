@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
-from scipy.special import ndtr
+from scipy.stats import norm
 
 from diagnosis.evidence.explanation import Explanation, best_of_sets
 from diagnosis.evidence.hypotheses import Probabilities
@@ -230,7 +230,7 @@ def below_threshold(search: Search, explanation: Explanation) -> float:
         of_records = np.max(np.sqrt(energy_left / energy_of_motion), axis=1)
         logs = np.log(np.maximum(of_records, _NOTHING))
         width = np.hypot(_SOLVER_WIDTH, np.std(logs) / np.sqrt(logs.size))
-        probabilities.append(float(ndtr(np.log(case.machine.weighing.model_error / left) / width)))
+        probabilities.append(float(norm.cdf(np.log(case.machine.weighing.model_error / left) / width)))
     return max(probabilities)
 
 

@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
+import scipy
 
 from diagnosis.machine.body_forces import BodyForces
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.motion_effects import PulseResponse, with_forces
-from ident.data.filters import convolved
 
 Run = Callable[[Real], Real]
 Values = Mapping[str, float]
@@ -302,7 +302,7 @@ class Actuator:
             outputs, command = simulate(added)
             for _ in range(_ROUNDS):
                 # What the linear loop would have commanded without, then the fixed point beside that.
-                without = command - convolved(response, added)[: added.size]
+                without = command - scipy.signal.fftconvolve(response, added)[: added.size]
                 added, expected = _fixed(added_by_effects, without, response, added)
                 outputs, command = simulate(added)
                 missed = _norm(command - expected)
@@ -337,7 +337,7 @@ def _fixed(
     steps = list[Real]()
     x = start
     for _ in range(_STEPS):
-        step = added_by_effects(without + convolved(response, x)[: x.size]) - x
+        step = added_by_effects(without + scipy.signal.fftconvolve(response, x)[: x.size]) - x
         if not _norm(step) > _STANDS * _norm(x):
             break
         points = [*points, x][-_MIXED:]
@@ -347,7 +347,7 @@ def _fixed(
             moves = np.diff(points, axis=0).T
             changes = np.diff(steps, axis=0).T
             x = x - (moves + changes) @ np.linalg.lstsq(changes, step, rcond=_MIXING_RANK)[0]
-    return x, np.asarray(without + convolved(response, x)[: x.size])
+    return x, np.asarray(without + scipy.signal.fftconvolve(response, x)[: x.size])
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import scipy
 
 from diagnosis.machine.around import EffectLaw
 from diagnosis.machine.body_forces import BodyForces, DryFriction, DryLaw, SmoothLaw, followed
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.plant_effect import PlantEffect
-from ident.data.filters import through_filter
 from plant.effects.search_space import EffectParameter
 from plant.machine import ABSOLUTE, CUBIC, LINEAR, OFF_AXIS, QUADRATIC, SINE
 
@@ -70,7 +70,7 @@ def _lagged(signal: Real, values: Values, dt_s: float, before: float) -> Real:
     """A held signal behind 1/(T s + 1), as its mean over each sample."""
     T = values["time_constant_s"]
     decay = np.exp(-dt_s / T)
-    state = through_filter([1 - decay], [1.0, -decay], signal, before=decay * before)
+    state, _ = scipy.signal.lfilter([1 - decay], [1.0, -decay], signal, zi=[decay * before])
     return np.asarray(signal + (np.concatenate([[before], state[:-1]]) - signal) * T / dt_s * (1 - decay))
 
 
@@ -80,7 +80,7 @@ def _lagged_sensor(signal: Real, values: Values, dt_s: float, before: float) -> 
     decay = np.exp(-dt_s / T)
     new = 1 - T / dt_s * (1 - decay)
     taps = [new, (1 - decay) - new]
-    return np.asarray(through_filter(taps, [1.0, -decay], signal, before=before * (1 - new)))
+    return np.asarray(scipy.signal.lfilter(taps, [1.0, -decay], signal, zi=[before * (1 - new)])[0])
 
 
 def _drifting(signal: Real, values: Values, dt_s: float, before: float) -> Real:

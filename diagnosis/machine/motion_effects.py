@@ -25,7 +25,6 @@ from numba import njit
 
 from diagnosis.machine.body_forces import BodyForces, DryFriction, force_over_part
 from diagnosis.machine.machine_protocol import Real
-from ident.data.filters import through_filter
 
 # Rounds of a simulation: what needs more does not settle, since one that halves the error leaves 2^-12 of it.
 _ROUNDS = 12
@@ -208,7 +207,7 @@ class LinearBody:
         """
         head = np.concatenate([np.zeros(self.ahead), self.numerator])
         denominator = np.concatenate([[1.0], -self.poles])
-        beside = np.asarray(simulated - through_filter(head, denominator, force))
+        beside = np.asarray(simulated - scipy.signal.lfilter(head, denominator, force))
         travel = np.cumsum(simulated) * self.dt_s if self.of_speed else simulated
         parts = self.parts(forces, travel)
         if parts not in self._steps:
@@ -239,7 +238,7 @@ class LinearBody:
         moment += self.early * held
         held[1:] += 0.5 * moment[:-1]
         held[:-1] -= 0.5 * moment[1:]
-        expected = beside + through_filter(head, denominator, command + held)
+        expected = beside + scipy.signal.lfilter(head, denominator, command + held)
         return held, speed if self.of_speed else position, expected
 
 
@@ -377,7 +376,7 @@ def _filter(response: Real, ahead: int) -> tuple[Real, Real]:
 
         # Numerator: responses of the poles alone, each a sample later than the one before.
         rows = np.concatenate([np.arange(ahead, first), rows])
-        all_pole = through_filter([1.0], denominator, pulse)
+        all_pole = scipy.signal.lfilter([1.0], denominator, pulse)
         if not np.max(np.abs(all_pole)) < _GROWS:
             continue  # faster than any response that ends at one
         delays = range(ahead, ahead + order)

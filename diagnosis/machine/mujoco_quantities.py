@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.signal import savgol_filter
 
 from diagnosis.machine.around import EffectLaw
 from diagnosis.machine.listed_effects import Magnitudes
@@ -559,8 +560,6 @@ class Quantities:
     @cached_property
     def _as_felt(self) -> list[RecordAsFelt]:
         """Every record as the stated actuators feel it; without their delay, and without contacts."""
-        from scipy.signal import savgol_filter  # here: it takes its time to load
-
         spec = self.model.spec.copy()
         spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         for actuator in spec.actuators:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple, TypeVar
 import mujoco
 import numpy as np
 from mujoco import rollout
+from scipy.interpolate import CubicSpline
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.machine.mujoco_edits import (
@@ -484,8 +485,6 @@ class MujocoSimulation:
         -------
         (N,), (N,) for N steps; beyond the last row as there.
         """
-
-        from scipy.interpolate import CubicSpline  # here: it takes its time to load
 
         def compute() -> tuple[Real, Real]:
             dt_s = self.arm.dt_s

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
+import scipy
 
 from diagnosis.machine.around import Actuator, Body, MeasuredBody, Place, Sensor, Where
 from diagnosis.machine.listed_effects import KINDS, Magnitudes
@@ -255,9 +256,7 @@ def _of_body(
     if motion_is == "speed":
         position = _largest(np.cumsum(speed) * dt_s for speed in motions)
         return Magnitudes(force=size, position=position, speed=_largest(motions))
-    from scipy.signal import savgol_filter  # here: it takes its time to load
-
-    speeds = (savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in motions)
+    speeds = (scipy.signal.savgol_filter(x, _SMOOTHED, 2, deriv=1, delta=dt_s) for x in motions)
     return Magnitudes(force=size, position=_largest(motions), speed=_largest(speeds))
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import sawtooth
 
 from diagnosis.machine.case import Case
 from diagnosis.machine.machine_protocol import Real
@@ -136,8 +137,6 @@ def excitations(
     ValueError
         Fewer than 100 samples, or a voltage or period that is not positive.
     """
-    from scipy.signal import sawtooth  # here: it takes its time to load
-
     if not n_samples >= _LEAST_SAMPLES:
         raise ValueError(f"an experiment needs at least {_LEAST_SAMPLES} samples; got {n_samples}")
     if not (0 < voltage_V < np.inf and 0 < dt_s < np.inf):

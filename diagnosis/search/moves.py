@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 import numpy as np
+from scipy.signal import find_peaks
 
 from diagnosis.evidence.explanation import WeighedFit, best_of_sets
 from diagnosis.fit.descent import Fit, best_after_following, descend, refine_sizes, scan_far_values
@@ -615,12 +615,6 @@ def _local_minima(points: Sequence[StartPoint]) -> list[StartPoint]:
     if points[0].coordinates.size != 1:
         return []
     along_grid = sorted(points, key=lambda point: float(point.coordinates[0]))
-    # Neighbours of equal loss are one place, for which the middle one stands. A minimum may be at an end.
-    places = [list(place) for _, place in groupby(along_grid, key=lambda point: point.loss)]
-    losses = [np.inf, *(place[0].loss for place in places), np.inf]
-    minima = [
-        place[(len(place) - 1) // 2]
-        for place, before, loss, after in zip(places, losses, losses[1:], losses[2:], strict=False)
-        if loss < before and loss < after
-    ]
-    return sorted(minima, key=by_loss)
+    # A minimum may be at an end of the grid.
+    peaks, _ = find_peaks([-np.inf, *(-point.loss for point in along_grid), -np.inf])
+    return sorted([along_grid[peak - 1] for peak in peaks], key=by_loss)

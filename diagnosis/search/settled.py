@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from diagnosis.fit.coordinates import difference_quotients, solve_or_least_squares
 from diagnosis.fit.levels import Levels
@@ -104,8 +105,6 @@ def _states_of_beginnings(
     `start` has the states (S,) of this record alone, from which the first beginning is fitted. Least squares
     of the outputs over their standard deviations, whatever the likelihood is.
     """
-    from scipy.optimize import least_squares  # here: it takes its time to load
-
     record = records.experiments[r]
     spread = records.state_spread
     simulate = records.nominal.at(d).simulator(effects)

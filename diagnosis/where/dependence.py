@@ -23,12 +23,14 @@ from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
+from scipy.interpolate import BSpline
+from scipy.signal import savgol_filter
+from scipy.stats import norm
 
 from diagnosis.machine.around import MeasuredBody
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real
 from diagnosis.where.findings import Alternative, Dependence, Quantity, Shape
 from diagnosis.where.missing_force import ForcedRecord, MissingForces, missing_forces
-from ident.data.distributions import normal_quantile
 from ident.data.units import written_unit
 
 Integer = npt.NDArray[np.int64]
@@ -192,7 +194,7 @@ def _best_two(
     """The best dependence, and the best of what it leaves; `level` is shared by everything that is tried."""
     regressions = _Regressions(case, forced)
     pairs = [(acts, variable) for acts in acting for variable in acts.variables]
-    deviations = -float(normal_quantile(level / max(len(pairs), 1)))
+    deviations = float(norm.isf(level / max(len(pairs), 1)))
     findings: list[Dependence] = []
     taken: list[_Pair] = []
     while len(findings) < _MOST:
@@ -512,8 +514,6 @@ def _constant(records: Sequence[ForcedRecord]) -> _Basis:
 
 def _basis(variable: _Variable, shape: Shape) -> _Basis:
     """A spline of a variable, beside a constant; or the variable itself ("line"), or its sign ("jump")."""
-    from scipy.interpolate import BSpline  # here: it takes its time to load
-
     everything = np.concatenate(variable.values)
     low = float(np.min(everything))
     high = float(np.max(everything))
@@ -641,8 +641,6 @@ def _rate(values: Real, dt_s: float, order: int) -> Real:
 
     A second derivative takes four samples more; of a short record all of them, an odd number.
     """
-    from scipy.signal import savgol_filter  # here: it takes its time to load
-
     window = min(_SMOOTHED + 4 * (order - 1), len(values) - 1 + len(values) % 2)
     return np.asarray(savgol_filter(values, window, order + 1, deriv=order, delta=dt_s))
 

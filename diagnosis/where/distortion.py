@@ -19,14 +19,14 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import detrend
+from scipy.stats import chi2, f as fisher
 
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import FrequencyResponseBand, LineGroup, PeriodicFinding, sensors_of
 from diagnosis.where.where_energy import band_edges_Hz
 from ident.data.distortion import period_of
-from ident.data.distributions import chi_square_quantile, chi_square_tail, fisher_tail
-from ident.data.filters import without_line
 
 ComplexArray = npt.NDArray[np.complex128]
 Booleans = npt.NDArray[np.bool_]
@@ -123,7 +123,7 @@ def _finding(case: Case, experiment: Experiment, e: Real, period: int, level: fl
             error = float(np.sqrt(np.sum(np.abs(mean[inside]) ** 2)))
             size = float(np.sqrt(np.sum(np.abs(spectra.model[inside, s]) ** 2)))
             # Noise of a mean over the periods has a variance of 1 / (2 count) in each part of a line.
-            radius = np.sqrt(chi_square_quantile(0.95, 2) / (2 * count))
+            radius = np.sqrt(chi2.ppf(0.95, 2) / (2 * count))
             response.append(
                 FrequencyResponseBand(
                     sensor=sensor,
@@ -160,7 +160,7 @@ def _spectra(case: Case, experiment: Experiment, e: Real, period: int) -> _Perio
     # Orthonormal lines 1 .. below Nyquist: a mean square modulus of 1 is white noise of unit variance.
     lines = np.arange(1, (period + 1) // 2)
     # A drift is a ramp in every period, yet no answer to the input.
-    error = _lines(without_line(e), period, count, lines)
+    error = _lines(detrend(e, axis=0), period, count, lines)
     modelled = (experiment.output - e * case.noise) / case.noise
     drive = np.abs(np.fft.rfft(experiment.voltage_V[:period])[lines])
     return _Period(
@@ -205,7 +205,7 @@ def _p_value(mean: ComplexArray, varying: Real, inside: Booleans, count: int) ->
     repeated = 2 * count * float(np.sum(np.abs(mean[inside]) ** 2))
     between = 2 * float(np.sum(varying[inside]))
     freedom = 2 * n * (count - 1)
-    by_stated = float(chi_square_tail(repeated, 2 * n))
+    by_stated = float(chi2.sf(repeated, 2 * n))
     ratio = (repeated / (2 * n)) / max(between / freedom, _NO_ENERGY)
-    by_periods = float(fisher_tail(ratio, 2 * n, freedom))
+    by_periods = float(fisher.sf(ratio, 2 * n, freedom))
     return max(by_stated, by_periods)

@@ -11,9 +11,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from scipy.stats import chi2, norm
 
 from diagnosis.machine.case import Case
-from ident.data.distributions import chi_square_quantile, normal_quantile
 from plant.rig import Output
 
 Interval = tuple[float, float]
@@ -27,7 +27,7 @@ SENSORS: dict[Output, tuple[str, str]] = {
 }
 
 # Standard deviations of a two-sided interval of 95 %.
-_Z95 = float(normal_quantile(0.975))
+_Z95 = float(norm.ppf(0.975))
 # A statement about where "most" of the gap lies covers at least this share of it. Chosen; at 0.9 most gaps of
 # an arm with one mode have no such band.
 _MOST = 0.8
@@ -503,4 +503,4 @@ class Where:
         deviation = np.array([(band.gap.interval[1] ** 2 - band.gap.gap_rms**2) / _Z95 for band in bands])
         mean = np.sum(width * energy) / np.sum(width)
         away = (energy - mean) / np.maximum(deviation, _TINY)
-        return bool(np.sum(away**2) < chi_square_quantile(0.95, len(bands) - 1))
+        return bool(np.sum(away**2) < chi2.ppf(0.95, len(bands) - 1))

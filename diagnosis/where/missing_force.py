@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
+from scipy.optimize import linear_sum_assignment
 from scipy.sparse.linalg import LinearOperator, lsqr
 
 from diagnosis.machine.force_places import ForcePlace
@@ -313,8 +314,6 @@ def _paired(places: Sequence[ForcePlace], responses: Real) -> list[ForcePlace]:
     Of joints in coordinates of their own, an inverse inertia has no permutation with a larger trace. Where
     there are fewer outputs than places, or commands that are no forces, several may share an output.
     """
-    from scipy.optimize import linear_sum_assignment  # here: it takes its time to load
-
     early = max(responses.shape[1] // _EARLY, 2)
     early_motion = np.sum(responses[:, :early], axis=1)
     largest = np.max(np.abs(responses), axis=(0, 1))

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import dct
+from scipy.stats import chi2, norm
 
 from diagnosis.machine.machine_protocol import Real
 from diagnosis.where.findings import BandGap, ExperimentGap, PartGap, SensorGap
-from ident.data.distributions import chi_square_tail, normal_quantile
 
 # Standard deviations of a two-sided interval of 95 %.
-_Z95 = float(normal_quantile(0.975))
+_Z95 = float(norm.ppf(0.975))
 # Band edges, two a decade: 1, 3, 10, ... Hz, rounded for reading aloud. Chosen; with half as many a mode and
 # a drift share a band, with twice as many each holds half the energy to be found by.
 _EDGES_HZ = tuple(m * 10.0**k for k in range(-4, 6) for m in (1.0, 3.0))
@@ -62,7 +62,7 @@ class Energy:
     @property
     def p_value(self) -> float:
         """Chance of as much energy from noise alone."""
-        return float(chi_square_tail(self.squares, self.count))
+        return float(chi2.sf(self.squares, self.count))
 
 
 def total(parts: Sequence[Energy]) -> Energy:

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from itertools import permutations, product
 
 import numpy as np
+from scipy.stats import chi2, t as student
 
 from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.case import Case, Experiment
@@ -26,7 +27,6 @@ from diagnosis.where.findings import (
 from diagnosis.where.where_energy import Energy
 from ident.basis.functions import regressor
 from ident.basis.poles import Poles
-from ident.data.distributions import chi_square_tail, student_quantile, student_tail
 from plant.modal import linear_arm
 
 # Draws of the bootstrap: ends of a 95 % interval are then known to 6 % of a standard deviation.
@@ -115,8 +115,8 @@ def drift_findings(case: Case, residuals: Mapping[str, Real], level: float) -> t
             continue
         scatter = information @ (slopes[:, s] - mean[s]) ** 2
         error = float(np.sqrt(scatter / (freedom * information.sum()))) * noise
-        p_value = float(2 * student_tail(abs(rate) / error, freedom)) if error > 0 else 1.0
-        half = float(student_quantile(0.975, freedom)) * error
+        p_value = float(2 * student.sf(abs(rate) / error, freedom)) if error > 0 else 1.0
+        half = float(student.ppf(0.975, freedom)) * error
         beyond_chance = bool(p_value < level / len(case.outputs))
         interval = (rate - half, rate + half)
         findings.append(DriftFinding(sensor, unit, rate, share, interval, p_value, beyond_chance))
@@ -223,7 +223,7 @@ def common_findings(case: Case, residuals: Mapping[str, Real], level: float) -> 
         # Energy of the mean, over all choices of signs, from the products of the experiments.
         products = e[:, :, s] @ e[:, :, s].T
         energy = np.einsum("ki,ij,kj->k", signs, products, signs) / n
-        p_value = float(chi_square_tail(energy[0], length))
+        p_value = float(chi2.sf(energy[0], length))
         gap = float(np.trace(products)) - n * length
         shares = np.zeros(energy.size)
         if gap > _CLEAR_OF_CHANCE * np.sqrt(2.0 * n * length):

@@ -12,11 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import lfilter
 
 from ident.basis.autoregressive_noise import AutoregressiveNoise
 from ident.basis.noise_model import NoiseModel, monic_polynomial, reflected_inside
 from ident.data.arrays import RealArray, lock
-from ident.data.filters import through_filter
 
 # Share of its beginning below which the memory of 1 / C counts as gone. Whitening and the expansion of A / C
 # are exact to this share. Halved in its exponent, a zero at .9 needs 100 first rows in place of 200. Chosen:
@@ -132,11 +132,13 @@ class ArmaNoise(NoiseModel):
 
     def filtered(self, signals: RealArray) -> RealArray:
         """A / C signals from rest, (T,) or (T, n), in their units; from a NaN on all is NaN."""
-        return np.asarray(through_filter(self.a_polynomial, self.c_polynomial, signals), dtype=np.float64)
+        return np.asarray(lfilter(self.a_polynomial, self.c_polynomial, signals, axis=0), dtype=np.float64)
 
     def coloured(self, innovations: RealArray) -> RealArray:
         """C / A innovations from rest, (T,) or (T, n), in their units; from a NaN on all is NaN."""
-        return np.asarray(through_filter(self.c_polynomial, self.a_polynomial, innovations), dtype=np.float64)
+        return np.asarray(
+            lfilter(self.c_polynomial, self.a_polynomial, innovations, axis=0), dtype=np.float64
+        )
 
     def autocovariance(self, max_lag: int) -> RealArray:
         """gamma_k, k = 0 .. max_lag, from the autocovariance of w = e / A.

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import hankel, toeplitz
+from scipy.signal import lfilter
 
 from ident.basis.noise_model import NoiseModel, monic_polynomial
 from ident.data.arrays import RealArray, lock
-from ident.data.filters import through_filter
 
 # Polynomial 1: a filter without a denominator, or without a numerator.
 _ONE = np.ones(1)
@@ -71,14 +71,14 @@ class AutoregressiveNoise(NoiseModel):
 
     def filtered(self, signals: RealArray) -> RealArray:
         """A(q) signals from rest, (T,) or (T, n), in their units; NaN spreads over the next n rows."""
-        return np.asarray(through_filter(self.a_polynomial, _ONE, signals), dtype=np.float64)
+        return np.asarray(lfilter(self.a_polynomial, _ONE, signals, axis=0), dtype=np.float64)
 
     def coloured(self, innovations: RealArray) -> RealArray:
         """innovations / A(q) from rest, (T,) or (T, n), in their units.
 
         From a NaN on all is NaN; with roots of A on or outside the circle it grows.
         """
-        return np.asarray(through_filter(_ONE, self.a_polynomial, innovations), dtype=np.float64)
+        return np.asarray(lfilter(_ONE, self.a_polynomial, innovations, axis=0), dtype=np.float64)
 
     def autocovariance(self, max_lag: int) -> RealArray:
         """gamma_k, k = 0 .. max_lag, by the Yule-Walker equations and then their recursion.

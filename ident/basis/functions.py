@@ -17,10 +17,10 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from scipy.signal import lfilter
 
 from ident.basis.poles import Poles
 from ident.data.arrays import COMPILED, ComplexArray, RealArray, one_signal
-from ident.data.filters import through_filter
 
 # Least 1 - gamma of a pair: |p| < 1 can round to 1 - gamma = 0, and a block without input would be no basis
 # function. Half the distance of 1 to the double below it, so that it stands for "less than one digit".
@@ -278,8 +278,8 @@ def all_pass_slopes(poles: Poles, y: RealArray) -> RealArray:
         # B = N / D: N' / D - (D' / D) B.
         through = all_pass_signal(block, entering)
         for above, below in slopes:
-            of_numerator = through_filter(above, denominator, entering)
-            of_denominator = through_filter(below, denominator, through)
+            of_numerator = lfilter(above, denominator, entering)
+            of_denominator = lfilter(below, denominator, through)
             columns.append(of_numerator - of_denominator)
     return np.column_stack(columns) if columns else np.zeros((y.size, 0))
 

@@ -14,6 +14,7 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from scipy.signal import lfilter
 
 from ident.basis.autoregressive_noise import AutoregressiveNoise
 from ident.basis.functions import all_pass_response, basis_response, log_all_pass_slopes, regressor
@@ -22,7 +23,6 @@ from ident.basis.poles import NO_POLES, Poles
 from ident.basis.structure import filter_input, front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
 from ident.data.ellipses import spread_covariance
-from ident.data.filters import through_filter
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.shown import Shown
 
@@ -317,7 +317,7 @@ class ResponsePosterior(Shown):
         if self.has_feedthrough:
             taps[0] = values[n_poles]
         through_basis = regressor(self.poles, filtered) @ values[:n_poles]
-        return np.asarray(through_basis + through_filter(taps, np.ones(1), filtered))
+        return np.asarray(through_basis + lfilter(taps, np.ones(1), filtered))
 
     @property
     def stable_part(self) -> ResponsePosterior:

@@ -14,12 +14,11 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtri
+from scipy.stats import chi2
 
 from ident.basis.poles import NO_POLES, Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.data.arrays import RealArray
-from ident.data.distributions import chi_square_quantile
 from ident.data.finding import Finding, FindingKind, finding
 from ident.fit.least_squares import Regression, project
 
@@ -97,13 +96,13 @@ def refuse_unanswered(
     # Squared distance of zero from the centre, chi-square with two degrees of freedom (real, imaginary part).
     ellipses = posterior.at(omega_rad_s)
     distance = ellipses.normalised_distance(np.zeros(ellipses.centre.size))
-    squared = distance**2 * chi_square_quantile(ellipses.level, 2)
+    squared = distance**2 * chi2.ppf(ellipses.level, 2)
     n_frequencies = 1.0
     if doubts:
         # Two rows, one frequency, where nobody said how many there are.
         n_rows = 2 if posterior.report is None else max(posterior.report.n_rows, 2)
         n_frequencies = n_rows / 2
-    limit = chdtri(2, (1 - ZERO_LEVEL) / n_frequencies)
+    limit = chi2.isf((1 - ZERO_LEVEL) / n_frequencies, 2)
     if np.all(squared <= limit):
         unknown = "no response at all explains the log as well as any model; check columns, wiring and unit"
         names = f"the output '{posterior.output_name}' does not answer to the input '{posterior.input_name}'"

@@ -20,13 +20,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import detrend
 from scipy.special import chdtri
 
 from ident.basis.model import GobfModel
 from ident.basis.poles import Poles
 from ident.checks.early_checks import FEWEST_LINES, STILL_INPUT, STILL_OUTPUT, clipped, refuse_hopeless
 from ident.data.arrays import ComplexArray, RealArray
-from ident.data.filters import without_line
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import Regression
@@ -239,7 +239,7 @@ def alike_inputs(records: Sequence[Record]) -> list[Finding]:
     frequencies = []
     for record in records:
         n = len(record.input)
-        windowed = without_line(record.input) * np.hanning(n)[:, None]
+        windowed = detrend(record.input, axis=0) * np.hanning(n)[:, None]
         spectra.append(np.fft.rfft(windowed, axis=0)[1:] / np.sqrt(n))
         frequencies.append(2 * np.pi * np.fft.rfftfreq(n, records[0].dt_s)[1:])
     lines = np.concatenate(spectra)

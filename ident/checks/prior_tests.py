@@ -29,11 +29,11 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
+from scipy.stats import chi2
 
 from ident.basis.poles import Poles
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray
-from ident.data.distributions import chi_square_quantile
 from ident.data.finding import TEST_LEVEL, Finding, FindingKind, PriorTest, Value, finding
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression
@@ -109,7 +109,7 @@ def limit(degrees_of_freedom: int) -> float:
 
     nan for no degree of freedom, or less.
     """
-    return float(chi_square_quantile(TEST_LEVEL, degrees_of_freedom))
+    return float(chi2.ppf(TEST_LEVEL, degrees_of_freedom))
 
 
 def judged(

@@ -21,13 +21,13 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg import solve_toeplitz
+from scipy.signal import correlate
+from scipy.stats import chi2, norm
 
 from ident.basis.autoregressive_noise import WHITE_NOISE
 from ident.basis.posterior import ResponsePosterior
 from ident.checks.validation import fit_on_fresh_data
 from ident.data.arrays import RealArray, lock
-from ident.data.distributions import chi_square_tail, normal_quantile, normal_tail
-from ident.data.filters import convolved
 from ident.data.finding import TEST_LEVEL, WHITE_LAGS, Finding, FindingKind, finding
 from ident.data.nonparametric import empirical_frf
 from ident.data.record import Record
@@ -154,9 +154,9 @@ def whiteness_test(residuals: Sequence[RealArray], *, max_lag: int = WHITE_LAGS)
     correlation = _pooled_correlation(centred, centred, max_lag)[max_lag + 1 :]
     lags = np.arange(1, max_lag + 1)
     ljung_box = n * (n + 2) * float(np.sum(correlation**2 / (n - lags)))
-    probability = float(chi_square_tail(ljung_box, max_lag))
+    probability = float(chi2.sf(ljung_box, max_lag))
     # At a single lag the correlation of white noise is normal with variance 1 / n.
-    half_width = normal_quantile(0.5 + TEST_LEVEL / 2) / np.sqrt(n)
+    half_width = norm.ppf(0.5 + TEST_LEVEL / 2) / np.sqrt(n)
     return ResidualTest(
         name="whiteness",
         lags=lags.astype(np.float64),
@@ -219,7 +219,7 @@ def independence_test(
     # 1 - (1 - p)^(max_lag + 1).
     n_tested = max_lag + 1
     deviates = np.abs(correlation[max_lag:]) / deviation
-    single = 2 * normal_tail(deviates)
+    single = 2 * norm.sf(deviates)
     least_single = min(float(single.min()), BELOW_ONE)
     probability = float(-np.expm1(n_tested * np.log1p(-least_single)))
 
@@ -228,9 +228,9 @@ def independence_test(
     if max_lag:
         largest_before = np.abs(correlation[:max_lag]).max()
     one_sided_chance = (1 - TEST_LEVEL) / (2 * max(max_lag, 1))
-    limit_before = deviation * normal_quantile(1 - one_sided_chance)
+    limit_before = deviation * norm.ppf(1 - one_sided_chance)
 
-    half_width = normal_quantile(0.5 + TEST_LEVEL / 2) * deviation
+    half_width = norm.ppf(0.5 + TEST_LEVEL / 2) * deviation
     return ResidualTest(
         name="independence",
         lags=np.arange(-max_lag, max_lag + 1).astype(np.float64),
@@ -398,7 +398,7 @@ def _pooled_correlation(e: Sequence[RealArray], u: Sequence[RealArray], max_lag:
     """
     total = np.zeros(2 * max_lag + 1)
     for part_e, part_u in zip(e, u, strict=True):
-        at_all_lags = convolved(part_e, part_u[::-1])
+        at_all_lags = correlate(part_e, part_u, mode="full", method="fft")
         zero_lag = part_u.size - 1
         wanted = slice(zero_lag - max_lag, zero_lag + max_lag + 1)
         total += at_all_lags[wanted]

@@ -20,13 +20,13 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from ident.basis.functions import basis_state_space, nuisance_columns
 from ident.basis.model import GobfModel, MisoModel
 from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import answered, level_before, stabilised
 from ident.data.arrays import BoolArray, RealArray, lock, real_rows
-from ident.data.distributions import chi_square_quantile
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
@@ -317,7 +317,7 @@ def repeat_scatter(
         ratio_low = float("nan")
         ratio_high = float("nan")
         if freedom > 0:
-            interval = np.sqrt(chi_square_quantile([LOW_QUANTILE, HIGH_QUANTILE], freedom) / freedom)
+            interval = np.sqrt(chi2.ppf([LOW_QUANTILE, HIGH_QUANTILE], freedom) / freedom)
             ratio_low = float(interval[0])
             ratio_high = float(interval[1])
         rows.append(

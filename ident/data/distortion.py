@@ -27,9 +27,9 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from ident.data.arrays import BoolArray, ComplexArray, RealArray
-from ident.data.distributions import chi_square_quantile
 from ident.data.ellipses import circular_widening
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record, in_groups
@@ -176,8 +176,8 @@ class LineLevels:
         # Interval of a chi-square variable with this mean and variance, less the noise.
         freedom = 2 * (weight @ expected) ** 2 / variance
         tail = 0.5 * (1 - level)
-        upper_quantile = chi_square_quantile(1 - tail, freedom)
-        lower_quantile = chi_square_quantile(tail, freedom)
+        upper_quantile = chi2.ppf(1 - tail, freedom)
+        lower_quantile = chi2.ppf(tail, freedom)
         low = freedom * total / upper_quantile - of_noise
         # Where less than the noise came, no less is promised than where just the noise comes.
         high = freedom * max(total, of_noise) / lower_quantile - of_noise

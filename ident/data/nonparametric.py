@@ -15,10 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import detrend
 
 from ident.data.arrays import ComplexArray, IntArray, RealArray
 from ident.data.ellipses import circular_widening
-from ident.data.filters import without_line
 from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 
@@ -203,7 +203,7 @@ def spectra_of(records: Sequence[Record], periodic: bool) -> Spectra:
         """
         stacked = np.stack(signals)
         if not periodic:
-            stacked = without_line(stacked.T).T
+            stacked = detrend(stacked, axis=1, type="linear")
         lines = np.fft.rfft(stacked, axis=1)[:, 1:]
         return np.asarray(lines, dtype=np.complex128)
 

@@ -18,10 +18,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.stats import f
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.distortion import EXCITED, SAME
-from ident.data.distributions import fisher_tail
 from ident.data.finding import TEST_LEVEL
 from ident.data.nonparametric import spectra_of
 from ident.data.record import Record, in_groups
@@ -190,7 +190,7 @@ class Repeats:
         freedom = noise**2 / float(np.sum(variances_of_means**2 / (n_repeats - 1)))
         n_independent = _independent_errors(np.vstack(deviations), int(n_repeats.sum()) - 2)
         power = float(weight @ np.abs(change) ** 2)
-        probability = fisher_tail(power / noise, 2 * n_independent, 2 * n_independent * freedom)
+        probability = f.sf(power / noise, 2 * n_independent, 2 * n_independent * freedom)
 
         # What a shift of all frequencies by a common factor 1 + s does: G(w / (1 + s)) is G (1 + s slope),
         # with slope = -d ln G / d ln w. A constant slope cannot be told from a change of the whole band.

@@ -466,12 +466,12 @@ class TimeGrid:
         -----
         Neglected: the fourth derivative over a sample; noise of the readings next to a missing row.
         """
+        from scipy.interpolate import CubicSpline  # here: a log that is refused never waits for it
+
         samples = np.arange(self.rows[-1] + 1)
         is_on_grid = not self.late.any()
         if len(samples) == len(values) and is_on_grid:
             return values
-        from scipy.interpolate import CubicSpline  # here: complete logs never wait for it
-
         filled = np.asarray(CubicSpline(self.rows + self.late, values)(samples))
         # Readings on the grid are exact, the spline through them but for rounding.
         if is_on_grid:

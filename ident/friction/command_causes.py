@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from ident.data.arrays import RealArray
 from ident.data.distortion import period_of
-from ident.data.distributions import chi_square_tail
 from ident.data.finding import FindingKind, finding
 from ident.data.record import Record
 
@@ -100,7 +100,7 @@ def _follows(record: Record, late: int, n_records: int) -> bool:
     """Whether the position tells the command, taken `late` samples earlier, in one of `n_records` logs."""
     command = record.input[late:, 0]
     position = record.output[: record.n_samples - late, 0]
-    probability = chi_square_tail(_told_by_position(command, position), _CAUSES)
+    probability = chi2.sf(_told_by_position(command, position), _CAUSES)
     return bool(probability * n_records < BY_CHANCE)
 
 
@@ -115,7 +115,7 @@ def _answers_at_once(record: Record, late: int) -> bool:
     target = position[rows[:, 0]]
     ratio = _unexplained(target, past) / _unexplained(target, past_and_now)
     # One number more: a chi-square of one degree of freedom.
-    return bool(chi_square_tail(rows.size * np.log(ratio), 1) < BY_CHANCE)
+    return bool(chi2.sf(rows.size * np.log(ratio), 1) < BY_CHANCE)
 
 
 def _told_by_position(command: RealArray, position: RealArray) -> float:

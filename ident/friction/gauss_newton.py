@@ -16,12 +16,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
+from scipy.signal import lfilter
 
 from ident.basis.functions import basis_response, regressor
 from ident.basis.model import GobfModel
 from ident.basis.structure import Structure, answered, filter_input
 from ident.data.arrays import ComplexArray, RealArray, real_rows
-from ident.data.filters import through_filter
 from ident.data.record import Record
 from ident.friction.arm import FrictionLaw, SteppedArm, less_friction
 from ident.friction.spring import Spring
@@ -221,7 +221,7 @@ class FrictionFit:
             return record
         numerator, denominator = lag_filter(self.lag)
         start = record.input[0]
-        return replace(record, input=start + through_filter(numerator, denominator, record.input - start))
+        return replace(record, input=start + lfilter(numerator, denominator, record.input - start, axis=0))
 
     def forced(self, record: Record) -> Record:
         """A record with the force on a linear arm as its input: command behind the drive less friction.

@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.signal import sosfilt, zpk2sos
 
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.record import Record
@@ -165,8 +166,6 @@ class ObserverFilter:
     @classmethod
     def of(cls, fit: FrictionFit) -> ObserverFilter:
         """Whitening filter of a fit with an observer: zeros at the arm's poles, poles at the observer's."""
-        from scipy.signal import zpk2sos  # here: it takes its time to load
-
         assert fit.correction is not None
         arm = fit.arm
         a, _, c = _real_form(arm, fit.coefficients)
@@ -180,8 +179,6 @@ class ObserverFilter:
 
     def __call__(self, signal: RealArray) -> RealArray:
         """A signal (T, ...) through the filter, without the rows in which it settles, at most half."""
-        from scipy.signal import sosfilt  # loaded with the sections
-
         filtered = sosfilt(self.sections, signal - signal[:1], axis=0)
         return np.asarray(filtered[min(self.settled, len(signal) // 2) :])
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from scipy.special import log_ndtr, ndtri_exp
+from scipy.special import ndtri_exp
+from scipy.stats import norm
 
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
@@ -195,7 +196,7 @@ def below_modes(omega: RealArray, change: ComplexArray, poles: Poles, dt_s: floa
 
 def _positive_interval(mean: float) -> tuple[float, float]:
     """Ends of the interval of a normal of unit variance that is positive, without `_TAIL` on either side."""
-    log_positive = log_ndtr(mean)
+    log_positive = norm.logsf(-mean)
     ends = []
     for log_above in (np.log1p(-_TAIL), np.log(_TAIL)):
         # Number above which a unit normal lies with this probability, however small.

@@ -19,12 +19,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import correlate
+from scipy.stats import chi2
 
 from ident.basis.poles import DEADBEAT
 from ident.data.arrays import RealArray
-from ident.data.distributions import chi_square_quantile, chi_square_tail
 from ident.data.ellipses import LEVEL
-from ident.data.filters import convolved
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.record import Record
 from ident.fit.least_squares import EXPLAINED, Regression
@@ -105,7 +105,7 @@ def seek(records: Sequence[Record], plain: Fitted, starts: Sequence[int]) -> Sea
 
     # Delays that fit as well with these poles (95 %).
     fits = _moved(records, best).by_delay
-    limit = float(chi_square_quantile(LEVEL, 1))
+    limit = float(chi2.ppf(LEVEL, 1))
     likely = [delay for delay, other in fits.items() if gain(best, other) <= limit]
     if min(likely) < _delay(best):
         # Ellipses hold a response that begins later than the delay, never one that begins earlier.
@@ -202,9 +202,9 @@ def first_answer(records: Sequence[Record]) -> FirstAnswer:
     # The last row of the triangle is that of the output itself, so lag 0 stands in the one before, at -2.
     last_column = triangle[-2 : -lags - 3 : -1, -1]
     costs = last_column**2 / noise
-    at_once = bool(chi_square_tail(costs[0], 1) < MISSED_BY_CHANCE)
+    at_once = bool(chi2.sf(costs[0], 1) < MISSED_BY_CHANCE)
     # Whether the inputs at lags 1 to 1, 2, ... lags are missed together.
-    by_chance = chi_square_tail(np.cumsum(costs[1:]), np.arange(1, lags + 1))
+    by_chance = chi2.sf(np.cumsum(costs[1:]), np.arange(1, lags + 1))
     missed = np.asarray(by_chance < MISSED_BY_CHANCE)
     if missed[0]:
         return FirstAnswer((), at_once)
@@ -232,7 +232,7 @@ def _late_answer(records: Sequence[Record], n_lags: int) -> int:
     for record in records:
         input_changes = np.diff(record.input[:, 0])
         output_changes = np.diff(record.output[:, 0])
-        at_all_lags = convolved(output_changes, input_changes[::-1])
+        at_all_lags = correlate(output_changes, input_changes, mode="full", method="fft")
         zero_lag = input_changes.size - 1
         total += at_all_lags[zero_lag:][:n_lags]
     peak = int(np.argmax(np.abs(total)))

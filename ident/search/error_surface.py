@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import minimum_filter
 
 from ident.basis.coordinates import SearchSpace
 from ident.basis.model import GobfModel
@@ -91,11 +92,8 @@ class ErrorSurface(Shown):
 
         Points at the edge count too; plateaus and nan do not. Empty where there is none.
         """
-        rows, columns = self.mean_square.shape
-        padded = np.pad(self.mean_square, 1, constant_values=np.inf)
-        shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
-        neighbours = [padded[i : i + rows, j : j + columns] for i, j in shifts]
-        least_beside = np.fmin.reduce(neighbours)
+        neighbours = np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]])
+        least_beside = minimum_filter(self.mean_square, footprint=neighbours, mode="constant", cval=np.inf)
         is_minimum = self.mean_square < least_beside
         order = np.argsort(self.mean_square[is_minimum], kind="stable")
         return [(int(i), int(j)) for i, j in np.argwhere(is_minimum)[order]]

@@ -12,13 +12,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import norm
 
 from ident.basis.functions import all_pass_response, basis_response
 from ident.basis.poles import Poles
 from ident.basis.posterior import ResponsePosterior
 from ident.basis.structure import front_response
 from ident.data.arrays import ComplexArray, RealArray, lock
-from ident.data.distributions import normal_quantile
 
 # Points of the circle on which a Laurent series is taken: they determine it to 1/3^15 = 7e-8 when the next
 # pole is three radii away. Twice as many would be exact to rounding, which no interval needs.
@@ -94,7 +94,7 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
             raise ValueError("the posterior does not hold every one of these poles twice (method 'tangent')")
     if not 0 < level < 1:
         raise ValueError(f"level must lie between 0 and 1; got {level}")
-    width = float(normal_quantile(0.5 + level / 2))
+    width = float(norm.ppf(0.5 + level / 2))
 
     omega = poles.omega_rad_s(posterior.dt_s)
     zeta = poles.zeta()
@@ -155,7 +155,7 @@ def growth_intervals(posterior: ResponsePosterior, level: float = 0.95) -> RealA
     off = slice(posterior.mean.size - unstable.order, None)
     centre = -np.log(np.abs(poles)) + slopes @ posterior.mean[off]
     deviation = np.linalg.norm(slopes @ posterior.covariance_factor[off], axis=1)
-    half = normal_quantile(0.5 + level / 2) * deviation
+    half = norm.ppf(0.5 + level / 2) * deviation
     return np.column_stack([centre - half, centre + half]) / posterior.dt_s
 
 

@@ -9,8 +9,8 @@ import pytest
 
 # Each takes longer to load than a log takes to be read.
 NEVER_FOR_A_LOG = {"numba", "scipy", "control", "matplotlib", "casadi", "pandas", "nlopt"}
-# A second or more together; a model is identified in less.
-NEVER_FOR_A_MODEL = {"scipy.signal", "scipy.stats", "control", "matplotlib", "casadi", "pandas"}
+# What only designs, tables and drawings need: a second or more together, and a model is identified in less.
+NEVER_FOR_A_MODEL = {"control", "matplotlib", "casadi", "pandas"}
 SHOW = "import json, sys; sys.stderr.write('\\n' + json.dumps(sorted(sys.modules)))"
 COMMAND = f"import sys\nfrom workflow.__main__ import main\ntry:\n    main()\nfinally:\n    {SHOW}"
 IDENTIFY = (

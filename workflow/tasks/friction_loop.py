@@ -22,7 +22,6 @@ from control_design.analysis.stability import closed_loop_poles
 from control_design.controllers.controller import Controller, FrictionFeedforward
 from control_design.specification import GIVES_WAY, Specification
 from ident.data.arrays import RealArray, kernel_array
-from ident.data.distributions import student_quantile
 from ident.data.ellipses import LEVEL
 from ident.friction import FrictionFit, FrictionLaw
 from ident.friction.gauss_newton import lag_steps
@@ -345,8 +344,10 @@ def friction_feedforward(controller: Controller, fit: FrictionFit) -> FrictionFe
 def interval_of(values: Sequence[float]) -> Interval:
     """95 % interval in which one more of these positive values lies, two or more: Student's law of their
     logarithms."""
+    from scipy import stats  # here: it takes its time to load
+
     logs = np.log(values)
-    quantile = student_quantile(0.5 + LEVEL / 2, logs.size - 1)
+    quantile = stats.t.ppf(0.5 + LEVEL / 2, logs.size - 1)
     reach = quantile * np.sqrt(1 + 1 / logs.size) * np.std(logs, ddof=1)
     return float(np.exp(logs.mean() - reach)), float(np.exp(logs.mean() + reach))
 
