@@ -17,12 +17,6 @@ def test_what_is_not_there_is_said_in_words_and_is_none_for_programs():
     assert Quantity.of(float("inf"), "dB").plain is None
 
 
-def test_an_interval_shows_two_digits_of_its_width():
-    told = Quantity.between(15.0832, 15.0951, "Hz")
-    assert told.text == "15.083 to 15.095 Hz"
-    assert told.plain == [15.0832, 15.0951]
-
-
 def test_the_answer_nests_rows_of_all_parts_at_the_dots_of_their_keys():
     margin = Row("certificate.modulus_margin", "modulus margin", Quantity.of(0.55))
     settled = Row("closed_loop.settled", "settles", Quantity.words("20 of 20"))

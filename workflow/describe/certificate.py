@@ -23,7 +23,6 @@ from workflow.describe.facts import (
     Section,
     Table,
     Text,
-    Verdict,
     said,
     worded,
 )
@@ -165,8 +164,7 @@ def certificate_section(
                 rows.append(worded("closed-loop mode", f"{place}, damping {number(mode.zeta)}"))
     for item in certificate.items:
         if whole or not item.met:
-            verdict = Verdict.MET if item.met else Verdict.MISSED
-            rows.append(worded(item.requirement, f"{item_value(item)}: {met(item)}", verdict=verdict))
+            rows.append(worded(item.requirement, f"{item_value(item)}: {met(item)}"))
     rows += [worded("at the limits", limited_loops(certificate)), posterior]
     for plant in certificate.plants:
         rows += crossover_rows(plant)
@@ -183,14 +181,14 @@ def not_checked_section(certify: CertifyResult) -> Section:
 
 def _verdict_row(certify: CertifyResult, certificate: Certificate) -> Row:
     if certify.certified:
-        return worded("verdict", "certified", verdict=Verdict.MET)
+        return worded("verdict", "certified")
     why = ""
     unstable = ", ".join(plant.plant for plant in certificate.plants if not plant.stable)
     if unstable:
         why = f": nominal closed loop unstable ({unstable})"
     elif all(item.met for item in certificate.items):
         why = f": {certify.reason}"
-    return worded("verdict", f"NOT certified{why}", verdict=Verdict.MISSED)
+    return worded("verdict", f"NOT certified{why}")
 
 
 def unchecked_page(results: RunResults) -> PageSection:

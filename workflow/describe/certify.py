@@ -9,7 +9,7 @@ from control_design.analysis.certificate import Certificate
 from control_design.controllers.controller import Controller
 from control_design.controllers.engineers_numbers import engineers_numbers
 from workflow.describe.controller import controller_section, crossover_rows
-from workflow.describe.facts import Row, Section, Verdict, said, worded
+from workflow.describe.facts import Row, Section, said, worded
 from workflow.tasks.design_source import DesignSource
 from workflow.text.formats import bound, count, si
 from workflow.text.sentences.certificate import limited_loops
@@ -78,9 +78,7 @@ def _worst_row(
     text = bound(found[plant][name], is_margin)
     if len(found) > 1:
         text += f" ({plant})"
-    verdict = Verdict.NONE
     if name in held.get(plant, {}):
         _, before, stands = held[plant][name]
-        verdict = Verdict.MISSED if stands == "worse" else Verdict.MET
         text += f"; baseline {bound(before, is_margin)}: {'WORSE' if stands == 'worse' else stands}"
-    return worded(_NAMES[name], text, verdict=verdict)
+    return worded(_NAMES[name], text)

@@ -15,22 +15,12 @@ from urllib.parse import quote
 
 from markupsafe import Markup
 
-from ident.data.finding import Finding
-from workflow.text.formats import at_least, at_most, interval, number, unit as with_unit
+from workflow.text.formats import at_least, at_most, number, unit as with_unit
 
 # Rows that a page begins with; those behind them stand in the section of their subject.
 ON_THE_FIRST_SCREEN = 5
 # Digits of a number where its fact asks for no others: what a drawing or a data sheet gives.
 USUAL_DIGITS = 3
-
-
-class Verdict(Enum):
-    """Whether a fact is as it was required."""
-
-    NONE = "none"  # nothing was required of it
-    MET = "met"
-    MISSED = "missed"
-    DOUBTFUL = "doubtful"
 
 
 class Bound(Enum):
@@ -47,9 +37,9 @@ class Quantity:
 
     Attributes:
         text: As people read it, unit included.
-        plain: As JSON holds it: a number in `unit`, [low, high], text, a list or a mapping; None for "not
-            known" or "never".
-        unit: Of the number or the interval; "" for words and pure numbers.
+        plain: As JSON holds it: a number in `unit`, text, a list or a mapping; None for "not known" or
+            "never".
+        unit: Of the number; "" for words and pure numbers.
     """
 
     text: str
@@ -86,11 +76,6 @@ class Quantity:
         return cls(text, float(value) if math.isfinite(value) else None, unit)
 
     @classmethod
-    def between(cls, low: float, high: float, unit: str = "", *, digits: int | None = None) -> Quantity:
-        """An interval; digits: significant ones, None: two digits of its width."""
-        return cls(with_unit(interval((low, high), digits), unit), [float(low), float(high)], unit)
-
-    @classmethod
     def words(cls, text: str) -> Quantity:
         """What is no number."""
         return cls(text, text)
@@ -106,14 +91,12 @@ class Row:
         name: As people call it, in lower case: "modulus margin".
         value: Number with unit, interval or words.
         remark: What to know beside it: "required: 0.5; smallest at 2.28 Hz".
-        verdict: Whether it is as required.
     """
 
     key: str
     name: str
     value: Quantity
     remark: str = ""
-    verdict: Verdict = Verdict.NONE
 
     @property
     def text(self) -> str:
@@ -139,15 +122,11 @@ class Section:
     Attributes:
         title: The subject: "closed loop".
         rows: Facts that everybody sees.
-        pictures: Drawn when the page shows them.
-        notes: What was found and is no number; each says itself.
         parts: Folded on a page; on a terminal with --verbose only.
     """
 
     title: str
     rows: tuple[Row, ...] = ()
-    pictures: tuple[Picture, ...] = ()
-    notes: tuple[Finding, ...] = ()
     parts: tuple[Section, ...] = ()
 
     def whole(self) -> Iterator[Section]:
@@ -308,9 +287,9 @@ def file_text(title: str, text: str) -> Fold:
     return Fold(title, (Code(text),))
 
 
-def worded(name: str, text: str, *, key: str = "", verdict: Verdict = Verdict.NONE) -> Row:
-    """A fact in words, on one line."""
-    return Row(key, name, Quantity.words(" ".join(text.split())), verdict=verdict)
+def worded(name: str, text: str) -> Row:
+    """A fact in words, on one line, that programs read elsewhere."""
+    return Row("", name, Quantity.words(" ".join(text.split())))
 
 
 def said(*rows: Row | None) -> tuple[Row, ...]:

@@ -21,7 +21,6 @@ from workflow.describe.facts import (
     Row,
     Table,
     Text,
-    Verdict,
     said,
     worded,
 )
@@ -52,13 +51,8 @@ def ellipse_rows(spread: UncertainChannel, *, whole: bool = True) -> tuple[Row, 
     rows += [worded(f"the same, {part.about}", _radii(part.bands)) for part in spread.others]
     for test in spread.tests:
         if whole or not test.passed:
-            rows.append(
-                worded(
-                    f"residuals, {test.name}",
-                    f"{'pass' if test.passed else 'FAIL'}: {words(test.finding)}",
-                    verdict=Verdict.MET if test.passed else Verdict.DOUBTFUL,
-                )
-            )
+            outcome = "pass" if test.passed else "FAIL"
+            rows.append(worded(f"residuals, {test.name}", f"{outcome}: {words(test.finding)}"))
     rows += [worded("residuals, next step", words(item)) for item in spread.advice]
     agreement = spread.agreement
     if whole or agreement.share_inside_percent < USUALLY_INSIDE_PERCENT:

@@ -152,9 +152,6 @@ def diagnose_cases(
     return DiagnosisRun(documents, tuple(failures), summary)
 
 
-_Loaded = LoadedCase | SimulatorCase
-
-
 @dataclass(frozen=True)
 class Answers(Sequence[Mapping[str, Any]]):
     """JSON answers, read when they are looked at: a thousand would not fit."""

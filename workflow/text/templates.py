@@ -64,11 +64,6 @@ def render_text(template: str, **values: Any) -> str:
     return Markup(environment().get_template(template).render(**values)).unescape()
 
 
-def plain_line(text: str) -> str:
-    """Without escapes, on one line."""
-    return " ".join((text.unescape() if isinstance(text, Markup) else str(text)).split())
-
-
 class CompiledTemplates(BytecodeCache):
     """Kept as Python keeps its own: in `__pycache__`, a file each, nothing where none can be written.
 
