@@ -240,7 +240,7 @@ def test_steps_that_no_machine_has_are_asked_for(tmp_path, name, stamp, unit):
 def test_slow_samples_of_a_motion_are_asked_for_and_others_taken():
     """Of white noise, or of what stands still, nobody can say that the samples are too close."""
     seen, unseen = np.sin(0.1 * K), np.random.default_rng(0).standard_normal(N)
-    for dt_s, words in ((200.0, "Of a rate of 200 Hz it is 0.005"), (1e-7, "logged that fast")):
+    for dt_s, words in ((200.0, "of a rate of 200 Hz it is 0.005"), (1e-7, "logged that fast")):
         with pytest.raises(ValueError, match=words):
             flexlink.Record(u=U, y=seen, dt_s=dt_s)
     for dt_s, y in ((1.0, seen), (10.0, unseen), (1e-6, seen)):
