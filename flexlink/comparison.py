@@ -229,10 +229,11 @@ class Comparison(Shown):
             label = f"{model.name}: {model.fit_percent:.1f} %"
             curves += axes.plot(time_s, model.simulated[rows], label=label)
 
-        # Units as the log says them; without any the name stands alone.
-        unit = record.output_units[0] if record.output_units else ""
+        # A unit that nobody stated is never guessed.
+        stated_units = [unit for unit in record.output_units if unit]
+        unit = stated_units[0] if stated_units else "as logged"
         axes.set_xlabel("time [s]")
-        axes.set_ylabel(f"{record.output_names[0]} [{unit}]" if unit else record.output_names[0])
+        axes.set_ylabel(f"{record.output_names[0]} [{unit}]")
         axes.set_title(record.name if title is None else title)
         axes.margins(x=0)
         _label_beside(axes, curves)
