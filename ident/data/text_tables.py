@@ -635,7 +635,7 @@ class _Fit:
         cells = cells[: len(cells) - _empty_at_end(cells)]
         if all(_BEHIND_NAMES.fullmatch(cell) for cell in cells[self.n_cells :]):
             cells = cells[: self.n_cells]
-        if _is_statement(cells):
+        if _is_statement(cells) or not self.n_columns <= len(cells) <= self.n_cells:
             return None
 
         # A number is no name, whatever its decimal sign.
@@ -647,8 +647,6 @@ class _Fit:
         # Numbers of channels have three digits at most; the first column is time and may be called anything.
         if numbered and cells and all(re.fullmatch(r"\d{1,3}", cell) for cell in cells[1:]):
             n_words = len(cells)
-        if not self.n_columns <= len(cells) <= self.n_cells:
-            return None
         return cells if 2 * n_words > len(cells) else None
 
     def _without_sign(self, row: int) -> str:

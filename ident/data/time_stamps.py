@@ -119,7 +119,7 @@ def is_stamp(cell: str) -> bool:
     if len(cell) > 2 * _LONGEST_STAMP:
         return False
     # Most cells are numbers or words, which a look at a few characters tells.
-    has_sign = any(sign in cell for sign in ":./") or "-" in cell[1:]
+    has_sign = ":" in cell or "." in cell or "/" in cell or "-" in cell[1:]
     if not has_sign:
         text = cell.lstrip()
         # '20240301T100000': the sign stands behind eight digits.
