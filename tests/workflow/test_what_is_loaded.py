@@ -58,8 +58,10 @@ def test_a_look_at_a_log_loads_no_design(log, tmp_path):
     assert not modules & NEVER_FOR_A_MODEL
 
 
-def test_a_model_is_identified_without_what_designs_and_draws(log):
-    modules = loaded(COMMAND, "identify", log, "--real", "1", "--pairs", "0", "--integrators", "0")
+@pytest.mark.parametrize("page", [[], ["--report", "page.html"]], ids=["alone", "with its page"])
+def test_a_model_is_identified_without_what_designs_and_draws(log, page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    modules = loaded(COMMAND, "identify", log, "--real", "1", "--pairs", "0", "--integrators", "0", *page)
     assert "ident.one_input" in modules
     assert not modules & NEVER_FOR_A_MODEL
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import control
 import numpy as np
 from scipy.signal import ss2tf
 
@@ -21,6 +20,9 @@ from workflow.tasks.system_documents import (
     stated_system,
 )
 
+if TYPE_CHECKING:
+    import control
+
 
 def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSpace:
     """The system of a file as `stated_system` reads it. Raises InputError."""
@@ -28,6 +30,9 @@ def read_state_space(path: Path, document: Mapping[str, Any]) -> control.StateSp
 
 
 def _state_space(stated: StatedSystem) -> control.StateSpace:
+    # Here, since python-control loads matplotlib: most pages describe runs that read no system.
+    import control
+
     if stated.polynomials is not None:
         return of_polynomials(*stated.polynomials, stated.dt_s)
     if stated.roots is not None:
