@@ -16,11 +16,11 @@ from diagnosis.diagnosis import diagnose
 from flexlink.pictures import as_response
 from tests.browser import Browser
 from workflow.commands.run import run_from_files
-from workflow.commands.tune import tuning
 from workflow.diagnose.case_files import load_case
 from workflow.figures.bode import draw_bode
 from workflow.figures.gap_records import draw_measured_beside_simulated
 from workflow.figures.svg import alone
+from workflow.tune import tuning
 
 DOCS = Path(__file__).parent
 

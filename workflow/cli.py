@@ -312,7 +312,7 @@ def excite(
         raise InputError("--closed-loop goes with logs of the loop: flexlink excite --closed-loop LOG... ...")
     if log:
         need(*log)
-        from workflow.commands.excite import write_reference
+        from workflow.excite import write_reference
 
         of_reference = ("band_Hz", "duration_s", "lead_in_s")
         counts |= {name: stated[name] for name in of_reference if name in stated}
@@ -335,8 +335,7 @@ def excite(
         )
     if "motion" in stated:
         raise InputError("--motion goes with --closed-loop; in open loop --angle bounds the motion")
-    from workflow.commands.excite import write_experiment
-    from workflow.tasks.experiment import ExperimentLimits
+    from workflow.excite import ExperimentLimits, write_experiment
 
     _show_files(write_experiment(_settings(ExperimentLimits, stated), out, seed=seed, **counts), as_json)
 
@@ -352,7 +351,7 @@ def look(
 ) -> None:
     """Columns, units, sampling (period, jitter, missing rows), ranges, clipping and quantisation of a log."""
     need(log)
-    from workflow.commands.look import look as look_at_log
+    from workflow.look import look as look_at_log
 
     _show(look_at_log(log, out=out, **of_fields), as_json)
 
@@ -434,7 +433,7 @@ def identify(
             ],
         )
         if not any(of_fields[name] for name in ("input_name", "output_name", "time")) and is_response(*log):
-            from workflow.commands.identify_response import identify_response
+            from workflow.responses import identify_response
 
             of_logs = {
                 **{option_name(key): of_fields[key.replace(".", "_")] for key in _OF_LOGS},
@@ -590,7 +589,7 @@ def tune(
             from workflow.config.design_file import read_design_file
 
             file = None if specification is None else read_design_file(specification)
-            from workflow.commands.tune import serve, tuning
+            from workflow.tune import serve, tuning
 
             made = tuning(source or [], file, out=out, seed=seed, port=port, progress=progress)
             server = held.enter_context(made)

@@ -74,7 +74,7 @@ SETTINGS = {
     "channel": "workflow.config.run_config:Channel",
     "loop": "workflow.config.run_config:ClosedLoopData",
     "plan": "plant.experiment_plan:ExperimentPlan",
-    "limits": "workflow.tasks.experiment:ExperimentLimits",
+    "limits": "workflow.excite:ExperimentLimits",
     "files": "workflow.config.command_files:CommandFiles",
     "specification": "control_design.specification:Specification",
     "simulator": "workflow.diagnose.simulator_settings:SimulatorSettings",

@@ -37,12 +37,12 @@ from tests.workflow.diagnosis_examples import FRICTION, KnownAnswer, write_case
 from workflow.describe.diagnosis import far_off, headline, is_noise, numbers, unexplained_words
 from workflow.describe.diagnosis_view import DiagnosisView
 from workflow.describe.facts import Section, answer, by_key
-from workflow.describe.fleet import FleetMachine, overview_page
 from workflow.describe.summary import RunSummary
 from workflow.diagnose import command, outputs, pages
 from workflow.diagnose.advice import advice_words
 from workflow.diagnose.case_files import load_case
 from workflow.diagnose.document import document_of
+from workflow.diagnose.fleet import FleetMachine, overview_page
 from workflow.diagnose.following import Following, following
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase

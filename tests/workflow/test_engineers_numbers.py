@@ -14,9 +14,9 @@ from control_design.controllers.controller import Controller, ControllerStepper
 from control_design.controllers.engineers_numbers import engineers_numbers
 from tests.compiler import compiled, needs_compiler
 from tests.workflow.test_design_sources import DT_S, QUICK, arm, document, write_json
-from workflow.commands.tuning import TuningSession
-from workflow.commands.tuning_views import bode
 from workflow.config.design_file import read_design_file
+from workflow.tune.session import TuningSession
+from workflow.tune.views import bode
 
 WISH = """
 [specification]

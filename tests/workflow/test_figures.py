@@ -21,6 +21,8 @@ from ident.uncertainty import FrequencyUncertainty
 from plant import paper_link
 from tests.workflow import report_examples as example
 from workflow.describe.run_page import page_of_run
+from workflow.excite.drawing import draw_excitation
+from workflow.excite.experiment import ExperimentLimits, plan_experiment
 from workflow.figures import style
 from workflow.figures.bands import (
     degrees_near,
@@ -38,12 +40,11 @@ from workflow.figures.gap_answer import draw_waterfall
 from workflow.figures.gap_records import draw_residual_spectra
 from workflow.figures.matplotlib_figure import drawable, figure_of, house_style, saved
 from workflow.figures.poles import draw_poles
-from workflow.figures.records import draw_excitation, draw_records
+from workflow.figures.records import draw_records
 from workflow.figures.sensitivity import draw_sensitivities, sensitivity_curves
 from workflow.figures.subjects import RunView
 from workflow.figures.validation import draw_repeat_scatter
 from workflow.report import rendering
-from workflow.tasks.experiment import ExperimentLimits, plan_experiment
 from workflow.tasks.results import LoopCheck, LoopRuns, RunRecord, RunResults
 
 OMEGA = np.unique(np.concatenate([np.geomspace(0.3, np.pi / example.DT_S, 150), 14 + np.linspace(-2, 2, 41)]))

@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from workflow.describe import fleet
 from workflow.describe.summary import RunSummary
-from workflow.diagnose import command
+from workflow.diagnose import command, fleet
 from workflow.engine import codec
 from workflow.engine.executor import Failure
 from workflow.report.rendering import render_described

@@ -12,7 +12,7 @@ from tests.workflow.command import Answer
 from workflow.commands.logs import read_logs
 from workflow.config.run_config import load_config
 from workflow.engine.errors import cut_inside
-from workflow.tasks.log_look import look_at
+from workflow.look.log_look import look_at
 from workflow.tasks.records import read_record
 from workflow.text.formats import sparkline
 

@@ -10,14 +10,14 @@ from markupsafe import Markup
 from diagnosis.machine.telling import Alike, Telling
 from ident.data.roles import Roles
 from workflow.describe.check import Candidates, LogSeen, check_sections
-from workflow.describe.look import (
+from workflow.look.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
+from workflow.look.words import (
     look_page,
     look_sections,
     response_words,
     sampling_words,
     signal_words,
 )
-from workflow.tasks.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
 
 TIME = TimeLook("t_s", "s", period_s=0.005)
 COLUMN = ColumnLook("y_rad", "rad", np.array([-1.0, 0.0, 2.0]))

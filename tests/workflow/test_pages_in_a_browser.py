@@ -14,12 +14,12 @@ from plant import paper_link
 from tests.browser import AXE, PROGRAM, Browser, barriers
 from tests.workflow import report_examples as example
 from tests.workflow.page_shape import shape_faults
+from workflow.excite.experiment import ExperimentLimits, plan_experiment
 from workflow.figures.bode import draw_bode
 from workflow.figures.poles import draw_poles
 from workflow.report import rendering
 from workflow.report.pages import write_report
 from workflow.report.rendering import render_page
-from workflow.tasks.experiment import ExperimentLimits, plan_experiment
 from workflow.tasks.results import RunResults
 from workflow.text.templates import environment
 

@@ -18,9 +18,9 @@ from diagnosis.machine.telling import Alike, Telling, telling
 from plant.effects import in_words
 from tests.workflow.command import ROOT
 from tests.workflow.diagnosis_examples import KnownAnswer
-from workflow.describe.fleet import FleetMachine
 from workflow.diagnose import check
 from workflow.diagnose.command import _summary, diagnose_cases
+from workflow.diagnose.fleet import FleetMachine
 from workflow.diagnose.simulator_case import load_simulator_case
 from workflow.diagnose.simulator_settings import settings_of
 from workflow.engine.errors import InputError, StageError

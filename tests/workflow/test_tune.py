@@ -22,15 +22,15 @@ from tests.browser import PROGRAM, Browser, barriers
 from tests.workflow import report_examples as example
 from tests.workflow.command import start_flexlink
 from tests.workflow.test_design_sources import DT_S, QUICK, WISH, arm, document, write_json
-from workflow.commands import tuning
-from workflow.commands.tune import TuneServer
-from workflow.commands.tuning import SupersededError, TuningSession, toml_of
 from workflow.config.design_file import DesignFile, read_design_file
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design_source import load_sources
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.text.formats import percent, si
+from workflow.tune import session as tuning
+from workflow.tune.server import TuneServer
+from workflow.tune.session import SupersededError, TuningSession, toml_of
 
 UNCERTAIN = "\n[uncertainty]\nmultiplicative = 0.05\n"
 

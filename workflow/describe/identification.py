@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 from ident.basis.options import IdentOptions
 from ident.data.finding import Finding, FindingKind
-from ident.data.frequency_uncertainty import FrequencyUncertainty
-from ident.frequency_fit import FrfIdentification
 from workflow.describe.facts import (
     Block,
     Heading,
@@ -17,7 +15,6 @@ from workflow.describe.facts import (
     Picture,
     Remarks,
     Row,
-    Section,
     Table,
     Text,
     said,
@@ -322,44 +319,6 @@ def _channel_blocks(channel: ChannelView, *, is_control: bool) -> list[Block]:
 def sentences(found: Iterable[Finding]) -> tuple[str, ...]:
     """What was found, a sentence each."""
     return tuple(sentence(words(item)) for item in found)
-
-
-def response_sections(found: FrfIdentification, response: FrequencyUncertainty) -> list[Section]:
-    """Model of a measured frequency response: points, poles with standard deviations, fit, warnings."""
-    omega = response.omega_rad_s
-    points = (
-        f"{count(omega.size, 'frequency', 'frequencies')}, {frequency(omega[0])} to {frequency(omega[-1])}"
-    )
-    model = found.model
-    dt_s = model.dt_s
-    pairs = zip(
-        model.poles.omega_rad_s(dt_s).tolist(),
-        found.omega_std_rad_s.tolist(),
-        model.poles.zeta().tolist(),
-        found.zeta_std.tolist(),
-        strict=True,
-    )
-    rows = [
-        worded("order", f"{model.order}, sampled every {si(dt_s, 's', 6)}"),
-        *(worded("real pole", si(decay, "1/s")) for decay in model.poles.decay_per_s(dt_s).tolist()),
-    ]
-    for omega_rad_s, omega_std, zeta, zeta_std in pairs:
-        rows.append(
-            worded(
-                "mode",
-                f"{frequency(omega_rad_s, 4)} ± {si(omega_std, 'rad/s', 2)}, damping {number(zeta)} ± "
-                f"{number(zeta_std, 2)}",
-            )
-        )
-    verdicts = tuple(worded(f"{n}", words(item)) for n, item in enumerate(found.verdicts, 1))
-    warnings = tuple(worded(f"{n}", words(item)) for n, item in enumerate(found.warnings, 1))
-    sections = [
-        Section("response", (worded("points", points),)),
-        Section("model", tuple(rows)),
-        Section("fit", verdicts),
-        Section("warnings", warnings),
-    ]
-    return [section for section in sections if section.rows]
 
 
 def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:

@@ -15,11 +15,11 @@ from diagnosis.answer import Diagnosis
 from diagnosis.diagnosis import diagnose
 from workflow.config.settings import repeated
 from workflow.describe.diagnosis_rows import diagnosis_section, failed_case, short_answer
-from workflow.describe.fleet import FleetMachine, csv_text, groups, machines_section, overview_page, trends
 from workflow.describe.summary import RunSummary
 from workflow.diagnose.case_files import LoadedCase, load_case
 from workflow.diagnose.case_settings import CASE_FILE, case_document
 from workflow.diagnose.directory import LAYOUT_VERSION, DiagnosisDirectory
+from workflow.diagnose.fleet import FleetMachine, csv_text, groups, machines_section, overview_page, trends
 from workflow.diagnose.outputs import files_of
 from workflow.diagnose.simulator_case import SimulatorCase, load_simulator_case
 from workflow.diagnose.simulator_settings import SimulatorSettings, is_simulator, settings_of

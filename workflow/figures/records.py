@@ -1,4 +1,4 @@
-"""Signals as they are: of the records of a run, of any log, of a planned experiment."""
+"""Signals as they are: the records of a run."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from ident.data.record import Record
 from workflow.figures import style
 from workflow.figures.bands import Real, liveliest, outline
 from workflow.figures.description import Picture, new_picture
-from workflow.tasks.experiment import PlannedExperiment
-from workflow.tasks.log_look import LogLook
 from workflow.tasks.results import RunRecord
 
 # Samples of the close-up: as many as a panel has pixels across.
@@ -92,78 +90,3 @@ def _signal(record: Record, kind: str, name: str) -> tuple[Real, str]:
     column = names.index(name)
     units = getattr(record, f"{kind}_units")
     return np.asarray(getattr(record, kind)[:, column]), units[column] if units else ""
-
-
-# Panels of one picture; a log of more signals is looked at in parts.
-_MOST = 12
-
-
-@style.drawing("log")
-def draw_log(found: LogLook) -> Picture | None:
-    """One panel per column of numbers, the first twelve."""
-    shown = [column for column in found.columns if column.values is not None][:_MOST]
-    if not shown:
-        return None
-    picture, grid = new_picture(1.6 * len(shown), len(shown), 1, squeeze=False)
-    known = found.time is not None and not found.time.why
-    step = found.time.period_s if known and found.time is not None else 1.0
-    for panel, column in zip(grid[:, 0], shown, strict=True):
-        values = column.values
-        assert values is not None
-        panel.plot(step * np.arange(values.size), values, color=style.MEASURED, lw=0.7)
-        panel.set(
-            xlabel="time [s]" if known else "row [1]", ylabel=f"[{column.unit or '?'}]", title=column.name
-        )
-    return picture
-
-
-# Seconds of a voltage that are shown: a panel of more shows a band and no signal.
-_TIME_S = 10.0
-
-
-@style.drawing("excitation")
-def draw_excitation(found: PlannedExperiment) -> Picture:
-    """A planned experiment: first record at the highest amplitude, lines of all, and what to expect.
-
-    Right: the expected radius of the response, and its gain where it is known.
-    """
-    rms = np.array(found.plan.rms_V)
-    loudest = int(np.argmax(rms))
-    picture, (signal, lines, response) = new_picture(3.6, 1, 3)
-    voltage = found.voltages_V[loudest, 0]
-    time = np.arange(voltage.size) * found.limits.dt_s
-    shown = time <= _TIME_S
-    signal.plot(time[shown], voltage[shown], **style.REFERENCE_STEPS | {"ls": "-", "lw": 0.7})
-    for sign in (1, -1):
-        signal.axhline(sign * found.limits.peak_V, **style.LIMIT_LINE, label="voltage limit")
-    lead_in_s = found.plan.lead_in_samples * found.limits.dt_s
-    signal.axvspan(0, lead_in_s, color=style.MEASURED, alpha=0.2, lw=0, label="lead-in")
-    cut = "" if shown.all() else f", first {_TIME_S:g} s"
-    signal.set(xlabel=f"time [s]{cut}", ylabel="voltage [V]")
-    signal.set_title(f"First record at {rms[loudest]:g} V rms")
-    for value, shade in zip(rms, np.linspace(1.0, 0.45, rms.size), strict=True):
-        line_V = np.full(found.lines_Hz.size, value * np.sqrt(2 / found.lines_Hz.size))
-        dots = {"ls": "none", "marker": ".", "ms": 3, "alpha": shade, "color": style.MODEL}
-        lines.plot(found.lines_Hz, line_V, **dots, label="excited line")
-    bottom = 0.5 * rms.min() * np.sqrt(2 / found.lines_Hz.size)
-    lines.plot(
-        found.detection_Hz,
-        np.full(found.detection_Hz.size, bottom),
-        ls="none",
-        marker="|",
-        ms=6,
-        color=style.ACHIEVED,
-        label="detection line (odd)",
-    )
-    lines.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="amplitude of a line [V]")
-    lines.set_title("Lines of every record")
-    if found.gain is not None:
-        response.plot(found.lines_Hz, found.gain, **style.MODEL_LINE, label="expected gain")
-    for value, radius in zip(rms, found.radii, strict=True):
-        response.plot(
-            found.lines_Hz[[0, -1]], [radius] * 2, color=style.UNCERTAIN, lw=1.4, label="expected 95 % radius"
-        )
-        response.words(f"{value:g} V rms", found.lines_Hz[0], radius, offset=(0.0, 1.0))
-    response.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
-    response.set_title("Response to be expected")
-    return picture

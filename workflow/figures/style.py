@@ -80,6 +80,7 @@ def ratio_unit(output_unit: str, input_unit: str) -> str:
 # Drawings by the module that makes them. A page loads those it draws with and no other: the drawings of a run
 # need the whole design, those of one log next to nothing.
 _DRAWINGS_OF: dict[str, tuple[str, ...]] = {
+    "workflow.excite.drawing": ("excitation",),
     "workflow.figures.bode": ("bode", "response", "bode-loop", "distortion"),
     "workflow.figures.closed_loop": (
         "closed-loop",
@@ -101,9 +102,10 @@ _DRAWINGS_OF: dict[str, tuple[str, ...]] = {
     "workflow.figures.overview": ("overview",),
     "workflow.figures.pole_search": ("error-surface", "order"),
     "workflow.figures.poles": ("poles",),
-    "workflow.figures.records": ("records", "log", "excitation"),
+    "workflow.figures.records": ("records",),
     "workflow.figures.sensitivity": ("sensitivities",),
     "workflow.figures.validation": ("validation", "residuals", "repeats"),
+    "workflow.look.drawing": ("log",),
     "workflow.study.page": ("pareto",),
 }
 # The module of each drawing: the table above, the other way round.

@@ -32,11 +32,9 @@ from control_design.specification.structure import order_of_structure
 from control_design.synthesis.synthesis import synthesise_near
 from ident.uncertainty import ResponsePosterior
 from workflow.commands.design import at_one_bandwidth, design_controller, load_asked, of_run
-from workflow.commands.tuning_views import FrictionStep, bode, line, roots, short
 from workflow.config.design_file import DesignFile, PlantSection, read_design_file
 from workflow.config.run_config import RunConfig
 from workflow.config.settings import check
-from workflow.describe.tune import tune_rows
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.randomness import stage_rng
@@ -52,6 +50,8 @@ from workflow.tasks.sampled_plant import FINITE, realise, simulate_plant
 from workflow.tasks.simulated_rig import converter_steps
 from workflow.text.formats import bound, si, unit
 from workflow.text.sentences.certificate import LIMITS_NOT_LOOKED_AT, certificate_reason, limited_loops
+from workflow.tune.rows import tune_rows
+from workflow.tune.views import FrictionStep, bode, line, roots, short
 
 # A setting beside those of the specification: level of the ellipses.
 CONFIDENCE = "confidence"

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from ident.data.finding import FindingKind
 from ident.data.foreign_files import as_typed, path_as_typed
-from workflow.describe.look import look_page, look_sections
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec, storage
-from workflow.tasks.log_look import LogLook, ResponseLook, look_at, options_typed
+from workflow.look.log_look import LogLook, ResponseLook, look_at, options_typed
+from workflow.look.words import look_page, look_sections
 from workflow.text.formats import number
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from workflow.describe.facts import Section, worded
-from workflow.tasks.reference_plan import PlannedReference
+from workflow.excite.reference_plan import PlannedReference
 from workflow.text.formats import count, number, share, si
 
 # Share of the lines from which on the logs count as telling the loop at all of them; chosen.

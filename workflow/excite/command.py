@@ -16,7 +16,7 @@ from workflow.engine import codec, storage
 from workflow.engine.run_directory import RunDirectory
 
 if TYPE_CHECKING:
-    from workflow.tasks.experiment import ExperimentLimits
+    from workflow.excite.experiment import ExperimentLimits
 
 # The plan, beside the records.
 PLAN_FILE = "plan.json"
@@ -29,7 +29,7 @@ def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settin
 
     settings: fields of `plant.ExperimentPlan` by name. Raises InputError.
     """
-    from workflow.tasks.experiment import plan_experiment
+    from workflow.excite.experiment import plan_experiment
 
     RunDirectory(out).refuse_unless_free()
     experiment = plan_experiment(limits, seed=seed, **settings)
@@ -85,8 +85,8 @@ def write_reference(
     RunDirectory(out).refuse_unless_free()
     read = read_channel("excite --closed-loop", logs, stated)
     # Takes seconds to load.
-    from workflow.describe.reference import reference_sections
-    from workflow.tasks.reference_plan import plan_reference
+    from workflow.excite.reference_plan import plan_reference
+    from workflow.excite.words import reference_sections
 
     roles = read.roles
     position = is_position(roles.output, read.unit_of[roles.output])

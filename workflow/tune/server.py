@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from workflow.commands.tuning import Handler, SupersededError, TuningSession
 from workflow.config.design_file import DesignFile
 from workflow.config.run_config import built_in_config
 from workflow.engine.documents import json_object
@@ -28,6 +27,7 @@ from workflow.engine.errors import InputError, one_line
 from workflow.engine.progress import Progress
 from workflow.tasks.pipeline import identify_only
 from workflow.text.templates import environment
+from workflow.tune.session import Handler, SupersededError, TuningSession
 
 # Loopback address: nobody outside this machine reaches it.
 HOST = "127.0.0.1"

@@ -14,11 +14,11 @@ from ident.data.frf_records import FrfRepeats, measured_response
 from ident.frequency_fit import identify_frf
 from ident.uncertainty.nominal import nominal_near
 from workflow.config.command_files import refuse_model_ending
-from workflow.describe.identification import response_sections
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec, interrupts, storage
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
+from workflow.responses.words import response_sections
 from workflow.tasks.exports import model_bytes
 from workflow.tasks.results import IdentifiedPlant
 from workflow.text.findings.sentences import words

@@ -18,7 +18,7 @@ from workflow.describe.facts import (
     Section,
     Table,
 )
-from workflow.tasks.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
+from workflow.look.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
 from workflow.text.findings.sentences import words as finding_words
 from workflow.text.formats import count, number, share as percentage, si, sparkline
 

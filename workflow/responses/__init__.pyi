@@ -1,0 +1,1 @@
+from .command import identify_response as identify_response
