@@ -153,10 +153,10 @@ def of_run(summary: Any) -> Answer:
 
 def summary_of_run(config: Any, folder: Path) -> Any:
     """The `RunSummary` of a whole run into a folder."""
-    from workflow.describe.run import summarise
+    from workflow.kinds import kind_of, summarise
     from workflow.tasks.pipeline import run_pipeline
 
-    return summarise(run_pipeline(config, folder), config)
+    return summarise(run_pipeline(config, folder, kind=kind_of(config)), config)
 
 
 def example(name: str, golden: bool = True) -> Answer:
@@ -284,7 +284,7 @@ def two_joints(case: str) -> Answer:
 def joints_run() -> Answer:
     """A whole run for two simulated joints, as small as tests have it."""
     from tests.workflow.test_joints import _JOINTS, _REST, _SOURCE
-    from workflow.config.joints_config import load_any
+    from workflow.kinds import load_any
 
     with scratch() as folder:
         (folder / "two.toml").write_text(_SOURCE + _JOINTS + _REST)

@@ -26,12 +26,11 @@ from pathlib import Path
 from benchmarks.harness import Print, main
 from workflow.commands.logs import Reading
 from workflow.commands.run import run_from_files, simulate_to_csv
-from workflow.config.joints_config import load_any
 from workflow.engine import storage
 from workflow.engine.run_directory import KEPT_FILES, RunDirectory
+from workflow.kinds import kind_of, load_any
 from workflow.study.settings import load_study
 from workflow.study.work import run_study
-from workflow.tasks.pipeline import controller_stages, plant_stages
 
 # Of a run: the seconds of its stages and the status stand there.
 _NAMES_TIMES = ("manifest.json", "lock")
@@ -257,7 +256,7 @@ def run(out: Print, *, only: str = "") -> None:
             if kind.drafted:
                 config = whole / "config.toml"
             settings, _ = load_any(config)
-            stages = [stage.name for stage in (*plant_stages(settings), *controller_stages(settings))]
+            stages = [stage.name for stage in kind_of(settings).stages]
             for number, stage in enumerate(stages, start=1):
                 cut = folder / f"cut {number}" / "run"
                 cut_after(whole, cut, tuple(stages[:number]))

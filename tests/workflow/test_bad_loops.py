@@ -17,8 +17,8 @@ from benchmarks.closed_loop_machines.judge import read_law, violations
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks import pipeline
 from workflow.tasks.results import RunResults
+from workflow.tasks.stages import ONE_LOOP
 
 DT_S, PERIOD = 0.004, 1500
 MOTOR, LOAD, ANTIRESONANCE, TORQUE, COULOMB = 2e-3, 5e-3, 2 * np.pi * 5.0, 0.6, 0.03
@@ -84,8 +84,8 @@ def up_to_design(monkeypatch):
     def stop(stage):
         raise InputError(REACHED)
 
-    stages = [replace(one, run=stop) if one.name == "design" else one for one in pipeline.STAGES]
-    monkeypatch.setattr(pipeline, "STAGES", tuple(stages))
+    stages = [replace(one, run=stop) if one.name == "design" else one for one in ONE_LOOP.stages]
+    monkeypatch.setattr(ONE_LOOP, "stages", tuple(stages))
 
 
 @pytest.fixture
@@ -109,8 +109,8 @@ def records(flexlink, tmp_path, monkeypatch, unidentified):
         seen.append((stage.results.records.records, stage.config))
         raise InputError(REACHED)
 
-    stages = [replace(one, run=stop) if one.name == "identify" else one for one in pipeline.STAGES]
-    monkeypatch.setattr(pipeline, "STAGES", tuple(stages))
+    stages = [replace(one, run=stop) if one.name == "identify" else one for one in ONE_LOOP.stages]
+    monkeypatch.setattr(ONE_LOOP, "stages", tuple(stages))
 
     def run(paths):
         answer = flexlink("run", *paths, "--out", tmp_path / "out")

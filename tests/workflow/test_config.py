@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from tests.workflow.command import FAST_ARM, ROOT
-from workflow.config.joints_config import load_any
 from workflow.config.rig_settings import BangBang, Doublet, LogChirp, Multisine, Prbs
 from workflow.config.run_config import FileSource, RunConfig, SimulatedSource, built_in_config, load_config
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
+from workflow.kinds import load_any
 from workflow.tasks.simulated_rig import simulate_record
 
 MINIMAL = """

@@ -16,11 +16,11 @@ from control_design.plants.plant_set import matrix_response
 from plant import multisine, multisine_lines, two_link_arm
 from tests.workflow.command import FAST_ARM
 from workflow.cli import main
-from workflow.config.joints_config import load_any
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.joints import _judged
-from workflow.tasks.results import RunResults
-from workflow.tasks.simulated_rig import machine_at
+from workflow.joints import JointsResults
+from workflow.joints.machine import machine_at
+from workflow.joints.stages import _judged
+from workflow.kinds import load_any
 
 _JOINTS = """
 [[joints]]
@@ -93,7 +93,7 @@ def test_a_run_ends_with_a_certified_controller_and_a_page(run_of_the_arm):
 
 def _check_the_ball(run: Path):
     """It holds the response of small motions, linearised by automatic differentiation, not identified."""
-    (point,) = RunResults(RunDirectory.open(run)).identify.points
+    (point,) = JointsResults(RunDirectory.open(run)).identify.points
     a, b = two_link_arm(0.05).linear(1.6)
     true = control.c2d(control.ss(a, b, np.eye(2, len(a)), np.zeros((2, 2))), point.model.dt_s)
     assert np.mean(point.shown.distance(matrix_response(true, point.shown.omega_rad_s)) <= 1) > 0.9
@@ -170,7 +170,7 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     config.write_text(config.read_text().replace('"bent" }]', '"bent" }, ' + ", ".join(fresh) + "]"))
     assert main(["run", "--config", str(config), "--out", str(tmp_path / "run"), "--quiet", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)["numbers"]
-    (point,) = RunResults(RunDirectory(tmp_path / "run")).identify.points
+    (point,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
     kept, wrong = ([fit.fit_percent for fit in fits] for fits in point.fresh)
     np.testing.assert_allclose(kept, point.fit_percent[0], atol=3)
     assert wrong[1] < 0 < wrong[0] < kept[0] - 10
@@ -305,7 +305,7 @@ def test_a_study_varies_what_a_joint_is_asked(run_of_the_arm, tmp_path):
     table = pd.read_csv(out / "table.csv")
     assert list(table["state"]) == ["certified", "not certified"]
     assert table["worst_gamma"][0] < 1 < table["worst_gamma"][1]
-    certificate = RunResults(RunDirectory(run_of_the_arm)).certify.certificate
+    certificate = JointsResults(RunDirectory(run_of_the_arm)).certify.certificate
     disks = [disk.alpha for one in certificate.verdicts for disk in (one.input_disk, one.output_disk)]
     assert table["disk_margin"][0] == pytest.approx(min(disks), rel=1e-9)
     own = out / "points" / "1"
@@ -333,8 +333,8 @@ def test_each_input_may_have_its_own_dead_time(logs, run_of_the_arm, tmp_path):
     text = _from_log(tmp_path, tmp_path / "moved.csv").read_text()
     text = text.replace("n_real = 3", f"input_delay_samples = {list(late)}\nn_real = 3")
     assert _run(_written(tmp_path, text)) == 0
-    (found,) = RunResults(RunDirectory(tmp_path / "run")).identify.points
-    (own,) = RunResults(RunDirectory(run_of_the_arm)).identify.points
+    (found,) = JointsResults(RunDirectory(tmp_path / "run")).identify.points
+    (own,) = JointsResults(RunDirectory(run_of_the_arm)).identify.points
     assert found.model.order == own.model.order
     omega = np.geomspace(1.0, 300.0, 50)
     phase = np.exp(-1j * omega[:, None] * own.model.dt_s * np.array(late))[:, None, :]
@@ -361,7 +361,7 @@ def test_one_joint_at_two_operating_points_gets_one_controller(tmp_path):
     assert _run(_written(tmp_path, text.replace("n_real = 3\nn_pairs = 2", "n_real = 1\nn_pairs = 1"))) == 0
     run = tmp_path / "run"
     law, omega = Controller.from_json((run / "controller.json").read_text()), np.geomspace(0.1, 600.0, 2000)
-    first, half = RunResults(RunDirectory(run)).identify.points
+    first, half = JointsResults(RunDirectory(run)).identify.points
     for point in (first, half):
         loop = law.response(omega) * matrix_response(point.plant(0.0).nominal, omega)[:, 0, 0]
         assert np.max(1 / np.abs(1 + loop)) < 1 / 0.5

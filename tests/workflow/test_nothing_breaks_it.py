@@ -19,7 +19,6 @@ import pytest
 import workflow.commands.design
 import workflow.commands.identify
 import workflow.tasks.design_source
-import workflow.tasks.pipeline
 import workflow.tasks.simulated_rig
 from control_design.controllers.controller import Controller
 from tests.ident.mutations import DAMAGE, Tally, tally
@@ -32,6 +31,7 @@ from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
 from tests.workflow.test_cli import good_table, write_case as write_own
 from workflow.cli import main
 from workflow.engine.executor import LocalProcesses, ThisProcess
+from workflow.tasks.stages import ONE_LOOP
 
 TINY_SIMULATION = """
 [run]
@@ -148,8 +148,8 @@ def cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is computed: what was given has been taken once a command gets that far."""
-    idle = [with_fields(stage, run=_computes) for stage in workflow.tasks.pipeline.STAGES]
-    monkeypatch.setattr(workflow.tasks.pipeline, "STAGES", tuple(idle))
+    idle = [with_fields(stage, run=_computes) for stage in ONE_LOOP.stages]
+    monkeypatch.setattr(ONE_LOOP, "stages", tuple(idle))
     monkeypatch.setattr(workflow.commands.design, "_design", _computes)
     monkeypatch.setattr(workflow.commands.identify, "identify_logs", _computes)
     monkeypatch.setattr(workflow.tasks.design_source, "identify_frf", _computes)

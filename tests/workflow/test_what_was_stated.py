@@ -16,12 +16,13 @@ from ident.basis.options import LEFT_OPEN, IdentOptions
 from tests.workflow.command import FAST_ARM, ROOT
 from tests.workflow.test_resume import NAMES, plain_page, stage_bytes
 from workflow.commands.run import run_from_files
-from workflow.config.joints_config import JointsConfig, load_any
 from workflow.config.run_config import RunConfig, load_config
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
+from workflow.joints import JointsConfig
+from workflow.kinds import load_any
 from workflow.study.points import load_base
 from workflow.study.settings import StudyConfig, with_values
 from workflow.tasks.pipeline import config_of, identify_only

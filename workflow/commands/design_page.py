@@ -24,7 +24,8 @@ from workflow.tasks.results import (
     ReferenceFilterResult,
     RunResults,
 )
-from workflow.tasks.stages import PLANT, STAGES
+from workflow.tasks.stage import PLANT
+from workflow.tasks.stages import STAGES
 
 # Sections of a run's configuration that a design file states in their place.
 _OF_DESIGN_FILE = ("synthesis", "certificate", "achievable_performance", "reference_filter")

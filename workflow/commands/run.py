@@ -14,13 +14,21 @@ import numpy as np
 from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record
 from workflow.commands.init import decided
-from workflow.config.joints_config import AnyConfig, JointsConfig, load_any, load_simulation
-from workflow.config.run_config import FileSource, SimulatedSource, built_in_config, with_absolute_paths
+from workflow.config.run_config import (
+    AnyConfig,
+    FileSource,
+    RunConfig,
+    SimulatedSource,
+    SimulationConfig,
+    built_in_config,
+    with_absolute_paths,
+)
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory, default_directory
 from workflow.field_options import option_name
+from workflow.kinds import config_of_any, kind_of, load_any, load_simulation, page_of, simulated, summarise
 from workflow.tasks.changed_specification import config_with_typed
 from workflow.tasks.early_refusals import refuse_hopeless_source
 from workflow.tasks.records import read_records
@@ -96,8 +104,6 @@ def run_from_files(
             note = ""
             if found.refused and not found.remote:
                 note = f"described as recorded, its friction not identified: {found.refused}"
-            from workflow.describe.run import summarise
-            from workflow.report.pages import page_of
             from workflow.tasks.pipeline import run_pipeline
 
             results = run_pipeline(
@@ -123,17 +129,13 @@ def run_from_files(
         config, text = load_any(config_path)
         called = str(config_path)
     elif earlier is not None:
-        from workflow.tasks.pipeline import any_config_of
-
         called = str(earlier.path)
-        config = config_with_typed(any_config_of(earlier), typed, called)
+        config = config_with_typed(config_of_any(earlier), typed, called)
         values = {key: "none" if value is None else value for key, value in typed.items()}
         changes = ", ".join(f"{key} = {value}" for key, value in values.items()) or "nothing changed"
         text = f"# As {path_as_typed(earlier.path / 'config.toml')}, {changes}\n\n{config.to_toml()}"
     elif resume and out is not None and (out / "manifest.json").is_file():
-        from workflow.tasks.pipeline import any_config_of
-
-        config = any_config_of(RunDirectory.open(out))
+        config = config_of_any(RunDirectory.open(out))
         text = ""
     elif resume and not replace:
         raise InputError(f"{out}: no run is there to resume; start one without --resume")
@@ -150,13 +152,12 @@ def run_from_files(
         RunDirectory(place).refuse_unless_free(resume=resume, replace=replace)
         read = read_records(config.source, config.columns)
         refuse_hopeless_source(config, read, progress)
-    from workflow.describe.run import summarise
-    from workflow.report.pages import page_of
     from workflow.tasks.pipeline import run_pipeline
 
     results = run_pipeline(
         config,
         place,
+        kind=kind_of(config),
         config_text=text,
         called=called,
         page=page_of(config),
@@ -204,12 +205,12 @@ def rebuild_report(
 
     also: kinds of file for its pictures beside SVG, pdf or png.
     """
-    from workflow.describe.run import summarise
-    from workflow.report.pages import page_of
-    from workflow.tasks.pipeline import any_config_of, rebuild_page
+    from workflow.tasks.pipeline import rebuild_page
 
-    config = any_config_of(run)
-    return summarise(rebuild_page(run, page_of(config, also), progress), config)
+    config = config_of_any(run)
+    results = kind_of(config).results(run)
+    rebuild_page(config, results, page_of(config, also), progress)
+    return summarise(results, config)
 
 
 def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
@@ -220,13 +221,13 @@ def simulate_to_csv(config_path: Path | None, out: Path) -> list[Path]:
     """
     config = load_simulation(config_path) if config_path is not None else built_in_config()[0]
     if isinstance(config.source, FileSource):
-        kind = "two_joint_arm" if isinstance(config, JointsConfig) else "simulated"
+        kind = "simulated" if isinstance(config, RunConfig | SimulationConfig) else "two_joint_arm"
         raise InputError(f"{config_path}: source.kind is 'files'; simulating needs kind = {kind!r}")
     RunDirectory(out).refuse_unless_free()
     # Here: what simulates takes seconds to load, and a configuration that is refused does not need it.
-    from workflow.tasks.simulated_rig import TRUTH_FILE, simulated_records, truth_of
+    from workflow.tasks.simulated_rig import TRUTH_FILE, truth_of
 
-    files = _as_csv(simulated_records(config, str(config_path or "default arm")))
+    files = _as_csv(simulated(config, str(config_path or "default arm")))
     if isinstance(config.source, SimulatedSource):
         files[TRUTH_FILE] = truth_of(config.source).model_dump_json(indent=1) + "\n"
     return storage.write_new_directory(out, files)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self, TypeVar
 
 import tomlkit
 from pydantic import AfterValidator, Field, model_validator
@@ -397,7 +397,39 @@ class AnyRun(Section):
 RunT = TypeVar("RunT", bound=AnyRun)
 
 
-class RunConfig(AnyRun):
+class SimulationConfig(AnyRun):
+    """The experiments of a simulated machine alone."""
+
+    source: SimulatedSource
+
+
+class Signals(Protocol):
+    """An input and an output by their columns."""
+
+    @property
+    def input(self) -> str:
+        """Column of the command."""
+
+    @property
+    def output(self) -> str:
+        """Column of what is measured."""
+
+
+class AnyConfig(AnyRun):
+    """The configuration of a whole run, of one loop or of several joints."""
+
+    @property
+    def columns(self) -> Sequence[Signals]:
+        """Inputs and outputs that records have."""
+        raise NotImplementedError
+
+    @property
+    def loops(self) -> Sequence[Signals]:
+        """What the controller drives and is fed."""
+        raise NotImplementedError
+
+
+class RunConfig(AnyConfig):
     """A whole run of one loop. Load with `load_config`."""
 
     source: Source

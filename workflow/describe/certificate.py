@@ -27,7 +27,6 @@ from workflow.describe.facts import (
     worded,
 )
 from workflow.tasks.design import joint_numbers
-from workflow.tasks.point_models import JointsCertificate, JointsLoopResult
 from workflow.tasks.results import CertifyResult, RunResults
 from workflow.text.formats import (
     MISSING,
@@ -53,14 +52,13 @@ from workflow.text.sentences.certificate import (
     limited_loops,
     met,
     not_checked,
-    not_checked_of_joints,
 )
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import RunView
 
 # Anchor, title and short name of two sections of a page.
-_UNCHECKED = ("unchecked", "What was not checked", "Not checked")
+UNCHECKED = ("unchecked", "What was not checked", "Not checked")
 _MARGINS = ("margins", "Margins and certificate", "Margins")
 NOT_ON_THE_MACHINE = "The controller has not run on the real machine."
 # Modes of the closed loop with a larger damping ratio need no word: they overshoot by less than 25 %.
@@ -203,17 +201,7 @@ def unchecked_page(results: RunResults) -> PageSection:
         items = [sentence(text) for text in left]
         if check is not None and check.machine != "simulated":
             items.append(NOT_ON_THE_MACHINE)
-    return PageSection(*_UNCHECKED, (Remarks(tuple(items), "plain"),))
-
-
-def joints_unchecked_page(certify: JointsCertificate, loop: JointsLoopResult) -> PageSection:
-    """What neither certificate nor simulation of several joints speaks about."""
-    items = ["Without a controller, nothing about a closed loop was checked."]
-    if certify.certificate is not None:
-        items = [sentence(text) for text in not_checked_of_joints(certify.certificate)]
-        if loop.machine != "simulated":
-            items.append(NOT_ON_THE_MACHINE)
-    return PageSection(*_UNCHECKED, (Remarks(tuple(items), "plain"),))
+    return PageSection(*UNCHECKED, (Remarks(tuple(items), "plain"),))
 
 
 def margins_page(view: RunView, *, is_design: bool) -> PageSection:

@@ -15,7 +15,6 @@ from workflow.describe.friction import beside_recorded, friction_exceeds, stands
 from workflow.describe.run import lowered_bandwidth, signals_where_scaled
 from workflow.describe.uncertainty import USUALLY_INSIDE_PERCENT
 from workflow.tasks.giving_way import gave_way
-from workflow.tasks.pipeline import is_certified_and_settles
 from workflow.tasks.results import RunResults
 from workflow.text.findings.sentences import words
 from workflow.text.formats import at_most, count, frequency, listing, number, percent, sentence, share
@@ -69,7 +68,7 @@ def first_screen(view: RunView) -> FirstScreen:
     results = view.results
     headline = headline_of(results, view.config)
     state: State = "refused"
-    if is_certified_and_settles(results):
+    if results.certified and results.settles:
         state = "certified" if headline.startswith("Certified:") else "plain"
     if results.closed_loop.check is not None:
         picture = Picture(

@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from ident.data.distortion import Distortion
 from ident.data.record import Record
-from workflow.config.joints_config import JointsConfig
 from workflow.config.run_config import Notes, Role, RunConfig
 from workflow.describe.facts import (
     Block,
@@ -75,7 +74,7 @@ def logs_section(logs: Sequence[Record], input_limit: float | None) -> Section:
 def records_page(view: AnyRunView) -> PageSection:
     """What was measured, and how it was read."""
     config = view.config
-    several = isinstance(config, JointsConfig)
+    several = not isinstance(config, RunConfig)
     items = view.results.records.records
     simulated = config.source.kind != "files"
     inputs = list(dict.fromkeys(column.input for column in config.columns))
@@ -203,9 +202,11 @@ def _limit_blocks(view: AnyRunView, *, several: bool) -> list[Block]:
     if stated_limit is not None:
         return []
     blocks: list[Block] = []
-    for index, loop in enumerate(config.loops):
-        about = config.joints[index] if several else view.results.design.specification or config.specification
-        limit = about.input_limit
+    for loop in config.loops:
+        asked: Any = loop
+        if not several:
+            asked = view.results.design.specification or config.specification
+        limit = asked.input_limit
         largest = view.largest_recorded(loop.input)
         if limit is None or largest <= limit:
             continue

@@ -9,8 +9,7 @@ from control_design.controllers.engineers_numbers import ControllerNumbers, engi
 from control_design.specification import Specification
 from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
-from workflow.config.joints_config import AnyConfig, JointsConfig
-from workflow.config.run_config import RunConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.describe.certificate import certificate_section, margin_rows
 from workflow.describe.closed_loop import closed_loop_numbers, loop_numbers, loop_section
 from workflow.describe.controller import controller_section, pid_row
@@ -18,16 +17,6 @@ from workflow.describe.design import design_section, filter_section, gave_way_te
 from workflow.describe.facts import Row, Section, answer, said, worded
 from workflow.describe.friction import amplitude_row, friction_row
 from workflow.describe.identification import model_rows
-from workflow.describe.joints import (
-    fit_row,
-    joints_certificate_section,
-    joints_design_section,
-    joints_document,
-    joints_loop_section,
-    joints_numbers,
-    joints_verdict,
-    models_section,
-)
 from workflow.describe.records import records_section
 from workflow.describe.summary import RunSummary
 from workflow.describe.uncertainty import channel_numbers, ellipse_rows, untold_below_rad_s
@@ -36,29 +25,48 @@ from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.design import bracket_numbers, joint_numbers
 from workflow.tasks.exports import Logged
 from workflow.tasks.giving_way import gave_way
-from workflow.tasks.pipeline import is_certified_and_settles
-from workflow.tasks.results import CertifyResult, DesignResult, RunResults
+from workflow.tasks.results import AnyResults, CertifyResult, DesignResult, RunResults
 from workflow.text.findings.sentences import words
 from workflow.text.sentences.design import lowered, tracking_begins
 from workflow.text.sentences.friction import certified_for
 
 
-def summarise(results: RunResults, config: AnyConfig) -> RunSummary:
-    """What a run whose stages are all there says."""
-    if isinstance(config, JointsConfig):
-        sections = joints_sections(results, config)
-        several: Any = results
-        document = joints_document(several.identify, several.design, several.certify, several.closed_loop)
-        verdict = joints_verdict(several.design, several.certify, *several.closed_loop.settled_points())
-    else:
-        sections = run_sections(results, config)
-        document = run_document(results, config)
-        verdict = verdict_of_run(results, config)
+def summarise(results: RunResults, config: RunConfig) -> RunSummary:
+    """What a run of one loop says whose stages are all there."""
+    return summary_of(
+        results,
+        config,
+        run_sections(results, config),
+        run_document(results, config),
+        verdict_of_run(results, config),
+    )
+
+
+def summary_of(
+    results: AnyResults,
+    config: AnyConfig,
+    sections: Sequence[Section],
+    document: Mapping[str, Any],
+    verdict: str,
+) -> RunSummary:
+    """The summary of a run, of one loop or of several joints.
+
+    Parameters
+    ----------
+    results : AnyResults
+    config : AnyConfig
+    sections : sequence of Section
+        Rows for a terminal.
+    document : mapping of str to value
+        The stages for programs.
+    verdict : str
+        In one line.
+    """
     return RunSummary(
         title=title_of(config, results.run),
         sections=sections,
         numbers=with_rows(document, sections),
-        certified=is_certified_and_settles(results),
+        certified=results.certified and results.settles,
         verdict=verdict,
         report_path=str(results.run.report_path) if results.run.report_path.is_file() else None,
         taken_over=results.run.taken_over(),
@@ -154,33 +162,6 @@ def run_sections(results: RunResults, config: RunConfig) -> list[Section]:
     return [loop, plant]
 
 
-def joints_sections(results: Any, config: JointsConfig) -> list[Section]:
-    """The closed loop and the plant of a run for several joints, with everything else as their parts.
-
-    Args:
-        results: `RunResults` whose stages are those of several joints.
-        config: Its configuration.
-    """
-    models = results.identify
-    certify = results.certify
-    loop = Section(
-        "closed loop",
-        joints_numbers(models, certify, results.closed_loop, config),
-        parts=(
-            joints_loop_section(results.closed_loop),
-            joints_certificate_section(certify),
-            joints_design_section(results.design, signals_where_scaled(config, results)),
-        ),
-    )
-    warnings = [words(item) for point in models.points for item in point.warnings]
-    plant = Section(
-        "plant",
-        said(fit_row(models, config), first_warning(warnings)),
-        parts=(records_section(results.records), models_section(models, config)),
-    )
-    return [loop, plant]
-
-
 def channel_sections(results: RunResults) -> list[Section]:
     """Model and ellipses of every channel."""
     sections = []
@@ -212,7 +193,7 @@ def first_warning(warnings: Sequence[str]) -> Row | None:
     return worded("warning", f"{distinct[0]}{further}")
 
 
-def signals_where_scaled(config: AnyConfig, results: RunResults) -> str:
+def signals_where_scaled(config: AnyConfig, results: AnyResults) -> str:
     """What the controller's files take and give, where that is not the quantities of the model; else ""."""
     signals = Logged.of(config, results.records).signals
     return signals if "as logged" in signals else ""
@@ -226,10 +207,10 @@ def lowered_bandwidth(results: RunResults, config: RunConfig) -> str:
     return lowered(config.specification, design.specification, blocking, reached or 0.0)
 
 
-def numbers_of_controller(results: RunResults, config: AnyConfig) -> ControllerNumbers | None:
-    """The controller in an engineer's numbers, as the run's files have it; None without one, for several
-    joints, and where it has no such factors."""
-    if not isinstance(config, RunConfig) or results.design.controller is None:
+def numbers_of_controller(results: RunResults, config: RunConfig) -> ControllerNumbers | None:
+    """The controller in an engineer's numbers, as the run's files have it; None without one, and where it has
+    no such factors."""
+    if results.design.controller is None:
         return None
     return engineers_numbers(Logged.of(config, results.records).law(results.design.controller))
 

@@ -2,32 +2,24 @@
 
 from __future__ import annotations
 
-from workflow.describe.certificate import joints_unchecked_page, margins_page, unchecked_page
+from workflow.describe.certificate import margins_page, unchecked_page
 from workflow.describe.closed_loop import closed_loop_page
 from workflow.describe.design import design_page
 from workflow.describe.facts import FirstScreen, PageSection
 from workflow.describe.first_screen import first_screen
 from workflow.describe.identification import identification_page
-from workflow.describe.joints import joints_first_screen, joints_pages
 from workflow.describe.records import distortion_page, records_page, reproduce_page, rig_page
 from workflow.describe.uncertainty import uncertainty_page
-from workflow.figures.subjects import AnyRunView, RunView
+from workflow.figures.subjects import RunView
 
 
-def page_of_run(view: AnyRunView, *, is_design: bool = False) -> tuple[FirstScreen, list[PageSection]]:
-    """First screen and sections of the page of a run, of one loop or of several joints.
+def page_of_run(view: RunView, *, is_design: bool = False) -> tuple[FirstScreen, list[PageSection]]:
+    """First screen and sections of the page of a run of one loop.
 
     Args:
         view: The run.
         is_design: The page is of `flexlink design`; it stands away from the run's files and names none.
     """
-    about_rig = rig_page(view.config.notes)
-    reproduce = reproduce_page(view, is_design=is_design)
-    if not isinstance(view, RunView):
-        results = view.results
-        unchecked = joints_unchecked_page(results.certify, results.closed_loop)
-        sections = [*joints_pages(view), unchecked, records_page(view), about_rig, reproduce]
-        return joints_first_screen(view), sections
     sections = [
         margins_page(view, is_design=is_design),
         closed_loop_page(view),
@@ -37,7 +29,7 @@ def page_of_run(view: AnyRunView, *, is_design: bool = False) -> tuple[FirstScre
         uncertainty_page(view),
         records_page(view),
         distortion_page(view.control),
-        about_rig,
-        reproduce,
+        rig_page(view.config.notes),
+        reproduce_page(view, is_design=is_design),
     ]
     return first_screen(view), sections

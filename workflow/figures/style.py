@@ -94,7 +94,7 @@ _DRAWINGS_OF: dict[str, tuple[str, ...]] = {
     ),
     "workflow.figures.gap_records": ("gap_measured", "gap_traces", "gap_spectra"),
     "workflow.figures.gap_where": ("gap_bands", "gap_regimes", "gap_dependences"),
-    "workflow.figures.joints": (
+    "workflow.joints.pictures": (
         *("joint-steps", "matrix-response", "singular-values"),
         *("joint-requirements", "joint-validation", "mode-shapes"),
     ),

@@ -3,48 +3,43 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from importlib import metadata
 from pathlib import Path
 
-from workflow.config.joints_config import AnyConfig
 from workflow.config.run_config import RunConfig
+from workflow.describe.facts import FirstScreen, PageSection
 from workflow.describe.identify import identify_first_screen, identify_page_sections
 from workflow.describe.run import title_of
 from workflow.describe.run_page import page_of_run
 from workflow.engine import storage
 from workflow.engine.run_directory import RunDirectory
-from workflow.figures.subjects import AnyRunView, RunView, log_channel
+from workflow.figures.subjects import RunView, log_channel
 from workflow.figures.svg import svg_file
 from workflow.report.rendering import RenderedPage, render_page
 from workflow.tasks.log_identification import LogIdentification
 from workflow.tasks.results import RunRecord, RunResults
-from workflow.tasks.stage import Stage, StageInput, stages_for
+from workflow.tasks.stage import Stage, StageInput
 from workflow.tasks.stages import STAGES
 
 
 def write_report(
     results: RunResults,
-    config: AnyConfig,
+    config: RunConfig,
     progress: Callable[[float, str], None] | None = None,
     also: Iterable[str] = (),
     *,
     is_design: bool = False,
 ) -> Path:
-    """Draw every picture into `figures/`, and write `report.html`: all of them or none.
-
-    Pictures of an earlier report that this run no longer has are removed.
+    """Draw every picture into `figures/`, and write `report.html` of a run of one loop: all of them or none.
 
     Parameters
     ----------
     results : RunResults
-    config : RunConfig or JointsConfig
-    progress : callable, optional
-        Called with the share done and the name of each picture.
-    also : iterable of str
-        Kinds of file beside SVG: pdf, png.
+    config : RunConfig
+    progress, also
+        As of `write_run_page`.
     is_design : bool
         The page will not stand among the run's files, and names none of them.
 
@@ -58,13 +53,47 @@ def write_report(
     InputError
         A stage the report cannot do without is missing, or the disk refuses.
     """
-    run = results.run
-    view = RunView if isinstance(config, RunConfig) else AnyRunView
-    first, parts = page_of_run(view(config, results, run.manifest()), is_design=is_design)
+    first, parts = page_of_run(RunView(config, results, results.run.manifest()), is_design=is_design)
+    return write_run_page(results.run, title_of(config, results.run), first, parts, progress, also)
+
+
+def write_run_page(
+    run: RunDirectory,
+    title: str,
+    first: FirstScreen,
+    parts: Sequence[PageSection],
+    progress: Callable[[float, str], None] | None = None,
+    also: Iterable[str] = (),
+) -> Path:
+    """Write the page of a run, of one loop or of several joints, with its pictures: all of them or none.
+
+    Pictures of an earlier report that this run no longer has are removed.
+
+    Parameters
+    ----------
+    run : RunDirectory
+    title : str
+    first : FirstScreen
+    parts : sequence of PageSection
+    progress : callable, optional
+        Called with the share done and the name of each picture.
+    also : iterable of str
+        Kinds of file beside SVG: pdf, png.
+
+    Returns
+    -------
+    Path
+        Of the page.
+
+    Raises
+    ------
+    InputError
+        The disk refuses.
+    """
     page = render_page(
         "report.html.j2",
         progress,
-        title=title_of(config, run),
+        title=title,
         first=first,
         parts=parts,
         # A point of a study lies in the study's directory, two levels below its page.
@@ -100,22 +129,15 @@ def write_page(stage: StageInput, also: Iterable[str] = ()) -> str:
     return storage.sha256_of_file(path)
 
 
-def page_of(config: AnyConfig, also: Iterable[str] = ()) -> Stage:
-    """The stage that writes the page of a run. also: kinds of file for its pictures beside SVG."""
-    stage = stages_for(config, (*STAGES, REPORT))[-1]
-    return replace(stage, run=partial(write_page, also=also)) if also else stage
-
-
-# The last stage of a run.
+# The last stage of a run of one loop.
 REPORT = Stage(
     "report",
     tuple(stage.name for stage in STAGES),
     write_page,
     expected_s=7.0,
     # Words that appear on the page and nowhere before.
-    uses={"run": True, "notes": True, "specification": True, "joints": True},
+    uses={"run": True, "notes": True, "specification": True},
     also_writes=lambda run: (run.report_path,),
-    several=(write_page, 5.0),
 )
 
 

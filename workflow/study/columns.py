@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Literal
 
-from workflow.config.joints_config import AnyConfig, JointsConfig
-from workflow.config.run_config import RunConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.describe.loop_metrics import LOOP_METRICS
 
 if TYPE_CHECKING:
     from control_design.analysis.margins import Margins
-    from workflow.tasks.results import RunResults
+    from workflow.joints import JointsResults
+    from workflow.tasks.results import AnyResults, RunResults
 
 Number = float | int | None
 
@@ -69,15 +69,17 @@ _OF_THE_STEP = (StudyColumn(metric.name, metric.label, metric.unit, metric.bette
 COLUMNS: Mapping[str, StudyColumn] = {column.name: column for column in (*_ALL, *_OF_THE_STEP)}
 
 
-def numbers_of(results: RunResults, config: AnyConfig) -> dict[str, Number]:
+def numbers_of(results: AnyResults, config: AnyConfig) -> dict[str, Number]:
     """Numbers of a point from the results of its stages; None where there is none."""
     from workflow.engine.codec import plain
 
     numbers: dict[str, Number] = dict.fromkeys(COLUMNS)
     numbers["design_gamma"] = plain(results.design.gamma)
-    if isinstance(config, JointsConfig):
-        return numbers | _of_joints(results)
-    return numbers | _of_one_loop(results, config)
+    # Which kind of results they are follows from the configuration.
+    of_its_kind: Any = results
+    if isinstance(config, RunConfig):
+        return numbers | _of_one_loop(of_its_kind, config)
+    return numbers | _of_joints(of_its_kind)
 
 
 def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
@@ -143,7 +145,7 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     return numbers
 
 
-def _of_joints(results: Any) -> dict[str, Number]:
+def _of_joints(results: JointsResults) -> dict[str, Number]:
     """Numbers of a point of several joints; a column that has none is left out.
 
     Each is the worst over the operating points, over sensors and actuators, and, in closed loop, over runs

@@ -23,17 +23,11 @@ from typing import Self
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.engine.store import Store
+from workflow.kinds import kind_of
 from workflow.study.points import Base, Combination, Point
 from workflow.study.task import Done
-from workflow.tasks.pipeline import (
-    controller_stages,
-    is_certified_and_settles,
-    plant_stages,
-    stage_input_hash,
-)
-from workflow.tasks.results import RunResults
-from workflow.tasks.stage import Stage
-from workflow.tasks.stages import PLANT
+from workflow.tasks.pipeline import stage_input_hash
+from workflow.tasks.stage import PLANT, Stage
 
 # 2: the base is what was stated, without defaults, as in run directories of layout 10. A study of another
 # layout is not resumed.
@@ -96,12 +90,12 @@ class StudyDirectory(Store):
 
     def has_plant(self, point: Point) -> bool:
         """Whether the plant of a point is there, made from what it would be made from now."""
-        return _matches(self.plant(point), point, plant_stages(point.config), skip=point.given)
+        return _matches(self.plant(point), point, kind_of(point.config).plant_stages, skip=point.given)
 
     def has_point(self, point: Point) -> bool:
         """Whether a point is finished, with the plant that stands in the study."""
         run = self.point(point)
-        finished = _matches(run, point, controller_stages(point.config))
+        finished = _matches(run, point, kind_of(point.config).controller_stages)
         return finished and run.stage_files(PLANT) == self.plant_files(point)
 
     def save_plant(self, point: Point, given: Mapping[str, bytes], done: Done) -> None:
@@ -114,8 +108,9 @@ class StudyDirectory(Store):
         """Keep a finished point, with the plant's stages beside its own: a run like any other."""
         run = self.point(point)
         _write(run, point, self.plant_files(point), done)
-        certified = is_certified_and_settles(RunResults(run))
-        run.record_status("complete" if certified else "complete, not certified")
+        results = kind_of(point.config).results(run)
+        holds = results.certified and results.settles
+        run.record_status("complete" if holds else "complete, not certified")
 
     def link_numbers(self, points: Iterable[Combination]) -> None:
         """Every point that is there under its number as well; numbers of an earlier call are gone."""

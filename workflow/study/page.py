@@ -12,25 +12,24 @@ import numpy as np
 import numpy.typing as npt
 import pandas as pd
 
-from workflow.config.joints_config import JointsConfig
+from workflow.config.run_config import RunConfig
 from workflow.describe.design import gave_way_text, never_settles, run_verdict
-from workflow.describe.run import summarise
 from workflow.engine import codec
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures import style
 from workflow.figures.description import Panel, Picture, pad_limits, small_multiples
+from workflow.kinds import kind_of, summarise
 from workflow.study.columns import COLUMNS, StudyColumn, numbers_of
 from workflow.study.points import Point, PointRow, State, short
 from workflow.study.settings import ParetoPlot, StudyAxis, StudyConfig
 from workflow.tasks.giving_way import gave_way
-from workflow.tasks.results import RunResults
 from workflow.text.sentences.design import lowered as lowered_text, order_advice
 
 
 def row_of(point: Point, run: RunDirectory) -> PointRow:
     """The row of a finished point."""
     config = point.config
-    results = RunResults(run)
+    results: Any = kind_of(config).results(run)
     design = results.design
     certify = results.certify
     numbers = numbers_of(results, config)
@@ -45,7 +44,7 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
     else:
         state = "keeps moving"
 
-    if isinstance(config, JointsConfig):
+    if not isinstance(config, RunConfig):
         # Several joints have no check of tracking: a run at rest beside the reference looks like one that
         # moves.
         if state == "keeps moving":

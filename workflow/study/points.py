@@ -13,15 +13,14 @@ from typing import Any, Literal
 from pydantic import ValidationError
 
 from control_design.specification import GIVES_WAY
-from workflow.config.joints_config import AnyConfig, load_any
-from workflow.config.run_config import built_in_config
+from workflow.config.run_config import AnyConfig, built_in_config
 from workflow.config.settings import check
 from workflow.engine import storage
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory, hash_of
+from workflow.kinds import config_of_any, kind_of, load_any
 from workflow.study.columns import COLUMNS, Number
 from workflow.study.settings import StudyAxis, StudyConfig, last_name, with_values
-from workflow.tasks.pipeline import any_config_of, controller_stages, plant_stages
 
 State = Literal[
     "certified",
@@ -40,7 +39,7 @@ class Base:
 
     Attributes
     ----------
-    config : RunConfig or JointsConfig
+    config : AnyConfig
     inputs : mapping of str to str
         Its input files with their SHA-256.
     run : RunDirectory or None
@@ -91,7 +90,7 @@ class Base:
         """SHA-256 of the stage files taken from a given run."""
         if self.run is None:
             return {}
-        return {stage.name: self.run.stage_digest(stage.name) for stage in plant_stages(self.config)}
+        return {stage.name: self.run.stage_digest(stage.name) for stage in kind_of(self.config).plant_stages}
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,8 +150,8 @@ def load_base(study: StudyConfig, study_path: Path, base: Path | None) -> Base:
         config, _ = built_in_config()
     elif base.is_dir():
         run = RunDirectory.open(base)
-        config = any_config_of(run)
-        for stage in plant_stages(config):
+        config = config_of_any(run)
+        for stage in kind_of(config).plant_stages:
             # Raises where a stage is missing, and names it.
             run.stage_digest(stage.name)
     else:
@@ -185,7 +184,7 @@ class PointMaker:
         self._axes = study.axes
         self._path = study_path
         self._base = base
-        self._original = None if base.run is None else any_config_of(base.run)
+        self._original = None if base.run is None else config_of_any(base.run)
         self._digests = base.digests
         self._made = 0
         for index, axis in enumerate(self._axes):
@@ -204,7 +203,7 @@ class PointMaker:
         given = () if self._original is None else shared_stages(config, self._original)
 
         # Keys by what results depend on: points of equal keys share them.
-        plant = plant_stages(config)
+        plant = kind_of(config).plant_stages
         plant_key = hash_of(
             {
                 "given": {name: self._digests[name] for name in given},
@@ -213,7 +212,7 @@ class PointMaker:
                 "settings": {stage.name: stage.settings(config) for stage in plant},
             }
         )
-        design = controller_stages(config)[0].settings(config)
+        design = kind_of(config).controller_stages[0].settings(config)
         design_key = hash_of({"plant": plant_key, "seed": config.run.seed, "settings": design})
         name = self._name(values, hash_of({"plant": plant_key, "config": config.to_document()}))
         return Point(self._made, name, dict(values), config, inputs, plant_key, design_key, given)
@@ -262,7 +261,7 @@ class PointMaker:
 def shared_stages(config: AnyConfig, other: AnyConfig) -> tuple[str, ...]:
     """Names of the plant's stages before the first whose settings differ between two configurations."""
     shared = []
-    for stage in plant_stages(config):
+    for stage in kind_of(config).plant_stages:
         if hash_of(stage.settings(config)) != hash_of(stage.settings(other)):
             break
         shared.append(stage.name)

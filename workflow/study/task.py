@@ -19,11 +19,10 @@ from workflow.engine.errors import StageError
 from workflow.engine.executor import Failure, Report, attempt
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
+from workflow.kinds import kind_of
 from workflow.study.points import Point
 from workflow.tasks.pipeline import stage_input_hash
-from workflow.tasks.results import RunResults
-from workflow.tasks.stage import StageInput, stages_for
-from workflow.tasks.stages import STAGES
+from workflow.tasks.stage import StageInput
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +71,9 @@ class PointTask:
             storage.write_bytes(run.stages_path / name, content)
         seconds = {}
         hashes = {}
-        results = RunResults(run)
-        for stage in stages_for(point.config, STAGES):
+        kind = kind_of(point.config)
+        results: Any = kind.results(run)
+        for stage in kind.stages:
             if stage.name not in self.stages:
                 continue
             started = time.monotonic()

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.describe.summary import RunSummary
 from workflow.engine import codec
 from workflow.engine.code_version import code_digest
@@ -17,6 +17,7 @@ from workflow.engine.executor import Executor, Failure, workers
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import RunDirectory
 from workflow.figures.svg import svg_file
+from workflow.kinds import kind_of
 from workflow.report.pages import REPORT
 from workflow.report.rendering import render_described
 from workflow.study.described import study_page, study_summary
@@ -32,7 +33,6 @@ from workflow.study.points import (
 )
 from workflow.study.settings import JOINTS_PLOTS, StudyFile
 from workflow.study.task import Done, PointTask
-from workflow.tasks.pipeline import controller_stages, plant_stages
 from workflow.tasks.results import RunResults
 from workflow.tasks.stage import Stage
 
@@ -88,8 +88,8 @@ def run_study(
         directory = StudyDirectory(out)
         with directory.writing(resume=resume, replace=replace):
             directory.begin_study(text=file.text, base=base, resume=resume, replace=replace)
-            plant_s = sum(stage.expected_s for stage in plant_stages(base.config))
-            point_s = sum(stage.expected_s for stage in controller_stages(base.config))
+            plant_s = sum(stage.expected_s for stage in kind_of(base.config).plant_stages)
+            point_s = sum(stage.expected_s for stage in kind_of(base.config).controller_stages)
             points_s = point_s * len(points) / executor.width
             progress.plan([("plant", plant_s), ("points", points_s), ("page", REPORT.expected_s)])
             work = _Work(directory, base, maker.base_point(), executor, here, progress, len(points))
@@ -166,7 +166,7 @@ class _Work:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
         work = [
-            _task(group, self.directory.plant_files(group[0]), controller_stages(self.base.config))
+            _task(group, self.directory.plant_files(group[0]), kind_of(self.base.config).controller_stages)
             for group in groups.values()
         ]
         for results in _done(self.executor, list(groups.values()), work):
@@ -187,9 +187,8 @@ class _Work:
         work = []
         for point, files in wanted:
             stages_with_file = {name.partition(".")[0] for name in files}
-            lacking = [
-                stage for stage in plant_stages(self.base.config) if stage.name not in stages_with_file
-            ]
+            plant_stages = kind_of(self.base.config).plant_stages
+            lacking = [stage for stage in plant_stages if stage.name not in stages_with_file]
             work.append(_task([point], files, lacking))
         files_of = {point.name: files for point, files in wanted}
         for ((point, done),) in _done(self.here, [[point] for point, _ in wanted], work):
@@ -234,7 +233,7 @@ def _done(
 def _write_up(directory: StudyDirectory, file: StudyFile, base: Base, rows: Sequence[PointRow]) -> RunSummary:
     """Table, picture and page: all of them or none."""
     study = file.config
-    if "pareto" not in study.model_fields_set and isinstance(base.config, JointsConfig):
+    if "pareto" not in study.model_fields_set and not isinstance(base.config, RunConfig):
         study = study.model_copy(update={"pareto": JOINTS_PLOTS})
     # What the page is called and where it comes from.
     title = study.study.title or base.config.run.title or base.config.run.name
@@ -256,7 +255,7 @@ def _units(directory: StudyDirectory, config: AnyConfig, rows: Sequence[PointRow
     """Units that the rig decides, from the records of any finished point; those of joints differ by joint."""
     runs = (RunDirectory(directory.points_path / row.name) for row in rows)
     run = next((run for run in runs if run.stage_file("records") is not None), None)
-    if run is None or isinstance(config, JointsConfig):
+    if run is None or not isinstance(config, RunConfig):
         return {}
     control = config.control_channel
     units = RunResults(run).records.records[0].units

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from control_design.specification import GIVES_WAY
-from workflow.config.joints_config import AnyConfig, JointsConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.config.settings import check
 from workflow.engine.errors import InputError
 
@@ -44,14 +44,14 @@ def config_with_typed(config: AnyConfig, typed: Mapping[str, Any], source: str) 
 
     Parameters
     ----------
-    config : RunConfig or JointsConfig
+    config : AnyConfig
     typed : mapping of str to value
     source : str
         What a complaint begins with.
 
     Returns
     -------
-    RunConfig or JointsConfig
+    AnyConfig
         The one given where nothing is typed.
 
     Raises
@@ -61,7 +61,7 @@ def config_with_typed(config: AnyConfig, typed: Mapping[str, Any], source: str) 
     """
     if not typed:
         return config
-    if isinstance(config, JointsConfig):
+    if not isinstance(config, RunConfig):
         raise InputError(
             f"{source}: several joints: write the change into a copy of its config.toml, --config"
         )

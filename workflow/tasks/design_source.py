@@ -33,7 +33,7 @@ from workflow.engine import codec
 from workflow.engine.errors import InputError, naming
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.exports import Logged, read_model
-from workflow.tasks.pipeline import certified_for, config_of
+from workflow.tasks.pipeline import config_of
 from workflow.tasks.results import IdentifiedPlant, RunResults
 from workflow.tasks.system_documents import DOCUMENTS, read_document
 from workflow.tasks.system_files import read_state_space
@@ -149,7 +149,7 @@ def _sources_of_run(path: Path) -> list[DesignSource]:
     run = RunDirectory.open(path)
     config = config_of(run)
     results = RunResults(run)
-    about = certified_for(results, config)
+    about = results.certified_for(config)
     channel = config.control_channel
     units = results.records.unit(channel.input), results.records.unit(channel.output)
     logged = Logged.of(config, results.records)

@@ -14,8 +14,7 @@ from ident.checks.early_checks import STILL_INPUT, early_checks, early_doubts, r
 from ident.data.finding import FindingKind, distinct
 from ident.data.record import Record
 from ident.data.signal_filter import band_edges
-from workflow.config.joints_config import AnyConfig
-from workflow.config.run_config import Channel, ClosedLoopData, FileSource, RunConfig
+from workflow.config.run_config import AnyConfig, Channel, ClosedLoopData, FileSource, RunConfig
 from workflow.config.uncertainty_options import FitOptions, UncertaintyOptions
 from workflow.engine.errors import InputError, naming
 from workflow.engine.progress import Progress
@@ -137,7 +136,7 @@ def refuse_hopeless_source(
 
     Parameters
     ----------
-    config : RunConfig or JointsConfig
+    config : AnyConfig
         Of several joints, or of simulated records, nothing is judged here.
     records : sequence of Record
         In the order of the configuration's records.

@@ -13,8 +13,7 @@ from control_design.controllers.controller import Controller
 from control_design.convex.reference_filter import ReferenceFilter
 from ident.basis.model_files import ModelFile
 from ident.data.foreign_files import content_of
-from workflow.config.joints_config import AnyConfig
-from workflow.config.run_config import FileSource
+from workflow.config.run_config import AnyConfig, FileSource
 from workflow.engine import documents, storage
 from workflow.engine.errors import naming
 from workflow.engine.run_directory import CONTROLLER_SUFFIXES

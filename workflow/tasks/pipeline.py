@@ -15,25 +15,23 @@ from control_design.controllers.c_code import Dialect
 from ident.basis.model_files import ModelFile
 from ident.data.foreign_files import path_as_typed
 from ident.data.record import Record
-from workflow.config.joints_config import AnyConfig, JointsConfig
-from workflow.config.run_config import RunConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.engine import interrupts, storage
 from workflow.engine.code_version import code_digest
 from workflow.engine.errors import CommandInterruptedError, InputError, naming, one_line
 from workflow.engine.progress import Progress
 from workflow.engine.run_directory import KEPT_FILES, LAYOUT_VERSION, RunDirectory, hash_of
 from workflow.tasks.exports import Logged, model_bytes, write_controller
-from workflow.tasks.point_models import JointsLoopResult
-from workflow.tasks.results import ReferenceFilterResult, RunResults
-from workflow.tasks.stage import Stage, StageInput, stages_for
-from workflow.tasks.stages import PLANT, STAGES
-from workflow.text.sentences.friction import certified_for as about_what
+from workflow.tasks.results import AnyResults, ReferenceFilterResult, RunResults
+from workflow.tasks.stage import RunKind, Stage, StageInput
+from workflow.tasks.stages import ONE_LOOP
 
 
 def run_pipeline(
     config: AnyConfig,
     out: Path,
     *,
+    kind: RunKind = ONE_LOOP,
     config_text: str = "",
     called: str = "the configuration",
     resume: bool = False,
@@ -45,14 +43,16 @@ def run_pipeline(
     begun: RunDirectory | None = None,
     earlier: RunDirectory | None = None,
     progress: Progress | None = None,
-) -> RunResults:
+) -> AnyResults:
     """Run every stage into a directory and return the results of its stages.
 
     Parameters
     ----------
-    config : RunConfig or JointsConfig
+    config : AnyConfig
     out : Path
         The run directory.
+    kind : RunKind
+        That of the configuration.
     config_text : str
         Kept as config.toml.
     called : str
@@ -74,8 +74,8 @@ def run_pipeline(
 
     Returns
     -------
-    RunResults
-        A result that is not certified is no error.
+    AnyResults
+        Those of the kind. A result that is not certified is no error.
 
     Raises
     ------
@@ -87,16 +87,16 @@ def run_pipeline(
     """
     progress = progress or Progress()
     run = RunDirectory(Path(out))
-    stages = stages_for(config, STAGES)
+    stages = kind.stages
     existed = run.path.exists()
-    stage_input = _stage_input(config, run, progress, called)
+    stage_input = _stage_input(config, kind.results(run), progress, called)
     run.refuse_unless_free(resume=resume, replace=replace)
     inputs = input_digests(config, earlier)
     # Records are read before anything is written: a bad log leaves no directory behind.
     ready: tuple[Any, float] | None = None
     first_is_there = begun is not None
     if earlier is not None:
-        nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
+        nothing_because = why_nothing_is_taken_over(config, stages[0], earlier, inputs)
         first_is_there = first_is_there or not nothing_because
         if begun is None:
             _say_what_cannot_be_taken_over(earlier, nothing_because, progress)
@@ -145,7 +145,7 @@ def run_pipeline(
             for name in KEPT_FILES:
                 if run.path / name not in written:
                     (run.path / name).unlink(missing_ok=True)
-            holds = is_certified_and_settles(stage_input.results)
+            holds = stage_input.results.certified and stage_input.results.settles
         except BaseException as error:
             # A library may turn an interrupt into any other error, so that it is asked for, too.
             if isinstance(error, KeyboardInterrupt) or interrupts.came():
@@ -174,7 +174,7 @@ def identify_only(
     """
     stage_input = StageInput(config, RunResults(RunDirectory(out)), progress or Progress())
     inputs = input_digests(config)
-    stages = plant_stages(config)
+    stages = ONE_LOOP.plant_stages
     with stage_input.results.run.writing(replace=True), threadpool_limits(1):
         stage_input.results.run.begin_run(
             config_text=config_text,
@@ -185,69 +185,52 @@ def identify_only(
         )
         stage_input.progress.plan([(stage.name, stage.expected_s) for stage in stages])
         if earlier is not None:
-            nothing_because = why_nothing_is_taken_over(config, earlier, inputs)
+            nothing_because = why_nothing_is_taken_over(config, stages[0], earlier, inputs)
             _say_what_cannot_be_taken_over(earlier, nothing_because, stage_input.progress)
         for stage in stages:
             _perform(stage, stage_input, inputs, earlier=earlier)
 
 
-def rebuild_page(run: RunDirectory, page: Stage, progress: Progress | None = None) -> RunResults:
-    """Perform the last stage again on a finished run. Raises InputError when a stage is missing."""
-    config = any_config_of(run)
-    stage_input = _stage_input(config, run, progress or Progress())
+def rebuild_page(
+    config: AnyConfig, results: AnyResults, page: Stage, progress: Progress | None = None
+) -> None:
+    """Perform the last stage again on a finished run. Raises InputError when a stage is missing.
+
+    Parameters
+    ----------
+    config : AnyConfig
+        That the run was begun with.
+    results : AnyResults
+        Of the run.
+    page : Stage
+        The last stage.
+    progress : Progress, optional
+    """
+    stage_input = _stage_input(config, results, progress or Progress())
     stage_input.progress.plan([(page.name, page.expected_s)])
-    with run.locked():
+    with results.run.locked():
         _perform(page, stage_input, {}, always=True)
-    return stage_input.results
-
-
-def is_certified_and_settles(results: RunResults) -> bool:
-    """Whether the controller of a run is certified and every run of its closed loop settles."""
-    loop = results.closed_loop
-    if isinstance(loop, JointsLoopResult):
-        settled, points = loop.settled_points()
-        settles = settled == points
-    else:
-        settles = loop.check is not None and loop.check.settled_draws == loop.check.draws
-    return results.certify.certified and settles
 
 
 def _stage_input(
-    config: AnyConfig, run: RunDirectory, progress: Progress, called: str = "the configuration"
+    config: AnyConfig, results: AnyResults, progress: Progress, called: str = "the configuration"
 ) -> StageInput:
-    # Stages for several joints know that their configuration is a JointsConfig.
+    # The stages of another kind of run know what their configuration and results are.
     of_any_kind: Any = config
-    return StageInput(of_any_kind, RunResults(run), progress, called)
-
-
-def certified_for(results: RunResults, config: AnyConfig) -> str:
-    """What a certificate of the identified plant covers, in words."""
-    if isinstance(config, JointsConfig):
-        models: Any = results.identify
-        return f"{len(models.points)} operating points"
-    channel = config.control_channel
-    unit = results.records.unit(channel.input)
-    return about_what(channel.uncertainty.response, results.uncertainty.equivalent, unit)
+    of_its_results: Any = results
+    return StageInput(of_any_kind, of_its_results, progress, called)
 
 
 def config_of(run: RunDirectory) -> RunConfig:
     """The configuration a run of one loop was begun with. Raises InputError for one of several joints."""
-    config = any_config_of(run)
-    if isinstance(config, JointsConfig):
+    document = run.config_document()
+    if "joints" in document:
         config_file = path_as_typed(run.path / "config.toml")
         raise InputError(
             f"{run.path}: a run for several joints, and this command takes one loop; for other settings edit "
             f"its config.toml and type: flexlink run --config {config_file} --out OTHER"
         )
-    return config
-
-
-def any_config_of(run: RunDirectory) -> AnyConfig:
-    """The configuration that a run was begun with, of one loop or of several joints."""
-    document = run.config_document()
-    source = str(run.path / "config.json")
-    kind = JointsConfig if "joints" in document else RunConfig
-    return kind.from_document(document, source=source)
+    return RunConfig.from_document(document, source=str(run.path / "config.json"))
 
 
 def _perform(
@@ -307,14 +290,15 @@ def input_digests(config: AnyConfig, earlier: RunDirectory | None = None) -> dic
     return digests
 
 
-def why_nothing_is_taken_over(config: AnyConfig, earlier: RunDirectory, inputs: Mapping[str, str]) -> str:
+def why_nothing_is_taken_over(
+    config: AnyConfig, first: Stage, earlier: RunDirectory, inputs: Mapping[str, str]
+) -> str:
     """The reason why a run shares no stage with an earlier one, from its first stage on; "" where it does.
 
-    inputs: every input file with its SHA-256. Raises InputError where the earlier run was made from other
-    files: every stage reads them, through the first.
+    first: the first stage of the run. inputs: every input file with its SHA-256. Raises InputError where the
+    earlier run was made from other files: every stage reads them, through the first.
     """
     earlier.refuse_other_inputs(inputs)
-    first = stages_for(config, STAGES)[0]
     first_hash = stage_input_hash(first, config, earlier, inputs)
     # Also of a file that is lost since: made again it is the same, and so are the stages after it.
     noted = earlier.manifest()["stages"].get(first.name, {})
@@ -368,11 +352,12 @@ def stage_input_hash(stage: Stage, config: AnyConfig, run: RunDirectory, inputs:
     )
 
 
-def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> list[Path]:
+def _keep_files(results: AnyResults, config: AnyConfig, dialect: Dialect) -> list[Path]:
     """controller.json, .mat, .c and .h; of one loop with those of its reference filter, and model.json."""
     reference_filter = ReferenceFilterResult()
     written = list[Path]()
     if isinstance(config, RunConfig):
+        assert isinstance(results, RunResults)
         reference_filter = results.reference_filter
         channel = results.uncertainty.seen_by_controller(config)[config.control_index]
         model_file = results.run.path / "model.json"
@@ -387,20 +372,10 @@ def _keep_files(results: RunResults, config: AnyConfig, dialect: Dialect) -> lis
         results.run.path,
         law,
         reference_filter.filter,
-        certified=results.certify.certified,
-        about=certified_for(results, config),
+        certified=results.certified,
+        about=results.certified_for(config),
         dialect=dialect,
     )
-
-
-def plant_stages(config: AnyConfig) -> tuple[Stage, ...]:
-    """Stages up to the uncertain plant."""
-    return tuple(stage for stage in stages_for(config, STAGES) if stage.name in PLANT)
-
-
-def controller_stages(config: AnyConfig) -> tuple[Stage, ...]:
-    """Stages from the design to the closed loop."""
-    return tuple(stage for stage in stages_for(config, STAGES) if stage.name not in PLANT)
 
 
 def _fail(run: RunDirectory, error: BaseException, *, created: bool) -> None:

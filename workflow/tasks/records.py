@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ident.data.record import Record, in_one_unit
-from workflow.config.joints_config import AnyConfig, Joint, OperatingPoint
 from workflow.config.run_config import (
-    Channel,
+    AnyConfig,
     FileRecord,
     FileSource,
     RunConfig,
-    SimulatedRecord,
+    Signals,
     record_name,
 )
 from workflow.engine.errors import InputError, naming
@@ -27,14 +26,22 @@ if TYPE_CHECKING:
     from workflow.tasks.results import RecordsResult
     from workflow.tasks.stage import StageInput
 
+# Makes the records of a configuration, which complaints call by a name; told how far it is.
+Simulated = Callable[[Any, str, Callable[[float, str], None]], list[Record]]
+
 # Samples of all records together: at 4 kB each 80 GB, more memory than most machines have.
 MOST_SAMPLES = 20_000_000
 
 
-def make_records(stage: StageInput) -> RecordsResult:
+def make_records(stage: StageInput, simulate: Simulated | None = None) -> RecordsResult:
     """Records of a run in the order of its configuration, simulated or read.
 
-    For several joints the `condition` of a record names the operating point.
+    Parameters
+    ----------
+    stage : StageInput
+    simulate : callable, optional
+        Makes the records of a configuration whose records are not files; default: those of the simulated
+        arm with one joint (`simulated_records`).
 
     Raises
     ------
@@ -50,9 +57,10 @@ def make_records(stage: StageInput) -> RecordsResult:
 
     source = stage.config.source
     made = list(stage.read)
-    entries: Sequence[SimulatedRecord | FileRecord | OperatingPoint] = source.records
+    entries: Sequence[Any] = source.records
     if not isinstance(source, FileSource):
-        made = simulated_records(stage.config, stage.called, partial(stage.progress.update, "records"))
+        make = simulate or simulated_records
+        made = make(stage.config, stage.called, partial(stage.progress.update, "records"))
     elif not made:
         made = read_records(source, stage.config.columns)
 
@@ -81,12 +89,12 @@ def make_records(stage: StageInput) -> RecordsResult:
     return result
 
 
-def read_records(source: FileSource, channels: Sequence[Channel | Joint]) -> list[Record]:
+def read_records(source: FileSource, channels: Sequence[Signals]) -> list[Record]:
     """Every log file of a configuration. Raises InputError: one line naming file and place."""
     return [read_record(source, entry, channels) for entry in source.records]
 
 
-def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Channel | Joint]) -> Record:
+def read_record(source: FileSource, entry: FileRecord, channels: Sequence[Signals]) -> Record:
     """One log file as the configuration describes it. Raises InputError: one line naming file and place."""
     inputs = list(dict.fromkeys(channel.input for channel in channels))
     outputs = list(dict.fromkeys(channel.output for channel in channels))

@@ -41,7 +41,7 @@ from ident.uncertainty import FrequencyUncertainty, ResponsePosterior
 from ident.uncertainty.nominal import NominalAgreement, nominal_near
 from workflow.config.run_config import Channel, Role, RunConfig
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
+from workflow.text.sentences.friction import certified_for
 
 Interval = tuple[float, float]
 T = TypeVar("T")
@@ -1047,36 +1047,73 @@ class ClosedLoopResult:
 
 
 class StageResult(Generic[T]):
-    """The result of the stage that the attribute is named after, read when it is first asked for.
+    """The result of the stage that the attribute is named after, read when it is first asked for."""
 
-    several: its type in a run for several joints, where that is another one.
-    """
-
-    def __init__(self, kind: type[T], several: type | None = None) -> None:
-        self._kind: Any = kind if several is None else kind | several
+    def __init__(self, kind: type[T]) -> None:
+        self._kind = kind
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    def __get__(self, results: RunResults, owner: type) -> T:
+    def __get__(self, results: AnyResults, owner: type) -> T:
         if self._name not in results.read:
             results.read[self._name] = results.run.load_stage(self._name, self._kind)
         result: T = results.read[self._name]
         return result
 
 
-class RunResults:
-    """Results of a run directory, each read once; `read` holds those that were."""
+class AnyResults:
+    """Results of a run directory, of one loop or of several joints, each read once.
+
+    Attributes
+    ----------
+    run : RunDirectory
+    read : dict of str to value
+        Results that were read, by the name of their stage.
+    """
 
     records = StageResult(RecordsResult)
-    identify = StageResult(IdentifyResult, PointModels)
-    uncertainty = StageResult(UncertaintyResult)
     design = StageResult(DesignResult)
-    achievable_performance = StageResult(AchievablePerformance)
-    certify = StageResult(CertifyResult, JointsCertificate)
-    reference_filter = StageResult(ReferenceFilterResult)
-    closed_loop = StageResult(ClosedLoopResult, JointsLoopResult)
 
     def __init__(self, run: RunDirectory) -> None:
         self.run = run
         self.read: dict[str, Any] = {}
+
+    @property
+    def certified(self) -> bool:
+        """Whether the controller of the run is certified."""
+        raise NotImplementedError
+
+    @property
+    def settles(self) -> bool:
+        """Whether every run of the closed loop settles."""
+        raise NotImplementedError
+
+    def certified_for(self, config: Any) -> str:
+        """What a certificate of the identified plant covers, in words; config: that of the run."""
+        raise NotImplementedError
+
+
+class RunResults(AnyResults):
+    """Results of a run of one loop."""
+
+    identify = StageResult(IdentifyResult)
+    uncertainty = StageResult(UncertaintyResult)
+    achievable_performance = StageResult(AchievablePerformance)
+    certify = StageResult(CertifyResult)
+    reference_filter = StageResult(ReferenceFilterResult)
+    closed_loop = StageResult(ClosedLoopResult)
+
+    @property
+    def certified(self) -> bool:
+        return self.certify.certified
+
+    @property
+    def settles(self) -> bool:
+        check = self.closed_loop.check
+        return check is not None and check.settled_draws == check.draws
+
+    def certified_for(self, config: RunConfig) -> str:
+        channel = config.control_channel
+        unit = self.records.unit(channel.input)
+        return certified_for(channel.uncertainty.response, self.uncertainty.equivalent, unit)

@@ -1,4 +1,4 @@
-"""The simulated arms as a configuration describes them: rig file or preset, effects by name, experiments; and
+"""The simulated arm as a configuration describes it: rig file or preset, effects by name, experiments; and
 `truth.json` beside its logs, with the modes of the arm behind them, shown beside what is found.
 """
 
@@ -17,24 +17,17 @@ from control_design.analysis.closed_loop import simulate as simulate_loop
 from control_design.controllers.controller import Controller
 from ident.checks.plausible_modes import LARGEST_DAMPING
 from ident.data.record import Record
-from plant import TwoLinkMachine, multisine, multisine_lines, two_link_arm
 from plant.effects import make_machine, parse_effects
 from plant.modal import default_n_modes, equations_of_motion
 from plant.rig import Rig
 from plant.simulation import SampledArm, quantised, simulate
-from workflow.config.joints_config import (
-    AnyConfig,
-    JointsConfig,
-    OperatingPoint,
-    SimulationConfig,
-    TwoJointSource,
-)
 from workflow.config.rig_settings import rig_called
 from workflow.config.run_config import (
     ClosedLoopOptions,
     RunConfig,
     SimulatedRecord,
     SimulatedSource,
+    SimulationConfig,
 )
 from workflow.config.settings import Section, check
 from workflow.engine import documents
@@ -103,15 +96,15 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
 
 
 def simulated_records(
-    config: AnyConfig | SimulationConfig,
+    config: RunConfig | SimulationConfig,
     called: str,
     progress: Callable[[float, str], None] = lambda share, name: None,
 ) -> list[Record]:
-    """Every record of a configuration whose records are not files.
+    """Every record of a configuration whose records are those of the simulated arm.
 
     Parameters
     ----------
-    config : RunConfig, JointsConfig or SimulationConfig
+    config : RunConfig or SimulationConfig
     called : str
         What a complaint calls the configuration.
     progress : callable
@@ -123,58 +116,42 @@ def simulated_records(
         One line that names the entry.
     """
     source = config.source
-    key = "records"
+    # Nobody asks where the records are files.
+    assert isinstance(source, SimulatedSource)
+    make = partial(simulate_record, source, seed=config.run.seed)
+    return made_one_by_one(source.records, make, f"{called}: source.records", progress)
+
+
+def made_one_by_one(
+    entries: Sequence[Any],
+    make: Callable[[Any], Record],
+    called: str,
+    progress: Callable[[float, str], None],
+) -> list[Record]:
+    """A record for each entry of a list in a configuration.
+
+    Parameters
+    ----------
+    entries : sequence
+        Each has a name.
+    make : callable
+        Makes the record of an entry.
+    called : str
+        What a complaint calls the list.
+    progress : callable
+        Called with the share that is done and the name of the record that is made next.
+
+    Raises
+    ------
+    InputError
+        One line that names the entry.
+    """
     made = list[Record]()
-    entries: Sequence[Any] = source.records
-    make: Callable[[Any], Record]
-    if isinstance(config, JointsConfig) and isinstance(source, TwoJointSource):
-        key = "points"
-        make = partial(simulate_point, config, source)
-    else:
-        # Nobody asks for any other source.
-        assert isinstance(source, SimulatedSource)
-        make = partial(simulate_record, source, seed=config.run.seed)
     for index, entry in enumerate(entries):
         progress(index / len(entries), entry.name)
-        with naming(f"{called}: source.{key}[{index}] ({entry.name})"):
+        with naming(f"{called}[{index}] ({entry.name})"):
             made.append(make(entry))
     return made
-
-
-def simulate_point(config: JointsConfig, source: TwoJointSource, point: OperatingPoint) -> Record:
-    """The record of an operating point: independent multisines at both motors, from rest."""
-    draw = partial(stage_rng, config.run.seed, "records", point.name)
-    machine = machine_at(source, point, draw("noise"), coulomb_Nm=source.coulomb_Nm)
-    period = source.samples
-    rng = draw("excitation")
-    lines = multisine_lines(period, source.dt_s, source.band_Hz)
-    u = np.column_stack([multisine(lines, period, rms, rng) for rms in source.rms_V])
-    return Record(
-        u,
-        machine.run(u),
-        source.dt_s,
-        name=point.name,
-        input_names=tuple(joint.input for joint in config.joints),
-        output_names=tuple(joint.output for joint in config.joints),
-        input_units=("V",) * 2,
-        output_units=("rad",) * 2,
-    )
-
-
-def machine_at(
-    source: TwoJointSource,
-    point: OperatingPoint,
-    rng: np.random.Generator,
-    *,
-    coulomb_Nm: tuple[float, float],
-    extra_kg: float = 0.0,
-) -> TwoLinkMachine:
-    """The simulated two-link arm around an operating point.
-
-    coulomb_Nm: dry friction of both joints; extra_kg: payload beyond that of the point; rng: of the noise.
-    """
-    arm = two_link_arm(point.payload_kg + extra_kg, coulomb_Nm, source.gravity_m_s2)
-    return TwoLinkMachine(arm, (point.shoulder_rad, point.elbow_rad), source.dt_s, source.noise_rad, rng)
 
 
 def encoded_arm(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,11 @@ from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
 from ident.basis.options import LEFT_OPEN
 from ident.data.record import Record
-from workflow.config.joints_config import AnyConfig
-from workflow.config.run_config import RunConfig
+from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.engine.progress import Progress
 from workflow.engine.randomness import stage_rng
 from workflow.engine.run_directory import RunDirectory
-from workflow.tasks.results import RunResults
+from workflow.tasks.results import AnyResults, RunResults
 
 
 @dataclass(frozen=True)
@@ -82,8 +81,6 @@ class Stage:
         The part of the configuration that the result depends on, as pydantic's `include` and `exclude`.
     also_writes : callable
         Files of a run outside `stages/` that belong to the result.
-    several : tuple of callable and float, or None
-        What it does for several joints, and its time; None: there is no such step for them.
     """
 
     name: str
@@ -93,7 +90,6 @@ class Stage:
     uses: Mapping[str, Any]
     except_for: Mapping[str, Any] | None = None
     also_writes: Callable[[RunDirectory], tuple[Path, ...]] = lambda run: ()
-    several: tuple[Callable[[StageInput], Any], float] | None = None
 
     def settings(self, config: AnyConfig) -> dict[str, Any]:
         """Its share of the configuration, JSON-able: every value, and which of `LEFT_OPEN` were stated.
@@ -120,15 +116,32 @@ def _stated_of_left_open(document: Any, where: str = "") -> Iterator[str]:
             yield from _stated_of_left_open(value, f"{where}[{index}]")
 
 
-def stages_for(config: AnyConfig, stages: Sequence[Stage]) -> tuple[Stage, ...]:
-    """The stages of a run: those that there are for one loop, or for several joints."""
-    if isinstance(config, RunConfig):
-        return tuple(stages)
-    of_joints = {stage.name for stage in stages if stage.several is not None}
-    for_joints = []
-    for stage in stages:
-        if stage.several is not None:
-            run, expected_s = stage.several
-            after = tuple(name for name in stage.after if name in of_joints)
-            for_joints.append(replace(stage, run=run, expected_s=expected_s, after=after))
-    return tuple(for_joints)
+# Stages up to the uncertain plant, by name, which several designs may share; a run for several joints has no
+# step of its own for the ellipses.
+PLANT = ("records", "identify", "uncertainty")
+
+
+@dataclass(eq=False)
+class RunKind:
+    """One kind of run: of one loop, or of several joints.
+
+    Attributes
+    ----------
+    stages : tuple of Stage
+        Before the page, in order.
+    results : type
+        Reads what they leave.
+    """
+
+    stages: tuple[Stage, ...]
+    results: type[AnyResults]
+
+    @property
+    def plant_stages(self) -> tuple[Stage, ...]:
+        """Stages up to the uncertain plant."""
+        return tuple(stage for stage in self.stages if stage.name in PLANT)
+
+    @property
+    def controller_stages(self) -> tuple[Stage, ...]:
+        """Stages from the design to the closed loop."""
+        return tuple(stage for stage in self.stages if stage.name not in PLANT)

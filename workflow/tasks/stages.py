@@ -1,7 +1,6 @@
-"""The stages of a run before its page, in order: each is a task on what the stages before it left.
+"""The stages of a run of one loop before its page, in order: each is a task on what those before it left.
 
-What each leaves behind is a type of `workflow.tasks.results`. Keys of the configuration that one kind of run
-lacks are none of its settings.
+What each leaves behind is a type of `workflow.tasks.results`.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from workflow.tasks.closed_loop import run_closed_loop
 from workflow.tasks.design import certify_asked, find_bracket, find_design, find_filter
 from workflow.tasks.friction_loop import friction_feedforward, soonest
 from workflow.tasks.identification import identify_channels
-from workflow.tasks.joints import certify_joints, design_joints, identify_points, run_loops
 from workflow.tasks.records import make_records
 from workflow.tasks.results import (
     AchievablePerformance,
     CertifyResult,
     DesignResult,
     ReferenceFilterResult,
+    RunResults,
 )
-from workflow.tasks.stage import Stage, StageInput
+from workflow.tasks.stage import RunKind, Stage, StageInput
 from workflow.tasks.uncertainty import find_uncertainty
 from workflow.text.sentences.design import no_filter
 
@@ -92,14 +91,10 @@ def design_filter(stage: StageInput) -> ReferenceFilterResult:
 
 # Stages of the uncertain plant behind its records.
 _PLANT = ("identify", "uncertainty")
-# Stages up to the uncertain plant, which several designs may share.
-PLANT = ("records", *_PLANT)
 # Which channel is fed back and which one must not swing.
 _PURPOSES = {"channels": {"__all__": {"purpose"}}}
 # Columns that records are read for.
 _COLUMNS = {"__all__": {"input", "output"}}
-# Of several joints the uncertainty of gains is part of the identification's settings.
-_JOINTS = {"joints": True, "design": True, "identification": True}
 
 # Stages in order. What a stage does not use it does not depend on: another value of it leaves its result as
 # it is.
@@ -109,17 +104,15 @@ STAGES: tuple[Stage, ...] = (
         (),
         make_records,
         1.0,
-        uses={"source": True, "channels": _COLUMNS, "joints": _COLUMNS},
-        several=(make_records, 3.0),
+        uses={"source": True, "channels": _COLUMNS},
     ),
     Stage(
         "identify",
         ("records",),
         identify_channels,
         2.0,
-        uses={"channels": True, "closed_loop_data": True, "identification": True},
+        uses={"channels": True, "closed_loop_data": True},
         except_for={"channels": {"__all__": {"uncertainty", "purpose"}}},
-        several=(identify_points, 15.0),
     ),
     Stage(
         "uncertainty",
@@ -140,9 +133,7 @@ STAGES: tuple[Stage, ...] = (
             # The step that is to settle has this length.
             "closed_loop": {"reference_step", "measurement_step"},
             **_PURPOSES,
-            **_JOINTS,
         },
-        several=(design_joints, 20.0),
     ),
     Stage(
         "achievable_performance",
@@ -159,8 +150,7 @@ STAGES: tuple[Stage, ...] = (
         (*_PLANT, "design"),
         certify_controller,
         1.0,
-        uses={"certificate": True, **_JOINTS},
-        several=(certify_joints, 5.0),
+        uses={"certificate": True},
     ),
     Stage(
         "reference_filter",
@@ -174,8 +164,10 @@ STAGES: tuple[Stage, ...] = (
         ("records", *_PLANT, "design", "certify", "reference_filter"),
         run_closed_loop,
         5.0,
-        uses={"closed_loop": True, "source": True, "joints": True},
+        uses={"closed_loop": True, "source": True},
         except_for={"source": {"records"}},
-        several=(run_loops, 5.0),
     ),
 )
+
+# A run of one loop.
+ONE_LOOP = RunKind(STAGES, RunResults)

@@ -10,7 +10,6 @@ from workflow.text.formats import at_most, bound, frequency, hertz, number, si
 if TYPE_CHECKING:
     from control_design.analysis.certificate import Certificate, PlantVerdict
     from control_design.analysis.limited_loop import LimitedLoop
-    from control_design.analysis.multivariable_certificate import MultivariableCertificate
     from control_design.specification.requirement import SpecificationItem
 
 # Relative difference of two frequencies up to which a pole pair of the nominal plant is an identified mode.
@@ -208,7 +207,7 @@ def not_checked(certificate: Certificate, *, sampled: bool, friction: bool = Fal
         )
         left += [
             f"{loop.plant} at the limits of the command: {why}"
-            for loop, why in _unknown_at_limits(certificate.limited)
+            for loop, why in unknown_at_limits(certificate.limited)
         ]
     for resonance in certificate.resonances:
         left.append(
@@ -223,37 +222,7 @@ def not_checked(certificate: Certificate, *, sampled: bool, friction: bool = Fal
     return left
 
 
-def not_checked_of_joints(certificate: MultivariableCertificate) -> list[str]:
-    """What a certificate of several joints leaves open, a sentence each."""
-    left = ["nonlinear effects (friction, Coriolis forces, quantisation) and plants outside the balls"]
-    at_limits = [verdict for verdict in certificate.verdicts if verdict.limited]
-    if not at_limits:
-        left.append(
-            "the command at a limit: the controller has none, or an earlier version made this certificate"
-        )
-    else:
-        left.append(
-            "the command at its limits, other than steps of one reference from rest on the nominal models"
-        )
-        for verdict in at_limits:
-            loops = () if verdict.limited is None else (verdict.limited,)
-            left += [
-                f"{verdict.plant}: the loop at the limits of the command: {why}"
-                for _, why in _unknown_at_limits(loops)
-            ]
-    left.append(f"anything between the operating points ({len(certificate.verdicts)} checked)")
-    left += [
-        f"{verdict.plant}: between grid points: {verdict.obstacle}"
-        for verdict in certificate.verdicts
-        if verdict.obstacle
-    ]
-    left.append("disk margins (nominal loop) and the growth of the uncertainty between grid points")
-    left.append("all frequencies together: the balls hold at their level at each frequency by itself")
-    left.append("that the true plant has as many unstable poles and integrators as the nominal")
-    return left
-
-
-def _unknown_at_limits(loops: Sequence[LimitedLoop]) -> list[tuple[LimitedLoop, str]]:
+def unknown_at_limits(loops: Sequence[LimitedLoop]) -> list[tuple[LimitedLoop, str]]:
     """Loops of which nothing is said, with the reason."""
     return [(loop, LIMITED_OBSTACLES[loop.obstacle.name]) for loop in loops if loop.obstacle is not None]
 

@@ -1,5 +1,5 @@
-"""The stages of a run as they are for several joints: models with their balls, one controller, its
-certificate, the loop on the nonlinear machine at every operating point."""
+"""The stages of a run for several joints: models with their balls, one controller, its certificate, the loop
+on the nonlinear machine at every operating point."""
 
 from __future__ import annotations
 
@@ -27,28 +27,31 @@ from ident.data.record import Record
 from ident.data.signal_filter import increments
 from ident.several_outputs import identify_mimo
 from ident.uncertainty.matrix_response import matrix_posterior
-from workflow.config.joints_config import JointsConfig, TwoJointSource
 from workflow.config.run_config import Role
 from workflow.engine.errors import naming
-from workflow.tasks.loop_sensitivity import SETTLED
-from workflow.tasks.point_models import (
+from workflow.joints.config import JointsConfig, TwoJointSource
+from workflow.joints.machine import machine_at, simulated_points
+from workflow.joints.results import (
     JointsCertificate,
     JointsLoopResult,
+    JointsResults,
     JointsRun,
     PointModel,
     PointModels,
 )
+from workflow.tasks.loop_sensitivity import SETTLED
+from workflow.tasks.records import make_records
 from workflow.tasks.results import DesignResult
-from workflow.tasks.simulated_rig import machine_at
-from workflow.tasks.stage import StageInput
+from workflow.tasks.stage import RunKind, Stage, StageInput
 
 Real = npt.NDArray[np.float64]
 
 
-def _of(stage: StageInput) -> tuple[JointsConfig, Any]:
+def _of(stage: StageInput) -> tuple[JointsConfig, JointsResults]:
     """Configuration and results of a stage by their types in a run for several joints."""
     config: Any = stage.config
-    return config, stage.results
+    results: Any = stage.results
+    return config, results
 
 
 def identify_points(stage: StageInput) -> PointModels:
@@ -177,7 +180,7 @@ def design_joints(stage: StageInput) -> DesignResult:
     return DesignResult(synthesis, synthesis.gamma <= 1.0, reason)
 
 
-def _plants(config: JointsConfig, results: Any) -> list[MultivariablePlant]:
+def _plants(config: JointsConfig, results: JointsResults) -> list[MultivariablePlant]:
     return [point.plant(config.identification.gain_error) for point in results.identify.points]
 
 
@@ -244,7 +247,7 @@ def _judged(
 
 
 def _machines(
-    config: JointsConfig, results: Any, stage: StageInput
+    config: JointsConfig, results: JointsResults, stage: StageInput
 ) -> list[tuple[str, str, Callable[[], Any]]]:
     """Machines to run the loop on: operating point, condition in words, and a function that makes it."""
     source = config.source
@@ -265,3 +268,52 @@ def _machines(
             words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
             machines.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
     return machines
+
+
+# Columns that records are read for.
+_COLUMNS = {"__all__": {"input", "output"}}
+# What design and certificate depend on: the uncertainty of gains is part of the identification's settings.
+_ASKED = {"joints": True, "design": True, "identification": True}
+
+# A run for several joints.
+SEVERAL_JOINTS = RunKind(
+    (
+        Stage(
+            "records",
+            (),
+            partial(make_records, simulate=simulated_points),
+            expected_s=3.0,
+            uses={"source": True, "joints": _COLUMNS},
+        ),
+        Stage(
+            "identify",
+            ("records",),
+            identify_points,
+            expected_s=15.0,
+            uses={"identification": True},
+        ),
+        Stage(
+            "design",
+            ("records", "identify"),
+            design_joints,
+            expected_s=20.0,
+            uses=_ASKED,
+        ),
+        Stage(
+            "certify",
+            ("identify", "design"),
+            certify_joints,
+            expected_s=5.0,
+            uses=_ASKED,
+        ),
+        Stage(
+            "closed_loop",
+            ("records", "identify", "design", "certify"),
+            run_loops,
+            expected_s=5.0,
+            uses={"closed_loop": True, "source": True, "joints": True},
+            except_for={"source": {"records"}},
+        ),
+    ),
+    JointsResults,
+)

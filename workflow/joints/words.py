@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
-from workflow.config.joints_config import JointsConfig
+from control_design.analysis.multivariable_certificate import MultivariableCertificate
+from workflow.describe.certificate import NOT_ON_THE_MACHINE, UNCHECKED
 from workflow.describe.facts import (
     Block,
     FirstScreen,
@@ -24,9 +25,12 @@ from workflow.describe.facts import (
     worded,
 )
 from workflow.describe.identification import sentences
+from workflow.describe.records import records_section
+from workflow.describe.run import first_warning, signals_where_scaled, summary_of
+from workflow.describe.summary import RunSummary
 from workflow.engine import codec
-from workflow.tasks.pipeline import is_certified_and_settles
-from workflow.tasks.point_models import JointsCertificate, JointsLoopResult, PointModels
+from workflow.joints.config import JointsConfig
+from workflow.joints.results import JointsCertificate, JointsLoopResult, JointsResults, PointModels
 from workflow.tasks.results import DesignResult
 from workflow.text.findings.sentences import words
 from workflow.text.formats import (
@@ -42,6 +46,7 @@ from workflow.text.formats import (
     si,
     yes_no,
 )
+from workflow.text.sentences.certificate import unknown_at_limits
 
 if TYPE_CHECKING:
     from workflow.figures.subjects import AnyRunView
@@ -192,7 +197,7 @@ def joints_first_screen(view: AnyRunView) -> FirstScreen:
     certificate = results.certify.certificate
     loop = results.closed_loop
     settled, points = loop.settled_points()
-    holds = is_certified_and_settles(results)
+    holds = results.certified and results.settles
     bullets = [results.design.reason]
     if "as logged" in view.signals:
         bullets.append(
@@ -356,3 +361,82 @@ def joints_document(
         "certificate": codec.plain(certify.certificate),
         "closed_loop": codec.plain(loop, arrays=False),
     }
+
+
+def joints_unchecked_page(certify: JointsCertificate, loop: JointsLoopResult) -> PageSection:
+    """What neither certificate nor simulation of several joints speaks about."""
+    items = ["Without a controller, nothing about a closed loop was checked."]
+    if certify.certificate is not None:
+        items = [sentence(text) for text in not_checked_of_joints(certify.certificate)]
+        if loop.machine != "simulated":
+            items.append(NOT_ON_THE_MACHINE)
+    return PageSection(*UNCHECKED, (Remarks(tuple(items), "plain"),))
+
+
+def not_checked_of_joints(certificate: MultivariableCertificate) -> list[str]:
+    """What a certificate of several joints leaves open, a sentence each."""
+    left = ["nonlinear effects (friction, Coriolis forces, quantisation) and plants outside the balls"]
+    at_limits = [verdict for verdict in certificate.verdicts if verdict.limited]
+    if not at_limits:
+        left.append(
+            "the command at a limit: the controller has none, or an earlier version made this certificate"
+        )
+    else:
+        left.append(
+            "the command at its limits, other than steps of one reference from rest on the nominal models"
+        )
+        for verdict in at_limits:
+            loops = () if verdict.limited is None else (verdict.limited,)
+            left += [
+                f"{verdict.plant}: the loop at the limits of the command: {why}"
+                for _, why in unknown_at_limits(loops)
+            ]
+    left.append(f"anything between the operating points ({len(certificate.verdicts)} checked)")
+    left += [
+        f"{verdict.plant}: between grid points: {verdict.obstacle}"
+        for verdict in certificate.verdicts
+        if verdict.obstacle
+    ]
+    left.append("disk margins (nominal loop) and the growth of the uncertainty between grid points")
+    left.append("all frequencies together: the balls hold at their level at each frequency by itself")
+    left.append("that the true plant has as many unstable poles and integrators as the nominal")
+    return left
+
+
+def joints_sections(results: JointsResults, config: JointsConfig) -> list[Section]:
+    """The closed loop and the plant of a run for several joints, with everything else as their parts.
+
+    Args:
+        results: Of the run.
+        config: Its configuration.
+    """
+    models = results.identify
+    certify = results.certify
+    loop = Section(
+        "closed loop",
+        joints_numbers(models, certify, results.closed_loop, config),
+        parts=(
+            joints_loop_section(results.closed_loop),
+            joints_certificate_section(certify),
+            joints_design_section(results.design, signals_where_scaled(config, results)),
+        ),
+    )
+    warnings = [words(item) for point in models.points for item in point.warnings]
+    plant = Section(
+        "plant",
+        said(fit_row(models, config), first_warning(warnings)),
+        parts=(records_section(results.records), models_section(models, config)),
+    )
+    return [loop, plant]
+
+
+def summarise_joints(results: JointsResults, config: JointsConfig) -> RunSummary:
+    """What a run for several joints says whose stages are all there."""
+    loop = results.closed_loop
+    return summary_of(
+        results,
+        config,
+        joints_sections(results, config),
+        joints_document(results.identify, results.design, results.certify, loop),
+        joints_verdict(results.design, results.certify, *loop.settled_points()),
+    )

@@ -16,6 +16,8 @@ from ident.basis.mimo_model import MimoModel
 from ident.checks.validation import FreshFit
 from ident.data.finding import Finding
 from ident.uncertainty.matrix_response import MatrixUncertainty
+from workflow.joints.config import JointsConfig
+from workflow.tasks.results import AnyResults, StageResult
 
 Real = npt.NDArray[np.float64]
 
@@ -165,3 +167,23 @@ class JointsLoopResult:
         points = dict.fromkeys(run.point for run in self.runs)
         good = [all(run.settled for run in self.runs if run.point == point) for point in points]
         return sum(good), len(good)
+
+
+class JointsResults(AnyResults):
+    """Results of a run for several joints."""
+
+    identify = StageResult(PointModels)
+    certify = StageResult(JointsCertificate)
+    closed_loop = StageResult(JointsLoopResult)
+
+    @property
+    def certified(self) -> bool:
+        return self.certify.certified
+
+    @property
+    def settles(self) -> bool:
+        settled, points = self.closed_loop.settled_points()
+        return settled == points
+
+    def certified_for(self, config: JointsConfig) -> str:
+        return f"{len(self.identify.points)} operating points"

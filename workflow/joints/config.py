@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, NonNegativeInt, model_validator
@@ -10,18 +9,8 @@ from pydantic import Field, NonNegativeInt, model_validator
 from control_design.specification import Specification
 from control_design.specification.multivariable import MultivariableSpecification
 from control_design.synthesis.synthesis_options import MultivariableOptions
-from workflow.config.run_config import (
-    AnyRun,
-    FileSource,
-    Name,
-    Notes,
-    Role,
-    RunConfig,
-    SimulatedSource,
-    loaded,
-)
+from workflow.config.run_config import AnyConfig, FileSource, Name, Notes, Role
 from workflow.config.settings import Section, repeated
-from workflow.engine.documents import read_toml
 
 Two = tuple[float, float]
 
@@ -134,8 +123,8 @@ class JointsLoop(Section):
     coulomb_Nm: Two | None = Field(None, description="dry friction of each joint in further runs")
 
 
-class JointsConfig(AnyRun):
-    """A whole run for several joints. Load with `load_any`."""
+class JointsConfig(AnyConfig):
+    """A whole run for several joints. Load with `workflow.kinds.load_any`."""
 
     source: Source
     joints: tuple[Joint, ...] = Field(min_length=1)
@@ -223,27 +212,3 @@ class JointsConfig(AnyRun):
     def loops(self) -> tuple[Joint, ...]:
         """What the controller drives and is fed."""
         return self.joints
-
-
-class SimulationConfig(AnyRun):
-    """The experiments of a simulated machine alone."""
-
-    source: SimulatedSource
-
-
-AnyConfig = RunConfig | JointsConfig
-
-
-def load_any(path: Path) -> tuple[AnyConfig, str]:
-    """Configuration of one loop or of several joints, and its text. Raises InputError: file, dotted key and
-    what was expected in one line."""
-    if "joints" in read_toml(path)[1]:
-        return loaded(JointsConfig, path)
-    return loaded(RunConfig, path)
-
-
-def load_simulation(path: Path) -> AnyConfig | SimulationConfig:
-    """A whole configuration, or one of [run] and [source] alone. Raises InputError as `load_any`."""
-    if read_toml(path)[1].keys() <= SimulationConfig.model_fields.keys():
-        return loaded(SimulationConfig, path)[0]
-    return load_any(path)[0]
