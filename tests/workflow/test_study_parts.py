@@ -150,7 +150,7 @@ def test_margins_in_the_units_of_the_table():
         reference_filter=kept.ReferenceFilterResult(),
         closed_loop=kept.ClosedLoopResult(skipped="why not"),
     )
-    asked = SimpleNamespace(specification=SimpleNamespace(mode_band_rad_s=(30.0, 100.0)))
+    asked = RunConfig.model_construct(specification=SimpleNamespace(mode_band_rad_s=(30.0, 100.0)))
     found = numbers_of(results, asked)
     assert found["gain_margin_dB"] == pytest.approx(6.0206, abs=1e-4)  # down to a half: the nearer side
     assert found["nominal_gain_margin_dB"] == pytest.approx(12.0412, abs=1e-4)
@@ -180,7 +180,9 @@ def test_numbers_beyond_the_margins():
         reference_filter=kept.ReferenceFilterResult(filtered),
         closed_loop=kept.ClosedLoopResult(check=check),
     )
-    found = numbers_of(results, SimpleNamespace(specification=SimpleNamespace(mode_band_rad_s=None)))
+    found = numbers_of(
+        results, RunConfig.model_construct(specification=SimpleNamespace(mode_band_rad_s=None))
+    )
     assert found["any_order_gamma"] == 0.8
     assert found["above_any_order_percent"] == pytest.approx(10.0)
     assert (found["whole_held_percent"], found["whole_stable_percent"]) == (99.0, 100.0)
@@ -389,12 +391,13 @@ def test_a_loop_at_rest_beside_its_reference_does_not_settle(offset, state, tmp_
         number=1,
         name="1",
         values={},
-        config=SimpleNamespace(specification=designed_for, control_index=0, performance_index=None),
+        config=example_config().model_copy(update={"specification": designed_for}),
     )
     row = row_of(point, RunDirectory.open(tmp_path / "run"))
     assert (row.state, row.good) == (state, state == "certified")
     assert ("1 of 3 runs never settle" in row.why) == (offset > 0)
-    point.config.specification = Specification(bandwidth_rad_s=9.0, lowest_bandwidth_rad_s=0.1)
+    lower_one = Specification(bandwidth_rad_s=9.0, lowest_bandwidth_rad_s=0.1)
+    point.config = point.config.model_copy(update={"specification": lower_one})
     lower = row_of(point, RunDirectory.open(tmp_path / "run"))
     assert lower.state == ("does not settle" if offset else "certified at a lower bandwidth")
     assert lower.why.startswith("bandwidth_rad_s = 9 was not met")

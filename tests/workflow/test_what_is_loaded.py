@@ -11,6 +11,8 @@ import pytest
 NEVER_FOR_A_LOG = {"numba", "scipy", "control", "matplotlib", "casadi", "pandas", "nlopt"}
 # What only designs, tables and drawings need: a second or more together, and a model is identified in less.
 NEVER_FOR_A_MODEL = {"control", "matplotlib", "casadi", "pandas"}
+# Packages of workflow that the main job does without (CONTRIBUTING.md).
+ROOMS = {"diagnose", "excite", "joints", "look", "responses", "study", "tune"}
 SHOW = "import json, sys; sys.stderr.write('\\n' + json.dumps(sorted(sys.modules)))"
 COMMAND = f"import sys\nfrom workflow.__main__ import main\ntry:\n    main()\nfinally:\n    {SHOW}"
 IDENTIFY = (
@@ -72,3 +74,13 @@ def test_nor_from_python():
 
 def test_a_diagnosis_begins_without_what_checks_controllers_and_draws():
     assert not loaded(f"import workflow.diagnose.command\n{SHOW}") & NEVER_FOR_A_MODEL
+
+
+@pytest.mark.slow
+def test_a_run_of_logs_enters_no_room(log, tmp_path):
+    """Only a run enters everything that it loads: imports inside functions count, too."""
+    modules = loaded(COMMAND, "run", log, "--out", str(tmp_path / "run"))
+    assert (tmp_path / "run" / "report.html").exists()
+    entered = {name.split(".")[1] for name in modules if name.startswith("workflow.")}
+    assert {"kinds", "describe", "figures", "report", "tasks"} <= entered
+    assert not entered & ROOMS
