@@ -7,6 +7,7 @@ from typing import Any
 
 from control_design.controllers.engineers_numbers import ControllerNumbers, engineers_numbers
 from control_design.specification import Specification
+from control_design.synthesis.synthesis_result import BlockingPoint
 from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
 from workflow.config.run_config import AnyConfig, RunConfig
@@ -28,7 +29,6 @@ from workflow.tasks.giving_way import gave_way
 from workflow.tasks.results import AnyResults, CertifyResult, DesignResult, RunResults
 from workflow.text.findings.sentences import words
 from workflow.text.sentences.design import lowered, tracking_begins
-from workflow.text.sentences.friction import certified_for
 
 
 def summarise(results: RunResults, config: RunConfig) -> RunSummary:
@@ -104,60 +104,68 @@ def _merged(document: Mapping[str, Any], more: Mapping[str, Any]) -> dict[str, A
 def run_sections(results: RunResults, config: RunConfig) -> list[Section]:
     """The closed loop and the plant of a run of one loop, with everything else as their parts."""
     certify = results.certify
-    used = results.design.specification or config.specification
-    given_way = gave_way(config.specification, results.design.specification)
-    input_unit = results.records.unit(config.control_channel.input)
-    output_unit = results.records.unit(config.control_channel.output)
+    design = results.design
+    # Requirements may have given way: what was designed for is not always what was asked.
+    asked = config.specification
+    used = design.specification or asked
+    given_way = gave_way(asked, design.specification)
+    channel = config.control_channel
+    input_unit = results.records.unit(channel.input)
+    output_unit = results.records.unit(channel.output)
     signals = signals_where_scaled(config, results)
     numbers = numbers_of_controller(results, config)
+
+    # What everybody sees first: how the loop moves, and how much it tolerates.
+    rows = [*loop_numbers(results, config)]
+    if certify.certificate is not None:
+        rows += margin_rows(certify.certificate)
+    gave_way_row = worded("gave way", gave_way_text(given_way))
+
+    # Its parts, in the order in which one asks for them.
+    loop_part = loop_section(
+        results.closed_loop,
+        input_unit,
+        output_unit,
+        feedforward=config.closed_loop.friction_feedforward,
+    )
+    certificate_part = certificate_section(
+        certify,
+        joint_numbers(certify.sampled),
+        results.certified_for(config),
+        whole=False,
+    )
+    design_part = design_section(
+        design,
+        results.achievable_performance,
+        used.controller_order,
+        bandwidth=lowered_bandwidth(results, config),
+        given_way=given_way,
+        tracking=tracking_begins(asked, design.specification),
+        files=signals,
+    )
+    controller_part = controller_section(numbers, used.computational_delay_samples, signals)
+    filter_part = filter_section(results.reference_filter)
     loop = Section(
         "closed loop",
-        said(
-            *loop_numbers(results, config),
-            *(() if certify.certificate is None else margin_rows(certify.certificate)),
-            worded("gave way", gave_way_text(given_way)),
-            pid_row(numbers),
-        ),
-        parts=(
-            loop_section(
-                results.closed_loop,
-                input_unit,
-                output_unit,
-                feedforward=config.closed_loop.friction_feedforward,
-            ),
-            certificate_section(
-                certify,
-                joint_numbers(certify.sampled),
-                certified_for(
-                    config.control_channel.uncertainty.response, results.uncertainty.equivalent, input_unit
-                ),
-                whole=False,
-            ),
-            design_section(
-                results.design,
-                results.achievable_performance,
-                used.controller_order,
-                bandwidth=lowered_bandwidth(results, config),
-                given_way=given_way,
-                tracking=tracking_begins(config.specification, results.design.specification),
-                files=signals,
-            ),
-            controller_section(numbers, used.computational_delay_samples, signals),
-            filter_section(results.reference_filter),
-        ),
+        said(*rows, gave_way_row, pid_row(numbers)),
+        parts=(loop_part, certificate_part, design_part, controller_part, filter_part),
     )
+
+    # The plant: friction and doubts first, then records, channels and what friction makes of the response.
     friction = results.identify.friction
+    plant_rows: list[Row | None] = []
+    if friction is not None:
+        plant_rows.append(friction_row(friction, input_unit, output_unit))
+    warnings = [words(item) for item in warnings_of(results)]
+    plant_rows.append(first_warning(warnings))
+    records_part = records_section(results.records)
+    channel_parts = channel_sections(results)
+    amplitude = amplitude_row(results.uncertainty.equivalent, input_unit)
+    friction_part = Section("friction", said(amplitude))
     plant = Section(
         "plant",
-        said(
-            None if friction is None else friction_row(friction, input_unit, output_unit),
-            first_warning([words(item) for item in warnings_of(results)]),
-        ),
-        parts=(
-            records_section(results.records),
-            *channel_sections(results),
-            Section("friction", said(amplitude_row(results.uncertainty.equivalent, input_unit))),
-        ),
+        said(*plant_rows),
+        parts=(records_part, *channel_parts, friction_part),
     )
     return [loop, plant]
 
@@ -189,22 +197,30 @@ def first_warning(warnings: Sequence[str]) -> Row | None:
     distinct = list(dict.fromkeys(warnings))
     if not distinct:
         return None
-    further = f" ({len(distinct) - 1} more: --verbose)" if len(distinct) > 1 else ""
+    further = ""
+    if len(distinct) > 1:
+        further = f" ({len(distinct) - 1} more: --verbose)"
     return worded("warning", f"{distinct[0]}{further}")
 
 
 def signals_where_scaled(config: AnyConfig, results: AnyResults) -> str:
     """What the controller's files take and give, where that is not the quantities of the model; else ""."""
     signals = Logged.of(config, results.records).signals
-    return signals if "as logged" in signals else ""
+    if "as logged" not in signals:
+        return ""
+    return signals
 
 
 def lowered_bandwidth(results: RunResults, config: RunConfig) -> str:
     """Which bandwidth is which where a lower one was taken than specified; "" elsewhere."""
     design = results.design
-    blocking = () if design.synthesis is None else design.synthesis.blocking
-    reached = bandwidth_numbers(design, results.certify, config.specification)["reached"]
-    return lowered(config.specification, design.specification, blocking, reached or 0.0)
+    asked = config.specification
+    blocking: tuple[BlockingPoint, ...] = ()
+    if design.synthesis is not None:
+        blocking = design.synthesis.blocking
+    bandwidths = bandwidth_numbers(design, results.certify, asked)
+    reached_rad_s = bandwidths["reached"] or 0.0
+    return lowered(asked, design.specification, blocking, reached_rad_s)
 
 
 def numbers_of_controller(results: RunResults, config: RunConfig) -> ControllerNumbers | None:
@@ -212,19 +228,24 @@ def numbers_of_controller(results: RunResults, config: RunConfig) -> ControllerN
     no such factors."""
     if results.design.controller is None:
         return None
-    return engineers_numbers(Logged.of(config, results.records).law(results.design.controller))
+    # As it is written to files: for the columns of the logs.
+    logged = Logged.of(config, results.records)
+    law = logged.law(results.design.controller)
+    return engineers_numbers(law)
 
 
 def verdict_of_run(results: RunResults, config: RunConfig) -> str:
     """The verdict on a run of one loop in one line."""
     design = results.design
+    used = design.specification or config.specification
+    fed_back = results.uncertainty.channels[config.control_index]
     return run_verdict(
         design,
         results.certify,
         results.closed_loop,
         results.achievable_performance,
-        (design.specification or config.specification).controller_order,
-        untold_below_rad_s(results.uncertainty.channels[config.control_index].frequency),
+        used.controller_order,
+        untold_below_rad_s(fed_back.frequency),
         results.uncertainty.conditions(config),
         config.specification,
         results.identify.modes_rad_s,
@@ -236,27 +257,46 @@ def run_document(results: RunResults, config: RunConfig) -> dict[str, Any]:
     design = results.design
     certify = results.certify
     synthesis = design.synthesis
-    pairs = zip(results.identify.channels, results.uncertainty.channels, strict=True)
+    asked = config.specification
+    used = design.specification or asked
+
+    # Without a controller the keys stay: a program finds an answer to every question.
+    outcome = "IMPOSSIBLE"
+    blocking: Any = []
+    if synthesis is not None:
+        outcome = synthesis.outcome.name
+        blocking = codec.plain(synthesis.blocking)
+    controller_dt_s = None
+    if design.controller is not None:
+        controller_dt_s = design.controller.dt_s
     numbers = numbers_of_controller(results, config)
-    used = design.specification or config.specification
+    engineers = None
+    if numbers is not None:
+        engineers = numbers.to_dict()
+
+    channels = []
+    pairs = zip(results.identify.channels, results.uncertainty.channels, strict=True)
+    for channel, spread in pairs:
+        channels.append(channel_numbers(channel, spread))
+    conditions = [words(doubt) for doubt in results.uncertainty.conditions(config)]
     return {
         "command_timing": timing_numbers(results.records.timing),
-        "channels": [channel_numbers(channel, spread) for channel, spread in pairs],
+        "channels": channels,
         "design": {
             "met": design.met,
             "reason": design.reason,
             "gamma": design.gamma,
-            "outcome": "IMPOSSIBLE" if synthesis is None else synthesis.outcome.name,
-            "blocking": [] if synthesis is None else codec.plain(synthesis.blocking),
-            "bandwidth_rad_s": bandwidth_numbers(design, certify, config.specification),
-            "gave_way": codec.plain(gave_way(config.specification, design.specification)),
+            "outcome": outcome,
+            "blocking": blocking,
+            "bandwidth_rad_s": bandwidth_numbers(design, certify, asked),
+            "gave_way": codec.plain(gave_way(asked, design.specification)),
             "tracking_from_rad_s": used.tracking_from_rad_s,
-            "controller_dt_s": None if design.controller is None else design.controller.dt_s,
+            "controller_dt_s": controller_dt_s,
         },
-        "engineers_numbers": None if numbers is None else numbers.to_dict(),
+        "engineers_numbers": engineers,
         "signals": Logged.of(config, results.records).signals,
         "certificate": codec.plain(certify.certificate),
-        "certificate_conditions": [words(doubt) for doubt in results.uncertainty.conditions(config)],
+        "certificate_conditions": conditions,
         "achievable_performance": bracket_numbers(results.achievable_performance, design.gamma),
         "sampled_responses": joint_numbers(certify.sampled),
         "reference_filter": codec.plain(results.reference_filter.filter),
@@ -281,9 +321,14 @@ def bandwidth_numbers(
     design: DesignResult, certify: CertifyResult, asked: Specification
 ) -> dict[str, float | None]:
     """Specified, designed for, and reached: up to there every plant has |S| below -3 dB."""
-    plants = () if certify.certificate is None else certify.certificate.plants
+    used = design.specification or asked
+    # The slowest of several plants counts.
+    reached = None
+    if certify.certificate is not None:
+        bandwidths = [plant.bandwidth_rad_s for plant in certify.certificate.plants]
+        reached = min(bandwidths, default=None)
     return {
         "specified": asked.bandwidth_rad_s,
-        "designed_for": (design.specification or asked).bandwidth_rad_s,
-        "reached": min((plant.bandwidth_rad_s for plant in plants), default=None),
+        "designed_for": used.bandwidth_rad_s,
+        "reached": reached,
     }

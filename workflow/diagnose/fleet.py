@@ -44,8 +44,10 @@ from workflow.text.names import stated_name
 
 # Chance of one false trend in an overview, or one false gap among sizes, all of them together (Bonferroni).
 _FALSE_TREND = 0.01
-# Machines that a group names, and machines of an overview with a line each in its picture.
-_MOST_NAMED, _MOST_DRAWN = 12, 20
+# Machines that a group names: its words stay within a few lines.
+_MOST_NAMED = 12
+# Machines of an overview with a line each in its picture: more lines could not be told apart.
+_MOST_DRAWN = 20
 # With fewer machines no order of them is as unlikely as that.
 _LEAST_MACHINES = 6
 _NUMBERS = ("probability", "gap_before", "gap_refit", "gap_after", "noise_floor")
@@ -113,7 +115,8 @@ class Group:
         sizes: dict[tuple[str, str], tuple[float, float, float]] = {}
         for key in dict.fromkeys(key for machine in self.machines for key in machine.sizes):
             values = [machine.sizes[key][0] for machine in self.machines if key in machine.sizes]
-            sizes[key] = float(np.median(values)), min(values), max(values)
+            median = float(np.median(values))
+            sizes[key] = (median, min(values), max(values))
         return sizes
 
 
@@ -137,10 +140,13 @@ def groups(machines: Iterable[FleetMachine]) -> list[Group]:
     by_cause: dict[str, list[FleetMachine]] = {}
     for machine in machines:
         by_cause.setdefault(machine.cause, []).append(machine)
+    # Causes of as many machines stand in the order of their words.
     ordered = sorted(by_cause.items(), key=lambda item: (-len(item[1]), item[0]))
-    return [
-        Group(cause, tuple(part), apart) for cause, members in ordered for part, apart in _by_size(members)
-    ]
+    found_groups = []
+    for cause, members in ordered:
+        for part, apart in _by_size(members):
+            found_groups.append(Group(cause, tuple(part), apart))
+    return found_groups
 
 
 def _by_size(
@@ -158,6 +164,7 @@ def _by_size(
     keys = [key for key in members[0].sizes if all(key in machine.sizes for machine in members)]
     for key in keys:
         sizes = np.sort([machine.sizes[key][0] for machine in members])
+        # Sizes of one sign are compared by their ratios.
         x = sizes
         if sizes[0] * sizes[-1] > 0:
             x = np.sign(sizes) * np.log(np.abs(sizes))
@@ -166,8 +173,10 @@ def _by_size(
         gap = x[k] - x[k - 1]
         width_below = x[k - 1] - x[0]
         width_above = x[-1] - x[k]
-        if 1 < k < n - 1 and gap > max(width_below, width_above):
-            gap_share = gap / (x[-1] - x[0])
+        has_two_on_either_side = 1 < k < n - 1
+        if has_two_on_either_side and gap > max(width_below, width_above):
+            whole_width = x[-1] - x[0]
+            gap_share = gap / whole_width
             # Every size is a trial more.
             chance = len(keys) * (n - 1) * (1 - gap_share) ** (n - 2)
             best = min(best, (float(chance), float(sizes[k]), key))
@@ -182,14 +191,26 @@ def _by_size(
 def serial_numbers(names: Sequence[str]) -> dict[str, int]:
     """Name -> its number, of the names that differ in numbers alone: that with the most different values, of
     two the last. Empty where there is none."""
-    pattern = Counter(re.sub(r"\d+", "#", name) for name in names).most_common(1)
-    alike = [name for name in names if pattern and re.sub(r"\d+", "#", name) == pattern[0][0]]
-    numbers = {name: [int(part) for part in re.findall(r"\d+", name)] for name in alike}
+    if not names:
+        return {}
+    # Names of the most frequent form, "arm # of #": others cannot be put in a row with them.
+    form_of = {name: re.sub(r"\d+", "#", name) for name in names}
+    forms = Counter(form_of[name] for name in names)
+    (usual_form, _) = forms.most_common(1)[0]
+    numbers = {}
+    for name in names:
+        if form_of[name] == usual_form:
+            numbers[name] = [int(part) for part in re.findall(r"\d+", name)]
+
+    # The place whose numbers differ most; of a date and a serial number the later one.
     columns = list(zip(*numbers.values(), strict=True))
     if not columns:
         return {}
-    best = max(range(len(columns)), key=lambda k: (len(set(columns[k])), k))
-    return {name: values[best] for name, values in numbers.items()} if len(set(columns[best])) > 1 else {}
+    different = [len(set(column)) for column in columns]
+    best = max(range(len(columns)), key=lambda place: (different[place], place))
+    if different[best] == 1:
+        return {}
+    return {name: values[best] for name, values in numbers.items()}
 
 
 def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
@@ -198,33 +219,47 @@ def trends(machines: Sequence[FleetMachine]) -> list[Trend]:
     Kendall's rank test over the machines whose cause is decided; an effect that a machine lacks has the size
     zero there (of a ratio: one). Neglected: that intervals of the sizes differ.
     """
-    from scipy.stats import kendalltau, theilslopes  # here: it takes its time to load
+    # Here: it takes its time to load.
+    from scipy.stats import kendalltau, theilslopes
 
     numbers = serial_numbers([machine.name for machine in machines])
     known = [machine for machine in machines if machine.name in numbers and machine.decided]
     series: dict[tuple[str, str], list[tuple[int, float]]] = {}
     for key in dict.fromkeys(key for machine in known for key in machine.sizes):
-        without = (1.0 if key[1] == "ratio" else 0.0,)
-        series[key] = [(numbers[machine.name], machine.sizes.get(key, without)[0]) for machine in known]
+        # The size that changes nothing.
+        without = 0.0
+        if key[1] == "ratio":
+            without = 1.0
+        pairs = []
+        for machine in known:
+            size = without
+            if key in machine.sizes:
+                size = machine.sizes[key][0]
+            pairs.append((numbers[machine.name], size))
+        series[key] = pairs
     for value in dict.fromkeys(value for machine in known for value in machine.values):
-        series["", value] = [
-            (numbers[machine.name], machine.values[value][1]) for machine in known if value in machine.values
-        ]
+        pairs = []
+        for machine in known:
+            if value in machine.values:
+                _, repaired = machine.values[value]
+                pairs.append((numbers[machine.name], repaired))
+        series["", value] = pairs
+
+    # Each series is a trial: all of them together have one chance of a false trend.
     significant = []
     for (effect, parameter), pairs in series.items():
-        at, size = np.array(pairs, dtype=np.float64).T
-        if len(pairs) < _LEAST_MACHINES or np.ptp(size) == 0:
+        at, sizes = np.array(pairs, dtype=np.float64).T
+        if len(pairs) < _LEAST_MACHINES or np.ptp(sizes) == 0:
             continue
-        tau, p = kendalltau(at, size)
+        tau, p = kendalltau(at, sizes)
         if p * len(series) < _FALSE_TREND:
-            slope = float(theilslopes(size, at)[0])
+            slope = float(theilslopes(sizes, at)[0])
             significant.append(Trend(effect, parameter, float(tau), float(p), slope, len(pairs)))
     return sorted(significant, key=lambda trend: trend.p)
 
 
 def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> str:
     """One row per machine with answer, numbers, sizes with intervals and values; then what failed."""
-
     numbers = serial_numbers([machine.name for machine in machines])
     rows: list[dict[str, Any]] = []
     for machine in machines:
@@ -235,17 +270,24 @@ def csv_text(machines: Sequence[FleetMachine], failures: Mapping[str, str]) -> s
             "answer": machine.answer,
         }
         row |= machine.numbers
-        for (effect, key), size in machine.sizes.items():
-            ends = ("", ".low", ".high")
-            row |= {f"{effect}.{key}{end}": value for end, value in zip(ends, size, strict=True)}
+        for (effect, key), (size, low, high) in machine.sizes.items():
+            column = f"{effect}.{key}"
+            row[column] = size
+            row[f"{column}.low"] = low
+            row[f"{column}.high"] = high
         for key, (stated, repaired) in machine.values.items():
-            row |= {f"{key} (stated)": stated, f"{key} (repaired)": repaired}
+            row[f"{key} (stated)"] = stated
+            row[f"{key} (repaired)"] = repaired
         rows.append(row)
-    rows += [{"case": case, "verdict": "failed", "answer": reason} for case, reason in failures.items()]
+    for case, reason in failures.items():
+        rows.append({"case": case, "verdict": "failed", "answer": reason})
+
+    # Columns that every machine has come first, then sizes and values by their names.
+    first_columns = ["case", "number", "verdict", "answer", *_NUMBERS]
+    all_columns = {name for row in rows for name in row}
+    further_columns = sorted(all_columns - set(first_columns))
     text = io.StringIO()
-    first = ["case", "number", "verdict", "answer", *_NUMBERS]
-    names = dict.fromkeys([*first, *sorted({name for row in rows for name in row} - set(first))])
-    writer = csv.DictWriter(text, list(names), lineterminator="\n")
+    writer = csv.DictWriter(text, [*first_columns, *further_columns], lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
@@ -256,7 +298,9 @@ def trend_words(trend: Trend) -> str:
     what = key_words(trend.parameter)
     if trend.effect:
         what = f"{in_words(trend.effect)}: {stated_name(trend.parameter)}"
-    grows = "grows" if trend.tau > 0 else "falls"
+    grows = "falls"
+    if trend.tau > 0:
+        grows = "grows"
     slope = value_words(trend.parameter, abs(trend.per_number))
     return (
         f"{what} {grows} with the number in the name, by {slope} per number (Kendall's tau {trend.tau:.2f}, "
@@ -271,9 +315,12 @@ def machines_section(machine_groups: Sequence[Group], size_trends: Sequence[Tren
         words = group.cause
         for (effect, key), (middle, low, high) in group.sizes.items():
             extent = f"{value_words(key, low)} to {value_words(key, high)}"
-            words += f"; {in_words(effect)}: {stated_name(key)} {value_words(key, middle)} ({extent})"
-        rows.append(Row("", count(len(group.machines), "machine"), Quantity.words(words)))
-    rows += [Row("", "trend", Quantity.words(trend_words(trend))) for trend in size_trends]
+            size = f"{stated_name(key)} {value_words(key, middle)} ({extent})"
+            words += f"; {in_words(effect)}: {size}"
+        machines = count(len(group.machines), "machine")
+        rows.append(Row("", machines, Quantity.words(words)))
+    for trend in size_trends:
+        rows.append(Row("", "trend", Quantity.words(trend_words(trend))))
     return Section("machines", tuple(rows))
 
 
@@ -298,13 +345,15 @@ def overview_page(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -
             (machines,),
         )
         blocks: tuple[Block, ...] = (cases_table(machines),)
+        # With more machines the lines of the picture could not be told apart.
         if len(machines) <= _MOST_DRAWN:
             blocks = (picture, *blocks)
         sections.append(PageSection("cases", "All cases", "Cases", blocks, open=True))
     if failed:
         reasons = Remarks(tuple(f"{case}: {reason}" for case, reason in failed.items()), "warning")
         sections.append(PageSection("failed", "Cases without an answer", "Failed", (reasons,), open=True))
-    first = FirstScreen(outcome_words(machines, failed), "plain", (), tuple(bullets), short="Outcome")
+    outcome = outcome_words(machines, failed)
+    first = FirstScreen(outcome, "plain", (), tuple(bullets), short="Outcome")
     return Page("Gap diagnosis", first, tuple(sections))
 
 
@@ -318,7 +367,8 @@ def outcome_words(machines: Sequence[FleetMachine], failed: Mapping[str, str]) -
         (len(failed), "failed"),
     ]
     parts = listing([f"{number} {what}" for number, what in kinds if number])
-    return f"{count(len(machines) + len(failed), 'case')}: {parts}"
+    cases = count(len(machines) + len(failed), "case")
+    return f"{cases}: {parts}"
 
 
 def _group_words(group: Group) -> str:
@@ -328,9 +378,13 @@ def _group_words(group: Group) -> str:
         key = group.apart[1]
         _, low, high = group.sizes[group.apart]
         words += f", {stated_name(key)} {value_words(key, low)} to {value_words(key, high)}"
-    names = [file_link(f"{machine.name}.html", machine.name) for machine in group.machines[:_MOST_NAMED]]
-    unnamed = ", …" if len(group.machines) > _MOST_NAMED else ""
-    return Markup("{} ({}{})").format(words, Markup(", ").join(names), unnamed)
+    named = group.machines[:_MOST_NAMED]
+    links = [file_link(f"{machine.name}.html", machine.name) for machine in named]
+    unnamed = ""
+    if len(group.machines) > len(named):
+        unnamed = ", …"
+    all_links = Markup(", ").join(links)
+    return Markup("{} ({}{})").format(words, all_links, unnamed)
 
 
 def causes_table(machine_groups: Sequence[Group]) -> Table:
@@ -341,6 +395,7 @@ def causes_table(machine_groups: Sequence[Group]) -> Table:
         for (effect, key), sizes in group.sizes.items():
             values = [value_words(key, size) for size in sizes]
             lines.append((*of_group, in_words(effect), stated_name(key), *values))
+            # Cause and number stand beside the first size only.
             of_group = ("", "")
     return Table(
         ("cause", "machines", "effect", "parameter", "median", "smallest", "largest"),

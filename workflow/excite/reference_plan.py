@@ -15,7 +15,7 @@ from ident.data.frequency_uncertainty import FrequencyUncertainty
 from ident.data.record import Record
 from plant.experiment_plan import ExperimentPlan
 from workflow.engine.errors import InputError
-from workflow.tasks.first_look import first_look, from_reference, told_response
+from workflow.tasks.first_look import FirstLook, first_look, from_reference, told_response
 
 # Amplitudes as shares of the largest: what differs between them is not linear.
 _LEVELS = (1.0, 0.5)
@@ -127,8 +127,7 @@ def plan_reference(
     dt_s = records[0].dt_s
     look = first_look(records, position=position)
     if band_Hz is None:
-        highest = look.told_rad_s[1] / (2 * np.pi) if look.told_rad_s else 0.05 / dt_s
-        band_Hz = float(f"{highest / _HIGHEST_OVER_LOWEST:.2g}"), float(f"{min(highest, 0.4 / dt_s):.2g}")
+        band_Hz = _band_of(look, dt_s)
     duration_s = duration_s or _PERIODS_OF_LOWEST / band_Hz[0]
     try:
         plan = ExperimentPlan.within(
@@ -146,61 +145,95 @@ def plan_reference(
 
     # What is allowed: as stated, or what the records had.
     def largest_deviation(signals: Sequence[RealArray]) -> float:
-        return max(float(np.max(np.abs(signal - signal.mean()))) for signal in signals)
+        deviations = [np.abs(signal - signal.mean()) for signal in signals]
+        return max(float(np.max(deviation)) for deviation in deviations)
 
-    command_limit = largest_command or share * largest_deviation([record.input for record in records])
-    motion_limit = largest_motion or largest_deviation([record.output for record in records])
+    commands = [record.input for record in records]
+    motions = [record.output for record in records]
+    command_limit = largest_command or share * largest_deviation(commands)
+    motion_limit = largest_motion or largest_deviation(motions)
 
     # How the loop answers a reference, with its command and its motion.
-    omega = np.asarray(2 * np.pi * lines / (plan.period_samples * dt_s), dtype=np.float64)
+    period_s = plan.period_samples * dt_s
+    omega = np.asarray(2 * np.pi * lines / period_s, dtype=np.float64)
     known = all(record.reference is not None for record in records)
-    command_response = told_response(from_reference(records, "input")) if known else None
-    motion_response = told_response(from_reference(records, "output")) if known else None
+    command_response: FrequencyUncertainty | None = None
+    motion_response: FrequencyUncertainty | None = None
+    if known:
+        command_response = told_response(from_reference(records, "input"))
+        motion_response = told_response(from_reference(records, "output"))
     is_told = command_response is not None and motion_response is not None
     if not is_told and rms is None:
-        why = "the logs do not tell how the loop answers" if known else "no reference is recorded"
+        why = "no reference is recorded"
+        if known:
+            why = "the logs do not tell how the loop answers"
         raise InputError(
             f"{records[0].label}: {why}: name a column with --reference, or state the amplitude of the new "
             "one with --rms VALUE, small at first"
         )
     unknown = np.full(omega.size, np.nan, dtype=np.complex128)
-    to_command = unknown if command_response is None else _at(command_response, omega)
-    to_motion = unknown if motion_response is None else _at(motion_response, omega)
+    to_command = unknown
+    if command_response is not None:
+        to_command = _at(command_response, omega)
+    to_motion = unknown
+    if motion_response is not None:
+        to_motion = _at(motion_response, omega)
 
     # Amplitudes over the lines: each line takes its share of both limits. Then phases.
     shape = np.ones(omega.size)
     if is_told:
-        shape = 1 / (np.abs(to_command) / command_limit + np.abs(to_motion) / motion_limit)
+        command_share = np.abs(to_command) / command_limit
+        motion_share = np.abs(to_motion) / motion_limit
+        shape = 1 / (command_share + motion_share)
     rng = np.random.default_rng(seed)
-    spectra = np.stack([_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)])
+    draws = [_drawn(plan, lines, shape, to_command, rng) for _ in range(plan.realisations)]
+    spectra = np.stack(draws)
 
-    def peaks(gain: ComplexArray | RealArray) -> RealArray:
-        return np.asarray(np.max(np.abs(_signal(plan, lines, gain * spectra)), axis=-1))
+    # One period of reference, command and motion, of each realisation at a size of 1.
+    unit = _signal(plan, lines, spectra)
+    command = _signal(plan, lines, to_command * spectra)
+    motion_signal = _signal(plan, lines, to_motion * spectra)
+    command_peaks = np.max(np.abs(command), axis=-1)
+    motion_peaks = np.max(np.abs(motion_signal), axis=-1)
 
     # Size: as stated, or up to the first limit.
-    unit = _signal(plan, lines, spectra)
+    unit_rms = float(np.sqrt(np.mean(unit**2)))
     if rms is not None:
-        scale = rms / float(np.sqrt(np.mean(unit**2)))
+        scale = rms / unit_rms
     else:
-        scale = 1 / max(
-            float(np.max(peaks(to_command))) / command_limit, float(np.max(peaks(to_motion))) / motion_limit
-        )
+        command_used = float(np.max(command_peaks)) / command_limit
+        motion_used = float(np.max(motion_peaks)) / motion_limit
+        scale = 1 / max(command_used, motion_used)
     levels = scale * np.array(_LEVELS)[:, None]
 
     # The lead-in rises from rest within its first half.
     ramp = np.ones(plan.n_samples)
     half = max(plan.lead_in_samples // 2, 1)
     ramp[:half] = 0.5 - 0.5 * np.cos(np.pi * np.arange(half) / half)
-    at = np.arange(-plan.lead_in_samples, plan.periods * plan.period_samples) % plan.period_samples
+    # The lead-in is the end of a period, so that the first whole one follows without a jump.
+    last_sample = plan.periods * plan.period_samples
+    at = np.arange(-plan.lead_in_samples, last_sample) % plan.period_samples
+
+    # What the logs tell: dry friction that hides small commands, and the lines where the loop is known.
     motion = look.motion
-    friction = abs(motion.friction.value) if motion is not None and motion.friction.shown else 0.0
-    told_omega = np.zeros(1) if command_response is None else command_response.omega_rad_s
-    is_inside = (omega >= told_omega[0]) & (omega <= told_omega[-1])
+    friction = 0.0
+    if motion is not None and motion.friction.shown:
+        friction = abs(motion.friction.value)
+    told_omega = np.zeros(1)
+    if command_response is not None:
+        told_omega = command_response.omega_rad_s
+    is_above_lowest = omega >= told_omega[0]
+    is_below_highest = omega <= told_omega[-1]
+    is_inside = is_above_lowest & is_below_highest
+
+    # Around the operating point of the logs.
     offsets = []
     for record in records:
-        followed = record.output if record.reference is None else record.reference
+        followed = record.output
+        if record.reference is not None:
+            followed = record.reference
         offsets.append(float(np.mean(followed)))
-    command = _signal(plan, lines, to_command * spectra)
+    command_rms = np.sqrt(np.mean(command**2, axis=-1))
     return PlannedReference(
         plan=plan,
         dt_s=dt_s,
@@ -208,10 +241,10 @@ def plan_reference(
         lines_Hz=omega / (2 * np.pi),
         references=levels[..., None] * unit[:, at] * ramp,
         offset=float(np.median(offsets)),
-        rms=levels[:, 0] * float(np.sqrt(np.mean(unit**2))),
-        command_peak=levels * peaks(to_command),
-        command_rms=levels * np.sqrt(np.mean(command**2, axis=-1)),
-        motion_peak=levels * peaks(to_motion),
+        rms=levels[:, 0] * unit_rms,
+        command_peak=levels * command_peaks,
+        command_rms=levels * command_rms,
+        motion_peak=levels * motion_peaks,
         largest_command=command_limit,
         largest_motion=motion_limit,
         friction=friction,
@@ -219,9 +252,22 @@ def plan_reference(
     )
 
 
+def _band_of(look: FirstLook, dt_s: float) -> tuple[float, float]:
+    """Two decades up to the highest frequency [Hz] that the records tell, to two digits."""
+    # A twentieth of the sampling rate where they tell none: ten samples and more in each half period.
+    highest_Hz = 0.05 / dt_s
+    if look.told_rad_s:
+        highest_Hz = look.told_rad_s[1] / (2 * np.pi)
+    lowest_Hz = highest_Hz / _HIGHEST_OVER_LOWEST
+    # Near the Nyquist frequency a held reference falls off.
+    highest_Hz = min(highest_Hz, 0.4 / dt_s)
+    return float(f"{lowest_Hz:.2g}"), float(f"{highest_Hz:.2g}")
+
+
 def _signal(plan: ExperimentPlan, lines: IntArray, amplitudes: ComplexArray) -> RealArray:
     """One period (..., N) of complex amplitudes (..., H) at its lines."""
-    spectrum = np.zeros((*amplitudes.shape[:-1], plan.period_samples // 2 + 1), dtype=np.complex128)
+    frequencies = plan.period_samples // 2 + 1
+    spectrum = np.zeros((*amplitudes.shape[:-1], frequencies), dtype=np.complex128)
     spectrum[..., lines] = amplitudes
     return np.asarray(np.fft.irfft(spectrum, plan.period_samples, axis=-1))
 
@@ -234,8 +280,12 @@ def _drawn(
     rng: np.random.Generator,
 ) -> ComplexArray:
     """Amplitudes (H,) with random phases: of the draws the one whose command, or reference, peaks least."""
-    gain = np.ones(lines.size) if np.isnan(to_command).any() else to_command
-    draws = shape * np.exp(2j * np.pi * rng.random((plan.phase_draws, lines.size)))
+    # Where the command is not known, the reference itself is to have small peaks.
+    gain = to_command
+    if np.isnan(to_command).any():
+        gain = np.ones(lines.size, dtype=np.complex128)
+    turns = rng.random((plan.phase_draws, lines.size))
+    draws = shape * np.exp(2j * np.pi * turns)
     signals = [_signal(plan, lines, gain * draw) for draw in draws]
     crests = [np.max(np.abs(signal)) / np.std(signal) for signal in signals]
     return np.asarray(draws[int(np.argmin(crests))])
@@ -244,8 +294,11 @@ def _drawn(
 def _at(response: FrequencyUncertainty, omega_rad_s: RealArray) -> ComplexArray:
     """The told response at other frequencies (H,): magnitude and phase between neighbours, larger outside."""
     known = response.omega_rad_s
-    size = np.exp(np.interp(omega_rad_s, known, np.log(np.abs(response.centre))))
-    is_outside = (omega_rad_s < known[0]) | (omega_rad_s > known[-1])
-    size[is_outside] *= _UNTOLD
-    phase = np.interp(omega_rad_s, known, np.unwrap(np.angle(response.centre)))
+    log_size = np.log(np.abs(response.centre))
+    size = np.exp(np.interp(omega_rad_s, known, log_size))
+    is_below = omega_rad_s < known[0]
+    is_above = omega_rad_s > known[-1]
+    size[is_below | is_above] *= _UNTOLD
+    known_phase = np.unwrap(np.angle(response.centre))
+    phase = np.interp(omega_rad_s, known, known_phase)
     return np.asarray(size * np.exp(1j * phase))

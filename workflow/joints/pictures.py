@@ -8,17 +8,20 @@ import numpy as np
 from control_design.plants.multivariable import tustin_s
 from control_design.plants.scaled_bound import BoundRows, scaled_bound
 from control_design.specification.multivariable import gram
+from ident.checks.validation import FreshFit
 from workflow.figures import style
 from workflow.figures.bands import Real, envelope, outline
 from workflow.figures.description import Picture, new_picture, small_multiples
 from workflow.figures.subjects import AnyRunView
 from workflow.figures.validation import draw_free_run
+from workflow.joints.results import PointModel
 
 # Lower end of a band that reaches 0, as a share of its middle: a log axis has no 0.
 _LOWEST = 1e-2
-# Smallest frequency of the singular values, over the Nyquist frequency.
+# Smallest frequency of the requirements, over the Nyquist frequency.
 _LOW = 1e-3
-
+# Share of an actuator's limit from which on its command is shown with the limit: half of the panel.
+_NEAR_LIMIT = 0.5
 
 # Weights by what the legend calls them.
 _MEANING = {
@@ -36,25 +39,40 @@ def draw_joint_steps(run: AnyRunView) -> Picture | None:
     if loop.time_s is None or loop.reference is None:
         return None
     joints = run.config.joints
+    records = run.results.records
+    # The first condition of every point is the machine as it was identified.
+    as_identified = loop.runs[0].condition
     picture, grid = new_picture(4.6, 2, len(joints), squeeze=False, sharex="col")
     for k, joint in enumerate(joints):
-        for panel, name, signal in zip(
-            grid[:, k], (joint.output, joint.input), ("output", "command"), strict=True
-        ):
-            lines = np.stack([getattr(loop_run, signal)[:, k] for loop_run in loop.runs])
-            panel.fill_between(*envelope(loop.time_s, lines), **style.ACHIEVED_BAND, label="all runs")
-            for number, (loop_run, line) in enumerate(zip(loop.runs, lines, strict=True)):
-                if loop_run.condition == loop.runs[0].condition:
-                    look = style.ACHIEVED_LINE | {"label": None if number else "as identified"}
-                    panel.plot(*outline(loop.time_s, line), **look)
-            panel.set(ylabel=style.two_lines(name, run.results.records.unit(name)))
+        output_panel, command_panel = grid[:, k]
+        outputs = np.stack([loop_run.output[:, k] for loop_run in loop.runs])
+        commands = np.stack([loop_run.command[:, k] for loop_run in loop.runs])
+        signals = (
+            (output_panel, joint.output, outputs),
+            (command_panel, joint.input, commands),
+        )
+        for panel, name, lines in signals:
+            band = envelope(loop.time_s, lines)
+            panel.fill_between(*band, **style.ACHIEVED_BAND, label="all runs")
+            for number, loop_run in enumerate(loop.runs):
+                if loop_run.condition != as_identified:
+                    continue
+                # One entry of the legend for all of these lines.
+                label = None if number else "as identified"
+                line = outline(loop.time_s, lines[number])
+                panel.plot(*line, **style.ACHIEVED_LINE, label=label)
+            panel.set(ylabel=style.two_lines(name, records.unit(name)))
+
         steps = outline(loop.time_s, loop.reference[:, k], hold=True)
-        grid[0, k].plot(*steps, **style.REFERENCE_STEPS, label="reference")
+        output_panel.plot(*steps, **style.REFERENCE_STEPS, label="reference")
+
+        # A limit that the command stays far below would only flatten the command.
         limit = joint.input_limit
-        if limit is not None and np.max(np.abs(lines)) > 0.5 * limit:
-            grid[1, k].axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
-            grid[1, k].axhline(-limit, **style.LIMIT_LINE)
-        grid[1, k].set(xlabel="time [s]")
+        largest_command = np.max(np.abs(commands))
+        if limit is not None and largest_command > _NEAR_LIMIT * limit:
+            command_panel.axhline(limit, **style.LIMIT_LINE, label="limit of the actuator")
+            command_panel.axhline(-limit, **style.LIMIT_LINE)
+        command_panel.set(xlabel="time [s]")
     return picture
 
 
@@ -62,6 +80,7 @@ def draw_joint_steps(run: AnyRunView) -> Picture | None:
 def draw_matrix_response(run: AnyRunView) -> Picture:
     """Size of every channel with its ball, one curve per operating point."""
     points = run.results.identify.points
+    records = run.results.records
     joints = run.config.joints
     n = len(joints)
     picture, grid = new_picture(2.1 * n + 0.5, n, n, squeeze=False, sharex=True)
@@ -74,24 +93,29 @@ def draw_matrix_response(run: AnyRunView) -> Picture:
                 shown = point.shown
                 size = np.abs(shown.centre[:, i, j])
                 # Every member of the ball deviates in this channel by at most that much.
-                off = (
-                    shown.radius
-                    * np.linalg.norm(shown.output_factor[i])
-                    * np.linalg.norm(shown.input_factor[:, :, j], axis=1)
-                )
+                left = np.linalg.norm(shown.output_factor[i])
+                right = np.linalg.norm(shown.input_factor[:, :, j], axis=1)
+                deviation = shown.radius * left * right
                 omega = shown.omega_rad_s
-                is_first = number == 0
                 # A log axis has no 0.
-                low = np.maximum(size - off, _LOWEST * size)
-                panel.fill_between(omega, low, size + off, **style.BAND, label="ball" if is_first else None)
-                line_label = "model, per point" if is_first else None
+                low = np.maximum(size - deviation, _LOWEST * size)
+                high = size + deviation
+                # One entry of the legend for all points.
+                band_label = None
+                line_label = None
+                if number == 0:
+                    band_label = "ball"
+                    line_label = "model, per point"
+                panel.fill_between(omega, low, high, **style.BAND, label=band_label)
                 panel.plot(omega, size, **style.MODEL_LINE, label=line_label)
                 panel.set(xlim=(omega[0], omega[-1]))
             panel.set(xscale="log", yscale="log")
-            panel.set_title(style.plain(f"{source.input} to {output.output}", 60), size=9.5)
-            unit = style.ratio_unit(
-                run.results.records.unit(output.output), run.results.records.unit(source.input)
-            )
+            channel = f"{source.input} to {output.output}"
+            panel.set_title(style.plain(channel, 60), size=9.5)
+            output_unit = records.unit(output.output)
+            input_unit = records.unit(source.input)
+            unit = style.ratio_unit(output_unit, input_unit)
+            # A column shares its frequencies, a row its outputs.
             if j == 0:
                 panel.set(ylabel=f"|G| [{style.plain(unit, 16)}]")
             if i == n - 1:
@@ -109,19 +133,33 @@ def draw_singular_values(run: AnyRunView) -> Picture:
         omega = shown.omega_rad_s
         sizes = np.linalg.svd(shown.centre, compute_uv=False)
         # Weyl: no singular value moves by more than the largest one of the deviation.
-        off = shown.radius * np.linalg.norm(shown.output_factor, 2)
-        off = off * np.linalg.norm(shown.input_factor, 2, axis=(1, 2))
-        for each, line, label in (
-            (sizes[:, 0], style.MODEL_LINE, "largest"), (sizes[:, -1], style.PREDICTED_LINE, "smallest")
-        ):  # fmt: skip
-            panel.fill_between(
-                omega, np.maximum(each - off, _LOWEST * each), each + off, **style.BAND,
-                label=None if number or label == "largest" else "over the ball",
-            )  # fmt: skip
-            panel.plot(omega, each, **line, label=None if number else label)
-    panel.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), xlabel="frequency [rad/s]")
+        left = np.linalg.norm(shown.output_factor, 2)
+        right = np.linalg.norm(shown.input_factor, 2, axis=(1, 2))
+        deviation = shown.radius * left * right
+        curves = (
+            (sizes[:, 0], style.MODEL_LINE, "largest"),
+            (sizes[:, -1], style.PREDICTED_LINE, "smallest"),
+        )
+        for size, line, label in curves:
+            # One entry of the legend for all points, and one for both bands.
+            band_label = None
+            line_label = None
+            if number == 0:
+                line_label = label
+                if label == "smallest":
+                    band_label = "over the ball"
+            # A log axis has no 0.
+            low = np.maximum(size - deviation, _LOWEST * size)
+            high = size + deviation
+            panel.fill_between(omega, low, high, **style.BAND, label=band_label)
+            panel.plot(omega, size, **line, label=line_label)
+    panel.set(xscale="log", yscale="log")
+    panel.set(xlim=(omega[0], omega[-1]), xlabel="frequency [rad/s]")
+
+    # Columns of a unit each have no common one: that of the first joint is stated.
     first = run.config.joints[0]
-    unit = style.ratio_unit(run.results.records.unit(first.output), run.results.records.unit(first.input))
+    records = run.results.records
+    unit = style.ratio_unit(records.unit(first.output), records.unit(first.input))
     panel.set(ylabel=f"singular value [{style.plain(unit, 16)}]")
     return picture
 
@@ -133,6 +171,7 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
     if law is None:
         return None
     asked = run.config.specification()
+    # Just below the Nyquist frequency, where the bilinear variable has no value.
     top = 0.999 * np.pi / law.dt_s
     omega = np.geomspace(_LOW * top, top, 300)
     s = tustin_s(omega, law.dt_s)
@@ -141,18 +180,28 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
     for point in run.results.identify.points:
         plant = point.plant(run.config.identification.gain_error)
         G, seen, entering = plant.blocks(omega, law.computational_delay_samples)
-        for name, (of, weights) in asked.weights(plant.inputs, plant.outputs).items():
+        weights_by_name = asked.weights(plant.inputs, plant.outputs)
+        for name, (weighted_signal, weights) in weights_by_name.items():
+            # Each requirement by itself: it weighs outputs or inputs, and nothing of the other.
             size = gram(weights, s)
-            none = np.zeros_like(size)
-            on_y, on_u = (size, none) if of == "y" else (none, size)
-            worst = scaled_bound(BoundRows(G, seen, entering, on_y, on_u, False), K).gamma
-            largest[name] = np.maximum(largest.get(name, np.zeros(omega.size)), worst)
+            nothing = np.zeros_like(size)
+            on_outputs = nothing
+            on_inputs = size
+            if weighted_signal == "y":
+                on_outputs = size
+                on_inputs = nothing
+            rows = BoundRows(G, seen, entering, on_outputs, on_inputs, False)
+            worst = scaled_bound(rows, K).gamma
+            before = largest.get(name, np.zeros(omega.size))
+            largest[name] = np.maximum(before, worst)
     picture, grid = new_picture(2.9, 1, 1, squeeze=False)
     panel = grid[0, 0]
     colours = (style.MODEL, style.PREDICTED, style.ACHIEVED)
     for (name, gamma), colour in zip(largest.items(), colours, strict=False):
+        # A bound that is not finite is a gap in its curve.
         finite = np.where(np.isfinite(gamma), gamma, np.nan)
-        panel.plot(omega, finite, color=colour, lw=1.4, label=_MEANING.get(name, name))
+        meaning = _MEANING.get(name, name)
+        panel.plot(omega, finite, color=colour, lw=1.4, label=meaning)
     panel.axhline(1.0, **style.LIMIT_LINE, label="stay below")
     panel.set(xscale="log", xlim=(omega[0], omega[-1]), ylim=(0, None))
     panel.set(xlabel="frequency [rad/s]")
@@ -163,18 +212,26 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
 @style.drawing("joint-validation")
 def draw_joint_validation(run: AnyRunView) -> Picture | None:
     """Every output, measured and simulated, of the record that the model meets worst of those kept back."""
-    records = [(point, fits) for point in run.results.identify.points for fits in point.fresh]
+    points = run.results.identify.points
+    records = [(point, fits) for point in points for fits in point.fresh]
     if not records:
         return None
-    point, fits = min(records, key=lambda each: min(fit.fit_percent for fit in each[1]))
+
+    def worst_fit_percent(record: tuple[PointModel, tuple[FreshFit, ...]]) -> float:
+        return min(fit.fit_percent for fit in record[1])
+
+    point, fits = min(records, key=worst_fit_percent)
     picture, grid = new_picture(4.2, 2, len(fits), squeeze=False, sharex="col", height_ratios=[1.5, 1.0])
     for k, (fit, name) in enumerate(zip(fits, point.model.output_names, strict=True)):
+        signal_panel, residual_panel = grid[:, k]
         time_s = np.asarray(np.arange(fit.residual.size) * point.model.dt_s)
+        # Two standard deviations hold 95 % of what is noise alone.
         draw_free_run(grid[:, k], time_s, fit, 2 * point.noise_std[k])
-        grid[0, k].set_title(f"{style.plain(name, 20)}: fit {fit.fit_percent:.1f} %")
+        short_name = style.plain(name, 20)
+        signal_panel.set_title(f"{short_name}: fit {fit.fit_percent:.1f} %")
         unit = run.results.records.unit(name)
-        for panel, words in zip(grid[:, k], (name, "residual"), strict=True):
-            panel.set(ylabel=style.two_lines(words, unit))
+        signal_panel.set(ylabel=style.two_lines(name, unit))
+        residual_panel.set(ylabel=style.two_lines("residual", unit))
     return picture
 
 
@@ -182,16 +239,22 @@ def draw_joint_validation(run: AnyRunView) -> Picture | None:
 def draw_mode_shapes(run: AnyRunView) -> Picture | None:
     """Which joint moves how much in each mode of the first operating point."""
     point = run.results.identify.points[0]
+    joints = run.config.joints
     shaped = [(omega, zeta, moved) for omega, zeta, moved in point.modes if moved is not None]
     # A single joint moves as its shape does.
-    if not shaped or len(run.config.joints) == 1:
+    if not shaped or len(joints) == 1:
         return None
-    picture, panels = small_multiples(len(shaped), min(len(shaped), 3), 2.1, 0.6, sharey=True)
+    joint_names = [(k, style.plain(joint.output, 16)) for k, joint in enumerate(joints)]
+    panels_in_a_row = min(len(shaped), 3)
+    picture, panels = small_multiples(len(shaped), panels_in_a_row, 2.1, 0.6, sharey=True)
     for panel, (omega, zeta, moved) in zip(panels, shaped, strict=True):
-        panel.bars(np.arange(moved.size), moved, 0.5, color=style.MODEL)
+        places = np.arange(moved.size)
+        panel.bars(places, moved, 0.5, color=style.MODEL)
         panel.axhline(0.0, color="#444444", lw=0.8)
-        panel.x.named = [(k, style.plain(joint.output, 16)) for k, joint in enumerate(run.config.joints)]
-        panel.set_title(f"{omega / (2 * np.pi):.3g} Hz, damping {zeta:.2g}", size=9.5)
+        panel.x.named = joint_names
+        frequency_Hz = omega / (2 * np.pi)
+        panel.set_title(f"{frequency_Hz:.3g} Hz, damping {zeta:.2g}", size=9.5)
+        # Shapes are scaled to a largest motion of 1.
         panel.set(ylim=(-1.15, 1.15))
     panels[0].set(ylabel="motion [largest = 1]")
     return picture

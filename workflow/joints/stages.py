@@ -19,7 +19,7 @@ from control_design.specification import SpecificationError
 from control_design.synthesis.multivariable import synthesise_multivariable
 from ident.basis.options import IdentOptions
 from ident.basis.poles import Poles
-from ident.checks.validation import fit_in_windows, fit_on_fresh_data
+from ident.checks.validation import FreshFit, fit_in_windows, fit_on_fresh_data
 from ident.closed_loop import two_stage_several
 from ident.data.finding import Finding, FindingKind, finding
 from ident.data.frequency_uncertainty import FREQUENCIES
@@ -75,13 +75,17 @@ def identify_points(stage: StageInput) -> PointModels:
         n_real=options.n_real,
         n_pairs=options.n_pairs,
     )
+    # Operating points in the order of their first record; logs without a condition are of one arm.
     items = results.records.of_role("estimation")
     names = list(dict.fromkeys(item.condition or "arm" for item in items))
     prepared: dict[tuple[str, Role], list[Record]] = {}
     for item in results.records.records:
         record = _with_later_inputs(item.record, later)
-        record = increments(record) if options.increments else record
-        prepared.setdefault((item.condition or "arm", item.role), []).append(record)
+        if options.increments:
+            record = increments(record)
+        point_name = item.condition or "arm"
+        of_point = prepared.setdefault((point_name, item.role), [])
+        of_point.append(record)
     # A free run of joints that turn freely drifts away, that of differences does not.
     again = fit_on_fresh_data if options.increments else fit_in_windows
     points: list[PointModel] = []
@@ -95,6 +99,7 @@ def identify_points(stage: StageInput) -> PointModels:
         fresh = prepared.get((name, "validation"), [])
         remarks: tuple[Finding, ...] = ()
         with naming(f"operating point {name!r}"):
+            # Records of a loop: the feedback's noise is in their commands, the reference is free of it.
             if any(record.reference is not None for record in records):
                 stages = two_stage_several(records, asked, start=start, progress=report)
                 assert stages.plant is not None
@@ -103,30 +108,36 @@ def identify_points(stage: StageInput) -> PointModels:
                 remarks = stages.finding, *stages.warnings
             identified = identify_mimo(records, asked, start=start, progress=report)
             ball = matrix_posterior(records, identified, level=options.level)
-            outputs = list(enumerate(identified.model.outputs))
-            fits = [
-                tuple(again(output_model, record.only(k)) for k, output_model in outputs) for record in fresh
-            ]
-            remarks += tuple(
-                finding(
-                    FindingKind.NO_ANSWER_THERE, record=f"{fit.name}, {output}", fit_percent=fit.fit_percent
-                )
-                for fits_of_record in fits
-                for fit, output in zip(fits_of_record, identified.model.output_names, strict=True)
-                if not fit.answers
-            )
+            model = identified.model
+
+            # Records that were kept back, output by output; one that the model says nothing about is named.
+            outputs = list(enumerate(model.outputs))
+            fits: list[tuple[FreshFit, ...]] = []
+            for record in fresh:
+                fits_of_record = tuple(again(output_model, record.only(k)) for k, output_model in outputs)
+                fits.append(fits_of_record)
+                for fit, output in zip(fits_of_record, model.output_names, strict=True):
+                    if not fit.answers:
+                        where = f"{fit.name}, {output}"
+                        no_answer = finding(
+                            FindingKind.NO_ANSWER_THERE, record=where, fit_percent=fit.fit_percent
+                        )
+                        remarks = (*remarks, no_answer)
             # A colour of the noise is the ball's own.
-            remarks += tuple(
-                item for item in identified.warnings if item.kind is not FindingKind.COLOURED_RESIDUAL
-            )
+            for warning in identified.warnings:
+                if warning.kind is not FindingKind.COLOURED_RESIDUAL:
+                    remarks = (*remarks, warning)
+
+            # The ball as pictures and the design see it: just below the Nyquist frequency it still exists.
             low = options.lowest_rad_s
-            shown = ball.at(np.geomspace(low, 0.999 * (np.pi / identified.model.dt_s), FREQUENCIES))
+            high = 0.999 * (np.pi / model.dt_s)
+            shown = ball.at(np.geomspace(low, high, FREQUENCIES))
             noise_std = np.sqrt(np.diag(identified.noise_covariance))
             Li_a, Li_b, Li_c, Li_d = ball.input_factor(low)
             points.append(
                 PointModel(
                     name=name,
-                    model=identified.model,
+                    model=model,
                     noise_std=noise_std,
                     fit_percent=identified.output_fit_percent,
                     rank_one=identified.rank_one,
@@ -142,7 +153,7 @@ def identify_points(stage: StageInput) -> PointModels:
                     fresh=tuple(fits),
                 )
             )
-        start = identified.model.poles
+        start = model.poles
     return PointModels(tuple(points))
 
 
@@ -170,9 +181,12 @@ def design_joints(stage: StageInput) -> DesignResult:
             )
         except SpecificationError as impossible:
             return DesignResult(None, met=False, reason=str(impossible))
+    # The requirement that is nearest to its limit, or beyond it, is the active constraint.
     blocking = synthesis.blocking[0]
     joint = config.joints[blocking.joint or 0]
-    signal = joint.input if blocking.weight == "effort" else joint.output
+    signal = joint.output
+    if blocking.weight == "effort":
+        signal = joint.input
     reason = (
         f"worst case {synthesis.gamma:.3f} (at most 1 is needed), of {blocking.weight} of "
         f"{signal}, {blocking.plant}, at {blocking.omega_rad_s:.3g} rad/s"
@@ -205,12 +219,18 @@ def run_loops(stage: StageInput) -> JointsLoopResult:
     if law is None:
         return JointsLoopResult(skipped=results.design.reason)
     # Twenty time constants of the slowest joint, unless a time is stated.
-    bandwidth = min((joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s), default=1.0)
-    duration_s = config.closed_loop.duration_s or 20.0 / bandwidth
+    bandwidths = [joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s]
+    bandwidth_rad_s = min(bandwidths, default=1.0)
+    duration_s = config.closed_loop.duration_s or 20.0 / bandwidth_rad_s
     samples = int(np.ceil(duration_s / law.dt_s))
-    step = np.array(config.closed_loop.step or (0.1,) * len(config.joints))
+
+    # A twentieth at rest shows what the loop does without a step.
+    step_sizes = config.closed_loop.step or (0.1,) * len(config.joints)
+    step = np.array(step_sizes)
     reference = np.tile(step, (samples, 1))
     reference[: samples // 20] = 0.0
+
+    # Every operating point as identified, then under each further condition.
     runs: list[JointsRun] = []
     machines = _machines(config, results, stage)
     for number, (point, condition, machine) in enumerate(machines):
@@ -228,13 +248,25 @@ def _judged(
     point: str, condition: str, output: Real, command: Real, step: Real, law: Controller
 ) -> JointsRun:
     """A run with what is read off it. output (T, Y) on a step (Y,), command (T, U)."""
-    late = output[-max(1, len(output) // 20) :]
     # A joint that is to rest is judged by the largest step of the others.
-    size = np.where(step, np.abs(step), np.max(np.abs(step)))
-    settled = bool(np.all(np.isfinite(output)) and np.all(np.abs(late - step) < SETTLED * size))
+    step_size = np.abs(step)
+    size = np.where(step, step_size, np.max(step_size))
+
+    # Settled: the last twentieth stays near the step; an unstable run has no finite end.
+    last_samples = max(1, len(output) // 20)
+    late = output[-last_samples:]
+    error = np.abs(late - step)
+    is_finite = np.all(np.isfinite(output))
+    settled = bool(is_finite and np.all(error < SETTLED * size))
+
+    # Beyond the step in its own direction.
     direction = np.where(step < 0, -1.0, 1.0)
-    overshoot = np.max(direction * (output - step) / size, axis=0)
-    at_limit = np.any(np.abs(command) >= law.limits("input_limit") * (1 - 1e-9), axis=1)
+    beyond = direction * (output - step)
+    overshoot = np.max(beyond / size, axis=0)
+
+    # Limits to the last digits: a limited command stands at its limit but for rounding.
+    limits = law.limits("input_limit") * (1 - 1e-9)
+    at_limit = np.any(np.abs(command) >= limits, axis=1)
     return JointsRun(
         point=point,
         condition=condition,
@@ -259,14 +291,20 @@ def _machines(
         ]
     machines: list[tuple[str, str, Callable[[], Any]]] = []
     for point in source.points:
-        at = partial(machine_at, source, point, stage.rng("closed_loop", point.name))
-        machines.append((point.name, "as identified", partial(at, coulomb_Nm=source.coulomb_Nm)))
-        for extra in options.extra_payload_kg:
-            words = f"payload {point.payload_kg + extra:g} kg"
-            machines.append((point.name, words, partial(at, coulomb_Nm=source.coulomb_Nm, extra_kg=extra)))
+        # One stream for all machines of a point: further conditions leave the noise of the first as it is.
+        rng = stage.rng("closed_loop", point.name)
+        at_point = partial(machine_at, source, point, rng)
+        as_identified = partial(at_point, coulomb_Nm=source.coulomb_Nm)
+        machines.append((point.name, "as identified", as_identified))
+        for extra_kg in options.extra_payload_kg:
+            payload_kg = point.payload_kg + extra_kg
+            loaded = partial(as_identified, extra_kg=extra_kg)
+            machines.append((point.name, f"payload {payload_kg:g} kg", loaded))
         if options.coulomb_Nm is not None:
-            words = f"dry friction {options.coulomb_Nm[0]:g} and {options.coulomb_Nm[1]:g} N m"
-            machines.append((point.name, words, partial(at, coulomb_Nm=options.coulomb_Nm)))
+            shoulder_Nm, elbow_Nm = options.coulomb_Nm
+            condition = f"dry friction {shoulder_Nm:g} and {elbow_Nm:g} N m"
+            with_friction = partial(at_point, coulomb_Nm=options.coulomb_Nm)
+            machines.append((point.name, condition, with_friction))
     return machines
 
 

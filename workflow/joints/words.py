@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from markupsafe import Markup
 
@@ -78,18 +78,18 @@ def joints_numbers(
         points = count(len(models.points), "operating point")
         gamma = Quantity(at_most(certificate.gamma, 4), codec.plain(certificate.gamma))
         rows.append(Row("", "worst case", gamma, f"over {points}; needed: 1 or less"))
-        sensors = min(verdict.output_disk.gain for verdict in certificate.verdicts)
-        actuators = min(verdict.input_disk.gain for verdict in certificate.verdicts)
-        for name, gain in (("sensors", sensors), ("actuators", actuators)):
+        # The weakest operating point counts, of sensors and of actuators by itself.
+        verdicts = certificate.verdicts
+        gains = {
+            "sensors": min(verdict.output_disk.gain for verdict in verdicts),
+            "actuators": min(verdict.input_disk.gain for verdict in verdicts),
+        }
+        for name, gain in gains.items():
+            key = f"certificate.gain_at_{name}"
             value = Quantity(f"× {at_least(gain)}", codec.plain(gain))
-            rows.append(
-                Row(
-                    f"certificate.gain_at_{name}",
-                    f"gain at the {name}",
-                    value,
-                    "tolerated in all at once, up or down",
-                )
-            )
+            rows.append(Row(key, f"gain at the {name}", value, "tolerated in all at once, up or down"))
+
+    # The largest overshoot of any joint in any run; nothing where no loop ran.
     settled, total = loop.settled_points()
     if not total:
         return tuple(rows)
@@ -100,18 +100,20 @@ def joints_numbers(
             if overshoot > largest:
                 largest = overshoot
                 place = f"{joint.output} at {run.point}, {run.condition}"
-    rows.append(
-        Row(
-            "closed_loop.overshoot_percent",
-            "overshoot",
-            Quantity.of(100 * largest, "%"),
-            f"largest, of {place}",
-        )
-    )
-    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
+    overshoot_percent = Quantity.of(100 * largest, "%")
+    largest_at = f"largest, of {place}"
+    rows.append(Row("closed_loop.overshoot_percent", "overshoot", overshoot_percent, largest_at))
     settles = Quantity(f"{settled} of {total}", settled)
-    rows.append(Row("closed_loop.settled_points", "settles", settles, f"operating points, {arm}"))
+    ran_on = f"operating points, {_machine_words(loop)}"
+    rows.append(Row("closed_loop.settled_points", "settles", settles, ran_on))
     return tuple(rows)
+
+
+def _machine_words(loop: JointsLoopResult) -> str:
+    """What the loop ran on: the simulated arm where there is one."""
+    if loop.machine == "simulated":
+        return "on the nonlinear arm"
+    return "on the identified models"
 
 
 def fit_row(models: PointModels, config: JointsConfig) -> Row:
@@ -120,53 +122,73 @@ def fit_row(models: PointModels, config: JointsConfig) -> Row:
     for index, joint in enumerate(config.joints):
         worst = [point.fit_percent.min(axis=0)[index] for point in models.points]
         parts.append(f"{extent(worst, 3)} % ({joint.output})")
-    of = ", of the increments" if config.identification.increments else ""
-    return worded("fit", ", ".join(parts) + of)
+    of_what = ""
+    if config.identification.increments:
+        of_what = ", of the increments"
+    all_parts = ", ".join(parts)
+    return worded("fit", f"{all_parts}{of_what}")
 
 
 def models_section(models: PointModels, config: JointsConfig) -> Section:
     """Every model with its fits, warnings, and the modes of the first."""
-    of = " of the increments" if config.identification.increments else ""
+    of_what = ""
+    if config.identification.increments:
+        of_what = " of the increments"
+
+    # Fits of the records that were fitted, the worst of each output, then of those that were kept back.
     rows = []
     for point in models.points:
-        fits = ", ".join(percent(fit) for fit in point.fit_percent.min(axis=0).tolist())
-        rows.append(worded(point.name, f"{count(point.states, 'state')}, fit {fits}{of}"))
+        worst_fits = point.fit_percent.min(axis=0).tolist()
+        fits = ", ".join(percent(fit) for fit in worst_fits)
+        states = count(point.states, "state")
+        rows.append(worded(point.name, f"{states}, fit {fits}{of_what}"))
     for point in models.points:
         for fresh in point.fresh:
             fits = ", ".join(percent(fit.fit_percent) for fit in fresh)
             rows.append(worded("kept back", f"{fresh[0].name}: fit {fits}"))
     for point in models.points:
-        rows += [worded("warning", f"{point.name}: {words(item)}") for item in point.warnings]
+        for warning in point.warnings:
+            rows.append(worded("warning", f"{point.name}: {words(warning)}"))
+
+    # Modes move little between operating points: those of the first stand for all.
     for omega_rad_s, zeta, moved in models.points[0].modes:
         if moved is None:
             continue
-        motion = ", ".join(
-            f"{joint.output} {number(size, 2)}"
-            for joint, size in zip(config.joints, moved.tolist(), strict=True)
-        )
-        rows.append(worded("mode", f"{number(hertz(omega_rad_s))} Hz, damping {number(zeta, 2)}: {motion}"))
+        sizes = [number(size, 2) for size in moved.tolist()]
+        joint_names = [joint.output for joint in config.joints]
+        moves = [f"{name} {size}" for name, size in zip(joint_names, sizes, strict=True)]
+        motion = ", ".join(moves)
+        frequency_Hz = number(hertz(omega_rad_s))
+        rows.append(worded("mode", f"{frequency_Hz} Hz, damping {number(zeta, 2)}: {motion}"))
     return Section("model", tuple(rows))
 
 
 def joints_certificate_section(certify: JointsCertificate) -> Section:
     """Worst case at every operating point, and the loop at its limits."""
     rows: list[Row] = []
-    for plant in () if certify.certificate is None else certify.certificate.verdicts:
+    if certify.certificate is None:
+        return Section("certificate", ())
+    for plant in certify.certificate.verdicts:
         if not plant.stable:
             text = "unstable"
         elif plant.obstacle:
             text = plant.obstacle
         else:
+            worst_case = number(max(plant.bounds.values()))
+            gain = number(plant.output_disk.gain)
             text = (
-                f"at most {number(max(plant.bounds.values()))} at all frequencies; gains at the sensors may "
-                f"change by {number(plant.output_disk.gain)} at once"
+                f"at most {worst_case} at all frequencies; gains at the sensors may change by {gain} at once"
             )
         rows.append(worded(plant.plant, text))
-        if plant.limited is not None and plant.limited.steps:
-            met = "met" if plant.limited.ends else "NOT met"
-            away = (
-                f"{at_most(100 * plant.limited.worst, 3)} % away from where it must end (at most 2 %): {met}"
-            )
+
+        # A loop that never meets its limits has no end to look at.
+        limited = plant.limited
+        if limited is not None and limited.steps:
+            met = "NOT met"
+            if limited.ends:
+                met = "met"
+            away_percent = at_most(100 * limited.worst, 3)
+            away = f"{away_percent} % away from where it must end (at most 2 %): {met}"
             rows.append(worded(f"{plant.plant}, at the limits", away))
     return Section("certificate", tuple(rows))
 
@@ -176,17 +198,19 @@ def joints_loop_section(loop: JointsLoopResult) -> Section:
     if loop.skipped:
         return Section("closed loop", (worded("not run", loop.skipped),))
     settled, points = loop.settled_points()
-    runs = sum(run.settled for run in loop.runs)
-    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
-    text = (
-        f"at {settled} of {count(points, 'operating point')}, {runs} of {count(len(loop.runs), 'run')}, {arm}"
-    )
+    of_points = count(points, "operating point")
+    settled_runs = sum(run.settled for run in loop.runs)
+    of_runs = count(len(loop.runs), "run")
+    machine = _machine_words(loop)
+    text = f"at {settled} of {of_points}, {settled_runs} of {of_runs}, {machine}"
     return Section("closed loop", (worded("settles", text),))
 
 
 def joints_design_section(design: DesignResult, files: str) -> Section:
     """Outcome of the design; files: columns and units of the controller's, where they are not plain."""
-    return Section("design", said(worded("worst case", design.reason), worded("controller files", files)))
+    outcome = worded("worst case", design.reason)
+    columns = worded("controller files", files)
+    return Section("design", said(outcome, columns))
 
 
 def joints_first_screen(view: AnyRunView) -> FirstScreen:
@@ -204,17 +228,20 @@ def joints_first_screen(view: AnyRunView) -> FirstScreen:
             "The controller's files take and give the columns as logged, this page does not. "
             f"{sentence(view.signals)}"
         )
+
+    # What is wrong comes before what is right: no proof, no rest, a limit that is met often.
     if certificate is not None:
-        bullets += [f"{plant.plant}: {plant.obstacle}" for plant in certificate.verdicts if plant.obstacle]
+        for plant in certificate.verdicts:
+            if plant.obstacle:
+                bullets.append(f"{plant.plant}: {plant.obstacle}")
         for run in loop.runs:
             if not run.settled:
                 bullets.append(f"{run.point}, {run.condition}: the loop does not settle.")
         for run in loop.runs:
             if run.limited > _OFTEN_LIMITED:
-                bullets.append(
-                    f"{run.point}, {run.condition}: an actuator is at its limit for {share(run.limited)} of "
-                    "the time."
-                )
+                where = f"{run.point}, {run.condition}"
+                limited = share(run.limited)
+                bullets.append(f"{where}: an actuator is at its limit for {limited} of the time.")
     if holds:
         level = share(config.identification.level)
         of = count(len(models.points), "operating point")
@@ -223,16 +250,17 @@ def joints_first_screen(view: AnyRunView) -> FirstScreen:
     if not all(point.shaped for point in models.points):
         bullets.append("Not every mode has one shape; a mode without one has more than two states.")
     headline = "Certified: every requirement is met"
+    look: Literal["certified", "refused"] = "certified"
     if not holds:
-        headline = sentence(joints_verdict(results.design, results.certify, settled, points))[:-1]
-    arm = "on the nonlinear arm" if loop.machine == "simulated" else "on the identified models"
-    picture = Picture(
-        "joint-steps",
-        f"A step of all joints at once: {arm}, at every operating point and under every condition.",
-        (view,),
-    )
+        # A headline has no full stop.
+        verdict = joints_verdict(results.design, results.certify, settled, points)
+        headline = sentence(verdict)[:-1]
+        look = "refused"
+    machine = _machine_words(loop)
+    caption = f"A step of all joints at once: {machine}, at every operating point and under every condition."
+    picture = Picture("joint-steps", caption, (view,))
     rows = joints_numbers(models, results.certify, loop, config)
-    return FirstScreen(headline, "certified" if holds else "refused", rows, tuple(bullets), picture)
+    return FirstScreen(headline, look, rows, tuple(bullets), picture)
 
 
 def joints_pages(view: AnyRunView) -> list[PageSection]:
@@ -250,18 +278,21 @@ def joints_pages(view: AnyRunView) -> list[PageSection]:
     ]
     certificate = results.certify.certificate
     if certificate is not None:
-        rows = tuple(
-            (
+        rows = []
+        for plant in certificate.verdicts:
+            is_met = "no"
+            if plant.met:
+                is_met = "yes"
+            cells = (
                 plant.plant,
                 number(max(plant.worst.values()), 4),
                 number(max(plant.bounds.values()), 4),
                 number(plant.stability_radius),
                 number(plant.output_disk.gain),
                 number(plant.input_disk.gain),
-                "yes" if plant.met else "no",
+                is_met,
             )
-            for plant in certificate.verdicts
-        )
+            rows.append(cells)
         head = (
             "operating point",
             "worst case on the grid",
@@ -271,21 +302,21 @@ def joints_pages(view: AnyRunView) -> list[PageSection]:
             "gain at actuators",
             "specification met",
         )
-        blocks.append(Table(head, rows, met=tuple(plant.met for plant in certificate.verdicts)))
+        met = tuple(plant.met for plant in certificate.verdicts)
+        blocks.append(Table(head, tuple(rows), met=met))
+
+    # Every run of the loop; a joint that stays below its step has no overshoot.
     runs = results.closed_loop.runs
-    of_runs = tuple(
-        (
-            run.point,
-            run.condition,
-            *(percent(overshoot) for overshoot in (100 * run.overshoot).clip(0).tolist()),
-            share(run.limited),
-            yes_no(run.settled),
-        )
-        for run in runs
-    )
-    overshoots = (f"overshoot of {name}" for name in names)
-    loop_head = ("operating point", "condition", *overshoots, "at a limit", "settles")
-    loop_table = Table(loop_head, of_runs, met=tuple(run.settled for run in runs))
+    rows_of_runs = []
+    for run in runs:
+        overshoot_percent = (100 * run.overshoot).clip(0).tolist()
+        overshoots = [percent(overshoot) for overshoot in overshoot_percent]
+        at_limit = share(run.limited)
+        rows_of_runs.append((run.point, run.condition, *overshoots, at_limit, yes_no(run.settled)))
+    overshoot_heads = [f"overshoot of {name}" for name in names]
+    loop_head = ("operating point", "condition", *overshoot_heads, "at a limit", "settles")
+    settled = tuple(run.settled for run in runs)
+    loop_table = Table(loop_head, tuple(rows_of_runs), met=settled)
     return [
         PageSection("requirements", "Requirements", "Requirements", tuple(blocks)),
         PageSection("loop", "Closed loop", "Loop", (loop_table,)),
@@ -315,6 +346,7 @@ def _model_blocks(view: AnyRunView, names: Sequence[str]) -> list[Block]:
         ),
         Picture("mode-shapes", f"Modes of {models[0].name}: how much each joint moves.", (view,)),
     ]
+    # Who knows fits of signals would take this one for a bad one.
     if increments:
         blocks.append(
             Text(
@@ -327,20 +359,24 @@ def _model_blocks(view: AnyRunView, names: Sequence[str]) -> list[Block]:
     if kept_back:
         head.append("fit of records kept back")
     head += [f"noise of {name}" for name in names]
+    units = [view.results.records.unit(name) for name in names]
     rows = []
     for point in models:
         cells: list[object] = [point.name, point.states]
-        cells += [percent(fit) for fit in point.fit_percent.min(axis=0).tolist()]
+        worst_fits = point.fit_percent.min(axis=0).tolist()
+        cells += [percent(fit) for fit in worst_fits]
         if kept_back:
             fits = [fit.fit_percent for record in point.fresh for fit in record]
-            cells.append(percent(min(fits)) if fits else "none")
-        cells += [
-            si(noise, view.results.records.unit(name))
-            for noise, name in zip(point.noise_std, names, strict=False)
-        ]
+            worst_kept_back = "none"
+            if fits:
+                worst_kept_back = percent(min(fits))
+            cells.append(worst_kept_back)
+        cells += [si(noise, unit) for noise, unit in zip(point.noise_std, units, strict=False)]
         rows.append(tuple(cells))
     blocks.append(Table(tuple(head), tuple(rows)))
-    how = ", in differences between samples" if increments else ""
+    how = ""
+    if increments:
+        how = ", in differences between samples"
     blocks.append(
         Picture(
             "joint-validation",

@@ -41,32 +41,52 @@ def look(
     ------
     InputError
     """
-    storage.refuse_in_the_way([log], [] if out is None else [("--out", out)])
+    # A page never replaces the log that it is of.
+    written = []
+    if out is not None:
+        written.append(("--out", out))
+    storage.refuse_in_the_way([log], written)
     log_look = look_at(log, time, time_unit, decimal)
     command = _next(log_look, options_typed(time_unit, decimal))
     if out is not None:
         # It loads all that draws, which takes a second.
         from workflow.report.rendering import render_described
 
-        storage.write_text(out, render_described(look_page(log_look, command)).html)
-    columns = {
-        column.name: {
+        page = render_described(look_page(log_look, command))
+        storage.write_text(out, page.html)
+
+    # The answer for programs; a column without numbers has no range, and says why.
+    columns = {}
+    for column in log_look.columns:
+        lowest = None
+        highest = None
+        if column.values is not None:
+            lowest = float(column.values.min())
+            highest = float(column.values.max())
+        columns[column.name] = {
             "unit": column.unit,
             "refused": column.why,
-            "lowest": None if column.values is None else float(column.values.min()),
-            "highest": None if column.values is None else float(column.values.max()),
+            "lowest": lowest,
+            "highest": highest,
             "clipped_share": column.clipped,
             "step": column.step,
         }
-        for column in log_look.columns
+    numbers = {
+        "rows": codec.plain(log_look.rows),
+        "layout": codec.plain(log_look.layout),
+        "time": codec.plain(log_look.time),
+        "response": codec.plain(log_look.response),
+        "columns": columns,
     }
-    parts = {name: codec.plain(getattr(log_look, name)) for name in ("rows", "layout", "time", "response")}
+    report_path = None
+    if out is not None:
+        report_path = str(out)
     return RunSummary(
         title=str(log),
         sections=look_sections(log_look),
-        numbers=parts | {"columns": columns},
+        numbers=numbers,
         verdict=command,
-        report_path=None if out is None else str(out),
+        report_path=report_path,
     )
 
 
@@ -80,30 +100,36 @@ def _next(log_look: LogLook, options: Sequence[str]) -> str:
         return _after_response(log_look.response, path_as_typed(log_look.path))
     if log_look.roles is None:
         return log_look.unclear
+
+    # What has to be done to the file before any command reads it.
     roles = log_look.roles
+    time = log_look.time
     used = log_look.taken_as.values()
     why = [column.why for column in log_look.columns if column.name in used and column.values is None]
-    if log_look.time and log_look.time.why:
-        why.append(log_look.time.why)
-    elif log_look.time and log_look.time.option == "split":
-        missing = log_look.time.missing
-        why.append(f"{log_look.time.gap_place}: {missing} rows are missing, split the file there")
+    if time and time.why:
+        why.append(time.why)
+    elif time and time.option == "split":
+        why.append(f"{time.gap_place}: {time.missing} rows are missing, split the file there")
     if why:
         return f"{log_look.path}, {why[0]}"
     doubted = [str(doubt.values["options"]) for doubt in log_look.doubts if "options" in doubt.values]
     # A log made in a loop needs more than one channel's model: `run` tells which way is right.
     if roles.reference or roles.doubts:
         return " ".join(["flexlink run", log, *doubted, "--out runs/arm"])
+
+    # One channel: every column by its name, and an option for each doubt that has one.
     named = {"--input": roles.input, "--output": roles.output, "--time": roles.time}
     typed = [f"{option} {as_typed(name)}" for option, name in named.items() if name]
     if not roles.time:
         typed.append("--dt-s SECONDS")
-    if log_look.time and log_look.time.option.startswith("--"):
-        typed.append(log_look.time.option)
+    if time and time.option.startswith("--"):
+        typed.append(time.option)
     for doubt in log_look.doubts:
         if doubt.kind is FindingKind.WRAPS and doubt.values["name"] == roles.output:
+            # Every digit: a turn that is a little off would add up.
             period = f"{doubt.values['period']:.17g}"
-            typed.append(f"--unwrap {as_typed(f'{roles.output}={period}')}")
+            column_and_period = as_typed(f"{roles.output}={period}")
+            typed.append(f"--unwrap {column_and_period}")
     return " ".join(["flexlink identify", log, *typed, *doubted])
 
 

@@ -22,7 +22,9 @@ from workflow.look.log_look import ColumnLook, LogLook, ResponseLook, TimeLook
 from workflow.text.findings.sentences import words as finding_words
 from workflow.text.formats import count, number, share as percentage, si, sparkline
 
+# Separators of a text table, as they are called.
 _SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", " ": "blanks", "|": "bars"}
+# Units of time stamps in full.
 _TIME_UNITS = {
     "s": "seconds",
     "ms": "milliseconds",
@@ -35,13 +37,18 @@ _TIME_UNITS = {
 
 def layout_words(layout: Layout) -> str:
     """How a text file is laid out."""
-    decimal = "point" if layout.decimal == "." else "comma"
-    names = f"names in line {layout.header}" if layout.header else "no line of names"
-    units = ", a line of units" if layout.units else ""
-    return (
-        f"separated by {_SEPARATORS[layout.separator]}, decimal {decimal}, {names}{units}, numbers from line "
-        f"{layout.first}"
-    )
+    separator = _SEPARATORS[layout.separator]
+    decimal = "comma"
+    if layout.decimal == ".":
+        decimal = "point"
+    names = "no line of names"
+    if layout.header:
+        names = f"names in line {layout.header}"
+    units = ""
+    if layout.units:
+        units = ", a line of units"
+    numbers = f"numbers from line {layout.first}"
+    return f"separated by {separator}, decimal {decimal}, {names}{units}, {numbers}"
 
 
 def sampling_words(time: TimeLook) -> str:
@@ -50,11 +57,18 @@ def sampling_words(time: TimeLook) -> str:
         return f"not usable: {time.why}"
     runs = ""
     if time.runs:
-        runs = (
-            f"{count(len(time.runs), 'run')} ({time.runs[0]} to {time.runs[-1]}), each a record of its own; "
-        )
-    period = si(1000 * time.period_s, "ms", 5) if time.period_s < 1 else si(time.period_s, "s", 5)
+        how_many = count(len(time.runs), "run")
+        first = time.runs[0]
+        last = time.runs[-1]
+        runs = f"{how_many} ({first} to {last}), each a record of its own; "
+    # Five digits: a period that is a little off the nominal one is worth a look.
+    period = si(time.period_s, "s", 5)
+    if time.period_s < 1:
+        period = si(1000 * time.period_s, "ms", 5)
+    rate = si(1 / time.period_s, "Hz", 5)
+    unit = _TIME_UNITS[time.unit]
 
+    # Stamps that are rounded stray by that alone, which is no jitter of the clock.
     jitter = f"jitter {percentage(time.jitter, 2)} of a step"
     if time.rounded:
         jitter = "stamps rounded to their last digit"
@@ -64,7 +78,8 @@ def sampling_words(time: TimeLook) -> str:
     missing = "no row missing"
     if time.missing:
         rows = count(time.missing, "row")
-        missing = f"{rows} missing, the largest step {si(time.gap_s, 's')} at {time.gap_place}"
+        gap = si(time.gap_s, "s")
+        missing = f"{rows} missing, the largest step {gap} at {time.gap_place}"
     elif time.jitter > LARGEST_JITTER:
         missing = "on no uniform grid"
 
@@ -73,10 +88,7 @@ def sampling_words(time: TimeLook) -> str:
         advice = ": split the file there"
     elif time.option:
         advice = f": flexlink run takes that by itself, identify with {time.option}"
-    return (
-        f"{runs}every {period} ({si(1 / time.period_s, 'Hz', 5)}), read in {_TIME_UNITS[time.unit]}; "
-        f"{jitter}; {missing}{advice}"
-    )
+    return f"{runs}every {period} ({rate}), read in {unit}; {jitter}; {missing}{advice}"
 
 
 def response_words(response: ResponseLook) -> str:
@@ -88,18 +100,19 @@ def response_words(response: ResponseLook) -> str:
         spread = "with variances"
     elif response.points == response.frequencies:
         spread = "one sweep, so its spread is not known"
+    points = count(response.points, "point")
     frequencies = count(response.frequencies, "frequency", "frequencies")
-    return (
-        f"{count(response.points, 'point')} at {frequencies}, {number(response.low_Hz, 4)} to "
-        f"{si(response.high_Hz, 'Hz', 4)}; {spread}"
-    )
+    lowest = number(response.low_Hz, 4)
+    highest = si(response.high_Hz, "Hz", 4)
+    return f"{points} at {frequencies}, {lowest} to {highest}; {spread}"
 
 
 def signal_words(column: ColumnLook) -> str:
     """Range, resolution and limits of a column, or why it holds no numbers."""
     if column.values is None:
         return column.why
-    low, high = column.values.min(), column.values.max()
+    low = column.values.min()
+    high = column.values.max()
     words = f"{number(low, 4)} to {si(high, column.unit, 4)}"
     if not column.unit:
         words += " (no unit in the name)"
@@ -113,31 +126,33 @@ def signal_words(column: ColumnLook) -> str:
     return words
 
 
-def was_in_closed_loop(found: LogLook) -> bool:
+def was_in_closed_loop(log_look: LogLook) -> bool:
     """Whether the log has a reference or leaves doubts: all logs of the machine are asked for then."""
-    return found.roles is not None and bool(found.roles.reference or found.roles.doubts)
+    return log_look.roles is not None and bool(log_look.roles.reference or log_look.roles.doubts)
 
 
-def look_sections(found: LogLook) -> list[Section]:
+def look_sections(log_look: LogLook) -> list[Section]:
     """Rows of a terminal."""
-    file = [_said("rows", str(found.rows))]
-    if found.layout is not None:
-        file.append(_said("layout", layout_words(found.layout)))
-    title = "frequency response" if found.response else "time"
-    taken = [_said(role, name) for role, name in found.taken_as.items()]
-    doubts = [_said(str(k), finding_words(doubt)) for k, doubt in enumerate(found.doubts, 1)]
+    file = [_said("rows", str(log_look.rows))]
+    if log_look.layout is not None:
+        file.append(_said("layout", layout_words(log_look.layout)))
+    title = "time"
+    if log_look.response:
+        title = "frequency response"
+    taken = [_said(role, name) for role, name in log_look.taken_as.items()]
+    doubts = [_said(str(k), finding_words(doubt)) for k, doubt in enumerate(log_look.doubts, 1)]
     next_rows: tuple[Row, ...] = ()
-    if found.taken_as and was_in_closed_loop(found):
+    if log_look.taken_as and was_in_closed_loop(log_look):
         advice = (
             "give flexlink run all logs of the machine: the last one validates, and one alone may hide a mode"
         )
         next_rows = (_said("logs", advice),)
     sections = [
         Section("file", tuple(file)),
-        Section(title, (_time_row(found),)),
+        Section(title, (_time_row(log_look),)),
         Section("doubts", tuple(doubts)),
         Section("taken as", tuple(taken)),
-        Section("signals", tuple(_signal_rows(found))),
+        Section("signals", tuple(_signal_rows(log_look))),
         Section("next", next_rows),
     ]
     return [section for section in sections if section.rows]
@@ -147,63 +162,65 @@ def _said(name: str, words: str) -> Row:
     return Row("", name, Quantity.words(words))
 
 
-def _time_row(found: LogLook) -> Row:
-    if found.response is not None:
-        return _said("points", response_words(found.response))
-    if found.time is None:
+def _time_row(log_look: LogLook) -> Row:
+    if log_look.response is not None:
+        return _said("points", response_words(log_look.response))
+    if log_look.time is None:
         return _said(
             "none", "no column looks like time: name it with --time, or state --dt-s in flexlink identify"
         )
-    return _said(found.time.name, sampling_words(found.time))
+    return _said(log_look.time.name, sampling_words(log_look.time))
 
 
-def _signal_rows(found: LogLook) -> Iterator[Row]:
+def _signal_rows(log_look: LogLook) -> Iterator[Row]:
     """Every column in words, and as a curve of bars."""
-    for column in found.columns:
+    for column in log_look.columns:
         yield _said(column.name, signal_words(column))
-        bars = "" if column.values is None else sparkline(column.values.tolist())
+        if column.values is None:
+            continue
+        # A column that stands still has no curve.
+        bars = sparkline(column.values.tolist())
         if bars:
             yield _said("", bars)
 
 
-def look_page(found: LogLook, next_command: str) -> Page:
+def look_page(log_look: LogLook, next_command: str) -> Page:
     """The page of a log. next_command: what to type now, or what has to be done before."""
-    if found.response is not None:
-        time = f"Frequency response: {response_words(found.response)}"
-    elif found.time is None:
+    if log_look.response is not None:
+        time = f"Frequency response: {response_words(log_look.response)}"
+    elif log_look.time is None:
         time = "Time: no column looks like it"
     else:
-        time = f"Time: {found.time.name}, {sampling_words(found.time)}"
-    bullets = [_onward(found, next_command)]
-    bullets += [f"Doubt: {finding_words(doubt)}" for doubt in found.doubts]
+        time = f"Time: {log_look.time.name}, {sampling_words(log_look.time)}"
+    bullets = [_onward(log_look, next_command)]
+    bullets += [f"Doubt: {finding_words(doubt)}" for doubt in log_look.doubts]
     bullets.append(time)
-    if found.layout is not None:
-        bullets.append(f"Layout: {layout_words(found.layout)}")
-    if found.taken_as:
-        roles = "; ".join(f"{role}: {name}" for role, name in found.taken_as.items())
+    if log_look.layout is not None:
+        bullets.append(f"Layout: {layout_words(log_look.layout)}")
+    if log_look.taken_as:
+        roles = "; ".join(f"{role}: {name}" for role, name in log_look.taken_as.items())
         bullets.append(f"Taken as {roles}")
-    signals = Table(
-        ("column", "what it holds"),
-        tuple((column.name, signal_words(column)) for column in found.columns),
-    )
-    first = FirstScreen(
-        f"{count(found.rows, 'row')}, {count(len(found.columns), 'signal')}",
-        "plain",
-        (),
-        tuple(bullets),
-        Picture("log", "Every column of numbers.", (found,)),
-        "file",
-        "File",
-    )
-    sections = (PageSection("signals", "Signals", "Signals", (signals,), open=True),)
-    return Page(f"Log {found.path.name}", first, sections)
+    rows = [(column.name, signal_words(column)) for column in log_look.columns]
+    signals = Table(("column", "what it holds"), tuple(rows))
+    how_many_rows = count(log_look.rows, "row")
+    how_many_signals = count(len(log_look.columns), "signal")
+    headline = f"{how_many_rows}, {how_many_signals}"
+    picture = Picture("log", "Every column of numbers.", (log_look,))
+    first = FirstScreen(headline, "plain", (), tuple(bullets), picture, "file", "File")
+    section = PageSection("signals", "Signals", "Signals", (signals,), open=True)
+    return Page(f"Log {log_look.path.name}", first, (section,))
 
 
-def _onward(found: LogLook, next_command: str) -> str:
+def _onward(log_look: LogLook, next_command: str) -> str:
     """The next command as code, behind what has to be known of it."""
     before, _, command = next_command.rpartition("; type: ")
     if before:
-        before = f"{before.removeprefix(f'{found.path}: ')}; type "
-    as_code = Markup("<code>{}</code>").format(command) if command.startswith("flexlink") else command
-    logs = ", with all logs of the machine" if was_in_closed_loop(found) else ""
+        before = f"{before.removeprefix(f'{log_look.path}: ')}; type "
+    # Where there is no command it is what has to be done before.
+    as_code = command
+    if command.startswith("flexlink"):
+        as_code = Markup("<code>{}</code>").format(command)
+    logs = ""
+    if was_in_closed_loop(log_look):
+        logs = ", with all logs of the machine"
     return Markup("Next: {}{}{}").format(before, as_code, logs)

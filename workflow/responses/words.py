@@ -11,37 +11,36 @@ from workflow.text.formats import count, frequency, number, si
 
 def response_sections(fit: FrfIdentification, response: FrequencyUncertainty) -> list[Section]:
     """Model of a measured frequency response: points, poles with standard deviations, fit, warnings."""
+    # What was measured.
     omega = response.omega_rad_s
-    points = (
-        f"{count(omega.size, 'frequency', 'frequencies')}, {frequency(omega[0])} to {frequency(omega[-1])}"
-    )
+    frequencies = count(omega.size, "frequency", "frequencies")
+    lowest = frequency(omega[0])
+    highest = frequency(omega[-1])
+    points = worded("points", f"{frequencies}, {lowest} to {highest}")
+
+    # The model, its modes with standard deviations: the posterior is Gaussian near them.
     model = fit.model
+    poles = model.poles
     dt_s = model.dt_s
-    pairs = zip(
-        model.poles.omega_rad_s(dt_s).tolist(),
-        fit.omega_std_rad_s.tolist(),
-        model.poles.zeta().tolist(),
-        fit.zeta_std.tolist(),
-        strict=True,
-    )
-    rows = [
-        worded("order", f"{model.order}, sampled every {si(dt_s, 's', 6)}"),
-        *(worded("real pole", si(decay, "1/s")) for decay in model.poles.decay_per_s(dt_s).tolist()),
-    ]
-    for omega_rad_s, omega_std, zeta, zeta_std in pairs:
-        rows.append(
-            worded(
-                "mode",
-                f"{frequency(omega_rad_s, 4)} ± {si(omega_std, 'rad/s', 2)}, damping {number(zeta)} ± "
-                f"{number(zeta_std, 2)}",
-            )
-        )
-    verdicts = tuple(worded(f"{n}", words(item)) for n, item in enumerate(fit.verdicts, 1))
-    warnings = tuple(worded(f"{n}", words(item)) for n, item in enumerate(fit.warnings, 1))
+    step = si(dt_s, "s", 6)
+    rows = [worded("order", f"{model.order}, sampled every {step}")]
+    for decay_per_s in poles.decay_per_s(dt_s).tolist():
+        rows.append(worded("real pole", si(decay_per_s, "1/s")))
+    frequency_std = fit.omega_std_rad_s.tolist()
+    damping_std = fit.zeta_std.tolist()
+    for k, omega_rad_s in enumerate(poles.omega_rad_s(dt_s).tolist()):
+        zeta = float(poles.zeta()[k])
+        frequency_words = f"{frequency(omega_rad_s, 4)} ± {si(frequency_std[k], 'rad/s', 2)}"
+        damping_words = f"{number(zeta)} ± {number(damping_std[k], 2)}"
+        rows.append(worded("mode", f"{frequency_words}, damping {damping_words}"))
+
+    verdicts = [worded(f"{place}", words(item)) for place, item in enumerate(fit.verdicts, 1)]
+    warnings = [worded(f"{place}", words(item)) for place, item in enumerate(fit.warnings, 1)]
     sections = [
-        Section("response", (worded("points", points),)),
+        Section("response", (points,)),
         Section("model", tuple(rows)),
-        Section("fit", verdicts),
-        Section("warnings", warnings),
+        Section("fit", tuple(verdicts)),
+        Section("warnings", tuple(warnings)),
     ]
+    # A fit without a warning has no section of them.
     return [section for section in sections if section.rows]

@@ -38,26 +38,30 @@ def tune_rows(
         friction: Settling times with friction; "" where they are not known.
         limits: What is said of the loop at its limits.
     """
+    # The slowest plant counts; one that never settles makes the whole set never settle.
     times_s = [step.settling_time_s for step in steps]
     reached_s = [time_s for time_s in times_s if time_s is not None]
     settling = "never"
     if len(reached_s) == len(times_s):
         settling = si(max(reached_s), "s")
-    phase_deg = math.degrees(margins.phase_rad)
-    delay_ms = 1000 * margins.delay_s
+
+    # Margins are rounded to the safe side: what is shown is reached.
+    phase_margin = f"{at_least(math.degrees(margins.phase_rad))} deg"
+    delay_margin = f"{at_least(1000 * margins.delay_s)} ms"
+    bandwidth = f"{at_least(bandwidth_rad_s)} rad/s"
     overshoot = max(step.overshoot_percent for step in steps)
-    peak_command = max(step.peak_command for step in steps)
+    peak_command = si(max(step.peak_command for step in steps), input_unit)
     return said(
         worded("worst case γ", at_most(gamma, 4)),
         worded("modulus margin", at_least(margins.modulus)),
         worded("gain margin", decibels(margins.gain_up)),
-        worded("phase margin", f"{at_least(phase_deg)} deg"),
-        worded("delay margin", f"{at_least(delay_ms)} ms"),
-        worded("bandwidth", f"{at_least(bandwidth_rad_s)} rad/s"),
+        worded("phase margin", phase_margin),
+        worded("delay margin", delay_margin),
+        worded("bandwidth", bandwidth),
         worded("overshoot", percent(overshoot)),
         worded("settling time to 2 %", settling),
         worded("settling time with friction, steps of half to twice the size", friction),
-        worded("peak command", si(peak_command, input_unit)),
+        worded("peak command", peak_command),
         worded("controller order", str(order)),
         pid_row(numbers),
         worded("at the limits", limits),
