@@ -103,16 +103,28 @@ def model_rows(
         *_unstable_rows(found, intervals),
     ]
     if whole:
-        decays = ", ".join(number(decay, 4) for decay in found.real_poles_per_s)
-        discrete = [pole for pole in found.real_poles_z if pole <= 0]
-        places = ", ".join("0 (deadbeat)" if pole == 0 else number(pole, 4) for pole in discrete)
-        rows.append(worded("real poles", f"{decays} 1/s" if decays else ""))
-        rows.append(worded("real poles, z plane", places))
+        decays = [number(decay, 4) for decay in found.real_poles_per_s]
+        if decays:
+            all_decays = ", ".join(decays)
+            rows.append(worded("real poles", f"{all_decays} 1/s"))
+        # A pole at or left of 0 in the z plane has no decay rate.
+        places = []
+        for pole in found.real_poles_z:
+            if pole == 0:
+                places.append("0 (deadbeat)")
+            elif pole < 0:
+                places.append(number(pole, 4))
+        rows.append(worded("real poles, z plane", ", ".join(places)))
+
+    # Where records were kept back, their fit says more than that of the fitted ones.
+    of_what = ""
+    if found.increments:
+        of_what = " of increments"
     for role, by_record in found.fit_percent.items():
         shown = whole or role != "estimation" or not found.fit_percent["validation"]
         if by_record and shown:
-            of = " of increments" if found.increments else ""
-            rows.append(worded(f"fit, {role}", f"{extent(by_record.values())} %{of}"))
+            fits_of_role = extent(by_record.values())
+            rows.append(worded(f"fit, {role}", f"{fits_of_role} %{of_what}"))
     return said(*rows)
 
 
@@ -122,15 +134,21 @@ def _pair_rows(
     """Pole pairs; one that the records do not tell from none is left out."""
     rows = []
     for index, pair in enumerate(found.modes):
-        known = None if intervals is None else intervals.modes[index]
+        known = None
+        if intervals is not None:
+            known = intervals.modes[index]
         if known is not None and found.is_mode(pair) and not known.told:
             continue
         text = f"{number(pair.frequency_Hz, 4)} Hz, damping {number(pair.damping)}"
         if intervals is not None and known is not None:
-            text += (
-                f" ({share(intervals.level)}: {interval(known.frequency_Hz)} Hz, {interval(known.damping)})"
-            )
-        truth = true_mode(truths[index]) if truths else ""
+            level = share(intervals.level)
+            frequencies = interval(known.frequency_Hz)
+            dampings = interval(known.damping)
+            text += f" ({level}: {frequencies} Hz, {dampings})"
+        # Simulated logs: what the linear arm behind them has.
+        truth = ""
+        if truths:
+            truth = true_mode(truths[index])
         if truth:
             text += f" (true (linear arm): {truth})"
         rows.append(worded(pair_kind(found, pair), text))
@@ -144,7 +162,9 @@ def _unstable_rows(found: IdentifiedChannel, intervals: Intervals | None) -> lis
         if omega_rad_s:
             text += f" at {frequency(omega_rad_s, 4)}"
         if intervals is not None:
-            text += f" ({share(intervals.level)}: {interval(intervals.growth_per_s[index])} 1/s)"
+            level = share(intervals.level)
+            growths = interval(intervals.growth_per_s[index])
+            text += f" ({level}: {growths} 1/s)"
         rows.append(worded("unstable pole", text))
     return rows
 

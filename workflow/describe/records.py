@@ -45,10 +45,10 @@ def records_section(records: RecordsResult) -> Section:
         chosen = records.of_role(role)
         if not chosen:
             continue
+        records_of_role = count(len(chosen), "record")
         samples = sum(item.record.n_samples for item in chosen)
-        length_s = sum(item.duration_s for item in chosen)
-        text = f"{count(len(chosen), 'record')}, {samples} samples, {si(length_s, 's', 4)}"
-        rows.append(worded(role, text))
+        length = si(sum(item.duration_s for item in chosen), "s", 4)
+        rows.append(worded(role, f"{records_of_role}, {samples} samples, {length}"))
     return Section("records", tuple(rows))
 
 
@@ -59,16 +59,16 @@ def logs_section(logs: Sequence[Record], input_limit: float | None) -> Section:
         logs: All of them, at least one.
         input_limit: What the amplifier gives, where it was stated.
     """
+    # All logs have the columns of the first.
     first = logs[0]
-    return Section(
-        "logs",
-        said(
-            *(worded(record.name, time_base(record)) for record in logs),
-            worded("input", signal(first.input_names[0], first.input_units)),
-            worded("output", signal(first.output_names[0], first.output_units)),
-            worded("input limit", cut_off(logs, input_limit, "".join(first.input_units))),
-        ),
-    )
+    input_signal = signal(first.input_names[0], first.input_units)
+    output_signal = signal(first.output_names[0], first.output_units)
+    input_unit = "".join(first.input_units)
+    rows = [worded(record.name, time_base(record)) for record in logs]
+    rows.append(worded("input", input_signal))
+    rows.append(worded("output", output_signal))
+    rows.append(worded("input limit", cut_off(logs, input_limit, input_unit)))
+    return Section("logs", said(*rows))
 
 
 def records_page(view: AnyRunView) -> PageSection:
@@ -113,13 +113,13 @@ def _record_rows(items: Sequence[RunRecord]) -> list[tuple[str, ...]]:
     """A row for each record, or for several in a row that are alike in all but the number in their name."""
 
     def said_of(item: RunRecord) -> tuple[str, ...]:
-        return (
-            item.role,
-            str(item.record.n_samples),
-            number(item.duration_s),
-            "open" if item.record.reference is None else "closed",
-            "; ".join(text for text in (item.condition, item.remark) if text),
-        )
+        loop = "closed"
+        if item.record.reference is None:
+            loop = "open"
+        samples = str(item.record.n_samples)
+        length_s = number(item.duration_s)
+        remarks = [text for text in (item.condition, item.remark) if text]
+        return item.role, samples, length_s, loop, "; ".join(remarks)
 
     def series_of(numbered: tuple[int, RunRecord]) -> tuple[object, ...]:
         place, item = numbered
@@ -154,9 +154,14 @@ def _about_records(view: AnyRunView, *, simulated: bool) -> str:
         if chosen:
             split.append(f"{chosen} {use}")
     seconds = number(sum(item.duration_s for item in items))
+    # All records of a run have one step.
     step_ms = number(1000 * items[0].record.dt_s)
-    was = "was" if len(items) == 1 else "were"
-    source = "simulated" if simulated else "read from files"
+    was = "were"
+    if len(items) == 1:
+        was = "was"
+    source = "read from files"
+    if simulated:
+        source = "simulated"
     text = (
         f"{count(len(items), 'record')} ({seconds} s in all, sampled every {step_ms} ms) {was} {source}: "
         f"{listing(split)}."
@@ -211,26 +216,25 @@ def _limit_blocks(view: AnyRunView, *, several: bool) -> list[Block]:
         if limit is None or largest <= limit:
             continue
         unit = view.results.records.unit(loop.input)
-        name = f" {loop.input}" if several else ""
-        key = "its input_limit" if several else "specification.input_limit"
-        blocks.append(
-            Remarks(
-                (
-                    f"The recorded input{name} reaches {si(largest, unit)}, beyond the {si(limit, unit)} of "
-                    f"{key}. If the amplifier clips there, the arm never got these commands: set input_limit "
-                    f"= {setting(limit)} in [source].",
-                ),
-                "warning",
-            )
+        name = ""
+        key = "specification.input_limit"
+        if several:
+            name = f" {loop.input}"
+            key = "its input_limit"
+        reaches = si(largest, unit)
+        beyond = si(limit, unit)
+        warning = (
+            f"The recorded input{name} reaches {reaches}, beyond the {beyond} of {key}. If the amplifier "
+            f"clips there, the arm never got these commands: set input_limit = {setting(limit)} in [source]."
         )
+        blocks.append(Remarks((warning,), "warning"))
     return blocks
 
 
 def distortion_page(channel: ChannelView) -> PageSection:
     """Noise and nonlinear distortion of a channel's records, as far as they show them."""
-    return PageSection(
-        "distortion", "Noise and nonlinear distortion", "Distortion", tuple(distortion_blocks(channel))
-    )
+    blocks = tuple(distortion_blocks(channel))
+    return PageSection("distortion", "Noise and nonlinear distortion", "Distortion", blocks)
 
 
 def distortion_blocks(channel: ChannelView) -> list[Block]:
@@ -239,17 +243,18 @@ def distortion_blocks(channel: ChannelView) -> list[Block]:
     blocks: list[Block] = []
     if refused:
         blocks.append(Text(f"Not analysed: {refused}."))
-    blocks.append(Remarks(tuple(sentence(words(item)) for item in known), "plain"))
-    about = f"{channel.name}: gain" if channel.file else "Gain"
-    blocks.append(
-        Picture(
-            "distortion",
-            f"{about} and scatter at every frequency of the input. Points above the noise curve are "
-            "nonlinear distortion.",
-            (distortions, channel.units),
-            channel.file,
-        )
+    remarks = [sentence(words(item)) for item in known]
+    blocks.append(Remarks(tuple(remarks), "plain"))
+
+    # On a page of several channels each picture says of which it is.
+    about = "Gain"
+    if channel.file:
+        about = f"{channel.name}: gain"
+    caption = (
+        f"{about} and scatter at every frequency of the input. Points above the noise curve are nonlinear "
+        "distortion."
     )
+    blocks.append(Picture("distortion", caption, (distortions, channel.units), channel.file))
     for levels in distortions:
         if levels.excited is None or not len(levels.bands_rad_s):
             continue
@@ -264,18 +269,23 @@ def _distortion_table(levels: Distortion, input_unit: str) -> Table:
         at = levels.excited.within(low, high)
         if at is None:
             continue
-        odd = None if levels.odd is None else levels.odd.within(low, high)
-        even = None if levels.even is None else levels.even.within(low, high)
-        rows.append(
-            (
-                f"{number(low)} to {number(high)}",
-                number(100 * at.distortion, 2),
-                f"{number(100 * at.interval[0], 2)} to {number(100 * at.interval[1], 2)}",
-                number(None if odd is None else 100 * odd.distortion, 2),
-                number(None if even is None else 100 * even.distortion, 2),
-                number(100 * at.noise, 2),
-            )
-        )
+        # Odd and even lines where the input left some of them out; else the cell is empty.
+        odd_percent = None
+        if levels.odd is not None:
+            odd = levels.odd.within(low, high)
+            if odd is not None:
+                odd_percent = 100 * odd.distortion
+        even_percent = None
+        if levels.even is not None:
+            even = levels.even.within(low, high)
+            if even is not None:
+                even_percent = 100 * even.distortion
+        least, most = at.interval
+        band = f"{number(low)} to {number(high)}"
+        distortion = number(100 * at.distortion, 2)
+        interval = f"{number(100 * least, 2)} to {number(100 * most, 2)}"
+        noise = number(100 * at.noise, 2)
+        rows.append((band, distortion, interval, number(odd_percent, 2), number(even_percent, 2), noise))
     head = (
         "band [rad/s]",
         "distortion, of the gain [%]",
@@ -284,11 +294,10 @@ def _distortion_table(levels: Distortion, input_unit: str) -> Table:
         "even lines [%]",
         "noise [%]",
     )
-    caption = (
-        f"{si(levels.rms, input_unit)} rms: {count(levels.realisations, 'realisation')} of "
-        f"{count(levels.periods, 'period')}"
-    )
-    return Table(head, tuple(rows), caption)
+    rms = si(levels.rms, input_unit)
+    realisations = count(levels.realisations, "realisation")
+    periods = count(levels.periods, "period")
+    return Table(head, tuple(rows), f"{rms} rms: {realisations} of {periods}")
 
 
 def rig_page(notes: Notes) -> PageSection:
