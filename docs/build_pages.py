@@ -71,9 +71,11 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Tutorials are run. Links to files of the repository, which are not on the site, become their names."""
+    """Tutorials are run, formulas drawn. Links to files of the repository, which are not on the site, become
+    their names."""
     if page.file.src_uri.startswith("tutorials/"):
         markdown = notebook(markdown, Path(page.file.src_uri), config, files)
+    markdown = with_formulas(markdown)
     return re.sub(r"\[[^\]]*\]\((?:\.\./)+((?:examples|benchmarks|tests)[^)]*)\)", r"`\1`", markdown)
 
 
@@ -322,7 +324,36 @@ def cells(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | None
     return f"**{title}**\n\n" + "\n".join(f"| {line} |" for line in lines)
 
 
-# A formula of its own: `.. math::` and the indented lines behind it.
+# Formulas of a page, in the spelling that GitHub draws as well: a block between lines of `$$`, and $`...`$ in
+# a sentence. A fenced block of code is matched first, so that what looks like a formula there stays code.
+FORMULA = re.compile(
+    r"(?P<code>^```.*?^```$)|^(?P<indent>[ ]*)\$\$\n(?P<block>.*?)^[ ]*\$\$$|\$`(?P<inline>[^`]+)`\$",
+    re.MULTILINE | re.DOTALL,
+)
+
+
+def with_formulas(markdown: str) -> str:
+    """A page with its formulas as MathML, which browsers draw without a script and without a network."""
+
+    def replaced(found: re.Match[str]) -> str:
+        if found["code"]:
+            return found["code"]
+        if found["inline"]:
+            # Without the span a formula that begins a line would be taken for a paragraph of its own.
+            return f"<span>{drawn(found['inline'], 'inline')}</span>"
+        # Indented as it stands, so that a formula inside a list stays in its item.
+        return f"{found['indent']}<div>{drawn(found['block'], 'block')}</div>"
+
+    return FORMULA.sub(replaced, markdown)
+
+
+def drawn(latex: str, display: str) -> str:
+    """A formula as MathML in which Markdown finds no mark of its own."""
+    mathml: str = convert(" ".join(latex.split()), display=display)
+    return mathml.replace("*", "&#42;").replace("_", "&#95;")
+
+
+# A formula of its own in a docstring: `.. math::` and the indented lines behind it.
 DISPLAYED = re.compile(r"^\.\. math::[ ]*([^\n]*)\n?((?:[ ]+[^\n]*\n?|\n)*)", re.MULTILINE)
 
 
@@ -333,8 +364,7 @@ def prose(text: str | None) -> str:
     end = 0
     for formula in DISPLAYED.finditer(text or ""):
         parts.append(escaped((text or "")[end : formula.start()]))
-        latex = " ".join(f"{formula[1]} {formula[2]}".split())
-        parts.append(f"\n\n<div>{convert(latex, display='block')}</div>\n\n")
+        parts.append(f"\n\n<div>{drawn(f'{formula[1]} {formula[2]}', 'block')}</div>\n\n")
         end = formula.end()
     parts.append(escaped((text or "")[end:]))
     return "".join(parts).strip()

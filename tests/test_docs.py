@@ -218,6 +218,23 @@ def test_a_docstring_becomes_tables_text_and_drawn_formulas():
     assert "^{-1}" not in page
 
 
+def test_formulas_of_a_page_are_drawn_and_code_stays_code():
+    """MathML without a mark that Markdown would read, and a formula that begins a line stays in its sentence."""
+    markdown = pytest.importorskip("markdown")
+    hook = pages()
+    page = "Of\n$`V V^*`$ and $`a_1 b_1`$ x_1:\n\n$$\n\\frac{a}{b}\n$$\n\n```text\n$`left`$\n```\n"
+    drawn = markdown.markdown(hook.with_formulas(page), extensions=["fenced_code"])
+    assert drawn.count("<math") == 3
+    assert drawn.count("<p>") == 1
+    assert "<em>" not in drawn
+    assert "<mfrac>" in drawn
+    assert "$`left`$" in drawn
+    for path in DOCS.rglob("*.md"):
+        made = hook.with_formulas(path.read_text(encoding="utf-8"))
+        assert "$$" not in made, path.name
+        assert "$`" not in made, path.name
+
+
 @pytest.mark.slow
 def test_the_site_is_built_whole_and_asks_no_network(site):
     made = {str(page.relative_to(site)) for page in site.rglob("*.html")}
