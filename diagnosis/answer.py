@@ -203,44 +203,78 @@ class Prediction:
 class Diagnosis(Shown):
     """What is wrong with a model, as far as its records tell.
 
+    Attributes
+    ----------
+    case : Case or PlantCase
+        What was diagnosed.
     verdict, detail_verdict : str
-    probabilities : answer -> probability, summing to one. Main cause; "none": no effect, and that is all;
-        "unknown": none of the candidates, and more remains than the threshold.
-    sets : effects -> probability, summing to one. () is none, ("unknown",) unknown. Whether a set is all is
-        another question (`completeness`).
-    effects : tuple of NamedEffect. Every effect, none and unknown; the answer first, then by presence, with
-        none and unknown last unless they are the answer.
-    combination : tuple of str. Effects that are accepted together; empty for the verdicts none and unknown.
-    ambiguous_with : tuple of str. Answers that the records cannot rule out beside the first.
-    gap_before, gap_refit, gap_after : float. Pooled RMS of (measured - model)/noise over the held-out
-        experiments: nominal rig, nominal parameters moved within their tolerances, accepted effects added.
+        "none", "effect" or "unknown"; in detail also "parametric" (stated values are off), "ambiguous" or
+        "not_converged".
+    probabilities : dict of answer to float
+        Of the main cause; they sum to one. "none": no effect, and that is all; "unknown": none of the
+        candidates, and more remains than the threshold.
+    sets : dict of effects to float
+        Probability of each set of effects; they sum to one. () is none, ("unknown",) unknown. Whether a set
+        is all is another question (`completeness`).
+    effects : tuple of NamedEffect
+        Every effect, none and unknown, each with `presence`, `parameters` and `intervals`: the answer first,
+        then by presence, with none and unknown last unless they are the answer.
+    combination : tuple of str
+        Effects that are accepted together; empty for the verdicts none and unknown.
+    ambiguous_with : tuple of str
+        Answers that the records cannot rule out beside the first.
+    gap_before, gap_refit, gap_after : float
+        Pooled RMS of (measured - model)/noise over the validation experiments: nominal rig, nominal
+        parameters moved within their tolerances, accepted effects added.
+    noise_floor : float
+        What the same number is for noise alone.
     gap_closed, gap_closed_interval : float, (low, high)
-        1 - (R_after - F)/(R_refit - F) with R, F the held-out mean squares and the noise floor's
-        and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
-    deviations : key -> tolerances
-        How far the nominal parameters are off, with the accepted effects in the model.
-    deviations_refit : key -> tolerances. How far they have to move without any effect.
-    rig, repair : The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), effects to
-        add (of `plant.effects`, or changes of the own plant).
-    residuals_before, residuals_refit, residuals_after : experiment -> (T, 2)
-        Whitened, every experiment; (T, Y) in the machine's order of outputs.
-    simulations : int. Number of simulated records.
-    held_out_decided : bool. The held-out records did not confirm what the others said, and chose among the
-        answers (none was fitted to them).
-    unlisted : tuple of effects. What explains the records where the answer is unknown and yet can be named: a
-        cause beyond the list that looks like one of it, with whatever it acts beside.
-    partial_model : tuple of str. Effects of the repaired model where the answer is none or unknown: with them
-        it predicts better, and nobody says that they are the cause.
-    prediction : what the repaired model is worth in logs that it was not fitted to.
-    completeness : whether that is all.
-    noise_below_stated : tuple of (output, noise, stated noise). Of an own machine whose records show less
-        noise than is stated, in whose place it was counted.
-    doubts : sentences on what makes the answer doubtful, whatever the fit says (`machine.probed`).
-    competing : tuple of CompetingHypothesis. Fitted explanations that contradict each other, most probable
-        first, for `next_experiment`; only for a flexible link.
-    shares : Shares or None. Only of a machine with a stated model error.
-    white : (Y,) or None. What sensors have in the unit of the residuals of a page, taken off their sizes;
-        None: sizes are over noise, which is one of them.
+        1 - (R_after - F)/(R_refit - F) with R, F the mean squares of the validation experiments and of the
+        noise floor, and its 95 % bootstrap interval over blocks of samples; nan without a gap to close.
+    deviations, deviations_refit : dict of key to float
+        How far the nominal parameters are off, in tolerances: with the accepted effects in the model, and
+        without any effect.
+    rig, repair : object, tuple of effects
+        The repaired model: nominal parameters moved (a Rig, or a Plant of one's own), and effects to add (of
+        `plant.effects`, or changes of the own plant).
+    residuals_before, residuals_refit, residuals_after : dict of experiment to (T, Y) array
+        Whitened, every experiment, in the machine's order of outputs.
+    simulations : int
+        Number of simulated records.
+    completeness : Completeness
+        Whether that is all: the probability that no more than the threshold remains, and what remains.
+    held_out_decided : bool
+        The validation records did not confirm what the others said, and chose among the answers (none was
+        fitted to them).
+    unlisted : tuple of effects
+        What explains the records where the answer is unknown and yet can be named: a cause beyond the list
+        that looks like one of it, with whatever it acts beside.
+    partial_model : tuple of str
+        Effects of the repaired model where the answer is none or unknown: with them it predicts better, and
+        nobody says that they are the cause.
+    noise_below_stated : tuple of (output, noise, stated noise)
+        Of an own machine whose records show less noise than is stated, in whose place it was counted.
+    doubts : tuple of str
+        What makes the answer doubtful, whatever the fit says.
+    competing : tuple of CompetingHypothesis
+        Fitted explanations that contradict each other, most probable first, for the next experiment; only for
+        a flexible link.
+    shares : Shares or None
+        Only of a machine with a stated model error.
+    white : (Y,) array or None
+        What sensors have in the unit of the residuals of a page, taken off their sizes; None: sizes are over
+        noise, which is one of them.
+    prediction : Prediction or None
+        What the repaired model is worth in logs that it was not fitted to.
+
+    Examples
+    --------
+    >>> found = flexlink.diagnose(example_case())
+    >>> found.combination, found.effects[0].presence > 0.9
+    (('coulomb_friction',), True)
+    >>> low, high = found.effects[0].intervals["torque_Nm"]
+    >>> low < 0.05 < high
+    True
     """
 
     table_in_notebook = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import html
 import inspect
 import os
@@ -16,7 +17,7 @@ from typing import Any, get_args
 
 import jupytext
 import nbformat
-from docstring_parser import DocstringStyle, parse
+from docstring_parser import Docstring, DocstringStyle, parse
 from latex2mathml.converter import convert
 from mkdocs.structure.files import File, Files
 from nbclient import NotebookClient
@@ -35,9 +36,11 @@ jupyter:
 ---
 """
 UNITS = {
-    "rad_s": "rad/s", "Nms": "N m s", "Nm": "N m", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg", "rad": "rad",
-    "deg": "deg", "Hz": "Hz", "dB": "dB", "percent": "%", "samples": "samples", "V": "V",
-    "m": "m", "s": "s",
+    "V_per_rad": "V/rad", "Vs_per_rad": "V s/rad", "rad_per_V": "rad/V", "Vs_rad": "V s/rad", "Nm_A": "N m/A",
+    "per_s": "1/s", "rad_s2": "rad/s²", "rad_s": "rad/s", "m_s2": "m/s²", "m_s": "m/s", "Nms": "N m s", "Nm": "N m",
+    "kg_m3": "kg/m³", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg", "rad": "rad", "deg": "deg", "Hz": "Hz",
+    "hz": "Hz", "dB": "dB", "db": "dB", "percent": "%", "samples": "samples", "Pa": "Pa", "ohm": "ohm", "N": "N",
+    "V": "V", "m": "m", "s": "s",
 }  # fmt: skip
 SHOWN = {
     "look.html": ("What a log holds", "flexlink look logs/09_prbs.csv --out look.html"),
@@ -115,7 +118,7 @@ def run(cells: nbformat.NotebookNode) -> None:
 
 
 def unit_of(key: str, meaning: str) -> str:
-    """From the end of the name, else from brackets in the meaning."""
+    """From the end of the name, the longer endings first; else from brackets in the meaning."""
     for ending, unit in UNITS.items():
         if key == ending or key.endswith(f"_{ending}"):
             return unit
@@ -202,14 +205,16 @@ def sentence(model: type[BaseModel]) -> str:
     return " ".join(text.partition("\n\n")[0].split())
 
 
-def row(key: str, field: Any) -> str:
-    """One line of a table."""
-    meaning = field.description or ""
+def row(key: str, field: Any, otherwise: str = "") -> str:
+    """One line of a table; `otherwise` is said of a key that has no meaning of its own."""
+    meaning = field.description or otherwise
     if field.is_required():
         name, default = f"**`{key}`**", ""
     else:
         value = field.get_default(call_default_factory=True)
         name, default = f"`{key}`", "none" if value is None else f"`{value!r}`"
+        if isinstance(value, BaseModel):
+            default = ""  # the table of its own keys has their defaults
     choices = [f"`{choice}`" for choice in get_args(field.annotation) if isinstance(choice, str)]
     text = f"{meaning} ({', '.join(choices)})" if choices else meaning
     return (
@@ -246,6 +251,10 @@ MODULES = {
 }
 
 
+MADE_FROM_DOCSTRINGS = """Names of `import flexlink`, in alphabetical order; the
+[overview](python.md#what-the-examples-use) has what the examples use."""
+
+
 def python() -> dict[str, str]:
     """Pages with every name of the front door and its docstring."""
     import flexlink
@@ -253,24 +262,67 @@ def python() -> dict[str, str]:
     made, lines = {}, ["| page | names |", "|---|---|"]
     for module, title in MODULES.items():
         names = sorted(import_module(f"flexlink.{module}").__all__)
-        parts = [f"# {title}"]
+        parts = [f"# {title}", MADE_FROM_DOCSTRINGS]
         for name in names:
             thing = getattr(flexlink, name)
             parts.append(f"## {name}\n\n{settings(thing) or docstring(name, thing)}")
         made[f"reference/python_{module}.md"] = "\n\n".join(parts) + "\n"
         listed = ", ".join(f"`{name}`" for name in names)
         lines.append(f"| [{title}](python_{module}.md) | {listed} |")
-    start = "# Python\n\nThe names of `import flexlink`. Start with [From Python](../from_python.md)."
-    return made | {"reference/python.md": start + "\n\n" + "\n".join(lines) + "\n"}
+    overview = [PYTHON_OVERVIEW, "\n".join(lines), EXAMPLES_USE, f"```python\n{what_examples_use()}\n```"]
+    return made | {"reference/python.md": "\n\n".join(overview) + "\n"}
+
+
+PYTHON_OVERVIEW = """# Python
+
+For scripts and notebooks: every name of `import flexlink`, with its arguments, units, errors and an example.
+Start with [From Python](../from_python.md)."""
+EXAMPLES_USE = """## What the examples use
+
+Every example runs as it stands behind these lines:"""
+
+
+def what_examples_use() -> str:
+    """The functions that examples of docstrings call, as the test that runs them has them."""
+    source = (ROOT / "tests" / "test_front_door.py").read_text(encoding="utf-8")
+    imports = [
+        "import control",
+        "import flexlink",
+        "import numpy as np",
+        "from numpy.random import default_rng",
+        "from scipy.signal import lfilter",
+    ]
+    parsed = ast.parse(source)
+    functions = [
+        # Decorated functions begin with their decorator.
+        "\n".join(
+            source.split("\n")[
+                min([node.lineno, *(mark.lineno for mark in node.decorator_list)]) - 1 : node.end_lineno
+            ]
+        )
+        for node in parsed.body
+        if isinstance(node, ast.FunctionDef) and f'"{node.name}": {node.name},' in source
+    ]
+    return "\n\n\n".join(["\n".join(imports), *functions])
 
 
 def settings(thing: Any) -> str:
-    """Keys of settings as a table; nothing for other things."""
+    """Keys of settings as a table, with the text of their docstring; nothing for other things."""
     if not (isinstance(thing, type) and issubclass(thing, BaseModel)):
         return ""
-    rows = [row(key, field) for key, field in keys(thing)]
-    table = "| key | unit | default | meaning |\n|---|---|---|---|\n" + "\n".join(rows)
-    return f"{sentence(thing)}\n\n{table}" if rows else ""
+    # Settings add a list of their fields for `help`; here the table has them.
+    text = inspect.cleandoc(thing.__dict__.get("__doc__") or "").partition("\nFields:\n")[0]
+    described = parse(text.strip(), DocstringStyle.NUMPYDOC)
+    parts = [prose(described.short_description), prose(described.long_description)]
+    head = "| key | unit | default | meaning |\n|---|---|---|---|\n"
+    for place, model in sections(thing):
+        fields = [(field.alias or key, field) for key, field in model.model_fields.items()]
+        title = f"Keys of `{place}`" if place else "Keys"
+        rows = [row(key, field, "its keys are below") for key, field in fields]
+        parts.append("\n\n".join(text for text in (f"**{title}**", sentence(model) if place else "") if text))
+        parts.append(head + "\n".join(rows))
+    parts.extend(last_sections(described))
+    return "\n\n".join(part for part in parts if part)
 
 
 def docstring(name: str, thing: Any) -> str:
@@ -279,12 +331,8 @@ def docstring(name: str, thing: Any) -> str:
     Parameters, what is returned and what is raised become tables; text stays text, with its formulas: those
     behind `.. math::` as MathML, which browsers draw without a script, others as they are written.
     """
-    try:
-        signature = re.sub(r"(?:[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", str(inspect.signature(thing)))
-    except (TypeError, ValueError):
-        signature = ""
     described = parse(inspect.cleandoc(thing.__doc__ or ""), DocstringStyle.NUMPYDOC)
-    parts = [f"```python\n{name}{signature}\n```", prose(described.short_description)]
+    parts = [f"```python\n{signature(name, thing)}\n```", prose(described.short_description)]
     parts.append(prose(described.long_description))
     # A class of results lists its attributes, anything else its parameters.
     for title, section in (("Parameters", "param"), ("Attributes", "attribute")):
@@ -296,8 +344,14 @@ def docstring(name: str, thing: Any) -> str:
         parts.append(cells(title, ("name", "type", "meaning"), listed))
     returned = [(part.return_name or "", part.type_name, part.description) for part in described.many_returns]
     parts.append(cells("Returns", ("name", "type", "meaning"), returned))
+    parts.extend(last_sections(described))
+    return "\n\n".join(part for part in parts if part)
+
+
+def last_sections(described: Docstring) -> list[str]:
+    """What is raised, notes and examples of a docstring, which functions, classes and settings share."""
     raised = [(part.type_name, part.description) for part in described.raises]
-    parts.append(cells("Raises", ("error", "when"), raised))
+    parts = [cells("Raises", ("error", "when"), raised)]
     for part in described.meta:
         section = part.args[0].capitalize()
         if section in ("Notes", "References", "See also"):
@@ -308,7 +362,40 @@ def docstring(name: str, thing: Any) -> str:
             lines.extend(text for text in (example.snippet, example.description) if text)
         code = "\n".join(lines)
         parts.append(f"**Examples**\n\n```python\n{code}\n```")
-    return "\n\n".join(part for part in parts if part)
+    return parts
+
+
+# A signature that is longer than this has a line for each parameter: what a page shows without wrapping.
+LONGEST_SIGNATURE = 88
+
+
+def signature(name: str, thing: Any) -> str:
+    """How a function or class is called, with types as a reader writes them: no quotes, no modules."""
+    try:
+        found = inspect.signature(thing)
+    except (TypeError, ValueError):
+        return name
+    listed, starred = [], False
+    for parameter in found.parameters.values():
+        starred = starred or parameter.kind is parameter.VAR_POSITIONAL
+        if parameter.kind is parameter.KEYWORD_ONLY and not starred:
+            listed.append("*")
+            starred = True
+        listed.append(plain_types(str(parameter)))
+    returned = ""
+    if not isinstance(thing, type) and found.return_annotation is not found.empty:
+        annotation = found.return_annotation
+        returned = f" -> {plain_types(annotation if isinstance(annotation, str) else annotation.__name__)}"
+    line = f"{name}({', '.join(listed)}){returned}"
+    if len(line) <= LONGEST_SIGNATURE:
+        return line
+    return "\n".join([f"{name}(", *(f"    {text}," for text in listed), f"){returned}"])
+
+
+def plain_types(text: str) -> str:
+    """A parameter without the quotes of an annotation that is kept as text, and without modules."""
+    text = re.sub(r"^(\**\w+: )(['\"])(.*?)\2(?= = |$)", r"\1\3", text)
+    return re.sub(r"(?:\b[A-Za-z_]+\.)+([A-Za-z_]+)", r"\1", text)
 
 
 def cells(title: str, columns: Sequence[str], rows: Sequence[Sequence[str | None]]) -> str:

@@ -28,11 +28,27 @@ def diagnose(
 ) -> Diagnosis:
     """Find the effect that explains the model error of a rig or of your own simulation.
 
-    case: a `Case`, or a `diagnosis.PlantCase` (docs/own_plant.md); `load_case` reads either. progress: called
-    with the share done (0 to 1) and what is being done. rng: of interval draws; without it one case has one
-    answer. time_limit_s: after it nothing more is tried, and the answer says what was not.
-
     Takes about ten seconds for records of a few thousand samples.
+
+    Parameters
+    ----------
+    case : Case or diagnosis.PlantCase
+        `load_case` reads either; "Your own plant" describes the second.
+    progress : callable, optional
+        Called with the share done (0 to 1) and what is being done.
+    rng : numpy.random.Generator, optional
+        Of interval draws; without it one case has one answer.
+    time_limit_s : float
+        Seconds after which nothing more is tried; the answer says what was not.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    ValueError
+        Records that do not fit to the rig or the simulation; one line says where.
 
     Examples
     --------
@@ -53,9 +69,23 @@ def diagnose(
 def load_case(place: str | os.PathLike[str], rig: str | None = None) -> Case | PlantCase:
     """Read a case as `flexlink diagnose` does (docs/case_files.md, docs/simulators.md).
 
-    place: a folder with `case.toml`, or such a TOML file; one that names a simulator's model must be named
-    itself. rig: another rig file than the one that the case file names. Raises ValueError, one line, which
-    names the file and what is wrong in it.
+    Parameters
+    ----------
+    place : path
+        A folder with `case.toml`, or such a TOML file. A file that names a simulator's model must be named
+        itself.
+    rig : str, optional
+        Another rig file than the one that the case file names.
+
+    Returns
+    -------
+    Case or diagnosis.PlantCase
+        The second for a simulator's model.
+
+    Raises
+    ------
+    ValueError
+        In one line: the file and what is wrong in it.
 
     Examples
     --------

@@ -80,8 +80,25 @@ def arx(record: Record, na: int, nb: int, *, delay_samples: int = 1) -> Polynomi
 def armax(record: Record, na: int, nb: int, nc: int, *, delay_samples: int = 1) -> PolynomialModel:
     """Fit A y = B u + C e by prediction errors: na, nb, nc coefficients, C stable.
 
-    Parameters and errors as in `arx`. The best of three local searches (from ARX, from two-stage least
-    squares, from Steiglitz-McBride); the minimum is local.
+    Parameters
+    ----------
+    record : Record
+        One input and one output; means are not removed.
+    na, nb, nc : int
+        Coefficients of A, B and C.
+    delay_samples : int
+        1 where the output does not answer within the same sample.
+
+    Returns
+    -------
+    PolynomialModel
+        The best of three local searches (from ARX, from two-stage least squares, from Steiglitz-McBride); the
+        minimum is local.
+
+    Raises
+    ------
+    ValueError
+        Orders or a record that cannot be used.
 
     Examples
     --------
@@ -95,8 +112,24 @@ def armax(record: Record, na: int, nb: int, nc: int, *, delay_samples: int = 1) 
 def oe(record: Record, nb: int, nf: int, *, delay_samples: int = 1) -> PolynomialModel:
     """Fit y = (B / F) u + e by prediction errors: nb coefficients in B, nf in F, F stable.
 
-    Parameters and errors as in `arx`. The best of two local searches (from Steiglitz-McBride, from ARX); the
-    minimum is local.
+    Parameters
+    ----------
+    record : Record
+        One input and one output; means are not removed.
+    nb, nf : int
+        Coefficients of B and F.
+    delay_samples : int
+        1 where the output does not answer within the same sample.
+
+    Returns
+    -------
+    PolynomialModel
+        The best of two local searches (from Steiglitz-McBride, from ARX); the minimum is local.
+
+    Raises
+    ------
+    ValueError
+        Orders or a record that cannot be used.
 
     Examples
     --------
@@ -122,6 +155,11 @@ def n4sid(
         The output answers within the same sample.
     block_rows : int, optional
         Past and future samples that are looked at together; by default twice the order, at least 20.
+
+    Returns
+    -------
+    InnovationModel
+        State space with the gain of its noise.
 
     Raises
     ------
@@ -173,6 +211,12 @@ class Comparison(Shown):
         One input and one output.
     models : tuple of ComparedModel
         In the order in which they were given.
+
+    Examples
+    --------
+    >>> beside = flexlink.compare(example_record(), flexlink.oe(example_record(), 2, 2))
+    >>> len(beside.models), "fit_percent" in beside.table()
+    (1, True)
     """
 
     table_in_notebook = True
@@ -281,7 +325,11 @@ def compare(
     names : str or sequence of str
         Of the models, in the same order; by default what made them.
     ax : axes of matplotlib, optional
-        Where `Comparison.plot` draws at once, with title, from_s and to_s as there.
+        Where `Comparison.plot` draws at once.
+    title : str, optional
+        Of that picture.
+    from_s, to_s : float, optional
+        Part of the record that it shows, s; by default a part in which single samples can be seen.
 
     Returns
     -------

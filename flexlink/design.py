@@ -305,6 +305,14 @@ def synthesise_multivariable(
     Returns
     -------
     MultivariableResult
+
+    Examples
+    --------
+    >>> designed = flexlink.synthesise_multivariable(
+    ...     example_joint_plant(), example_joint_specification(), rounds=2, steps=2
+    ... )
+    >>> designed.controller.order
+    2
     """
     chosen = options_of(MultivariableOptions, options, settings)
     return multivariable.synthesise_multivariable(plants, specification, chosen)
@@ -332,6 +340,14 @@ def certify_multivariable(
     Returns
     -------
     MultivariableCertificate
+
+    Examples
+    --------
+    >>> designed = flexlink.synthesise_multivariable(
+    ...     example_joint_plant(), example_joint_specification(), rounds=2, steps=2
+    ... )
+    >>> flexlink.certify_multivariable(designed, example_joint_plant(), example_joint_specification()).met
+    True
     """
     # A result of the synthesis has its controller.
     law = getattr(controller, "controller", controller)
@@ -358,6 +374,12 @@ def c_source(controller: Any, prefix: str = "controller", number: c_code.Number 
     Returns
     -------
     str
+
+    Examples
+    --------
+    >>> law = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[2.0]], dt_s=0.01)
+    >>> "hub_step" in flexlink.c_source(law, prefix="hub", number="float")
+    True
     """
     law = getattr(controller, "controller", controller)
     return c_code.c_source(_as_controller(law, 1), prefix, number)

@@ -40,7 +40,35 @@ prbs = front_door(excitation.prbs)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Shown, simulation.Trajectory):
-    """A simulated experiment: fields as in `plant.Trajectory`; `record` makes a `Record` of it."""
+    """A simulated experiment of T samples; `record` makes a `Record` of it. All arrays (T,), read-only.
+
+    Attributes
+    ----------
+    time_s : ndarray
+        Instants of the samples, s.
+    voltage_V : ndarray
+        Commanded voltage, held from its instant to the next.
+    hub_angle_rad, tip_m : ndarray
+        As measured, before the voltage of the same row takes effect: with effects of the sensors, and with
+        noise if the simulation was given a generator.
+    hub_angle_true_rad, tip_true_m : ndarray
+        Before every effect of a sensor and without noise.
+    tip_acceleration_m_s2 : ndarray
+        Zero unless an accelerometer was asked for.
+    hub_speed_rad_s, tip_deflection_m : ndarray
+        Speed of the hub, and deflection of the tip from the straight link, as measured.
+
+    Raises
+    ------
+    ValueError
+        An array has another shape than the others.
+
+    Examples
+    --------
+    >>> run = flexlink.simulate(flexlink.paper_link(), flexlink.prbs(8, 4, 6.0, 500))
+    >>> run.hub_angle_rad.shape, run.record("tip_m").dt_s
+    ((500,), 0.005)
+    """
 
     @property
     def dt_s(self) -> float:
@@ -59,9 +87,24 @@ class Simulation(Shown, simulation.Trajectory):
 
 @front_door
 def effect(name: str, **parameters: Any) -> Effect:
-    """An effect that a rig file does not describe: friction, backlash, delay, ... (`plant.EFFECTS`).
+    """Return an effect that a rig file does not describe: friction, backlash, delay and others.
 
-    Raises ValueError for an unknown name (and lists the known ones) or an unsuitable parameter.
+    Parameters
+    ----------
+    name : str
+        Of one of `plant.EFFECTS`, as "coulomb_friction" or "backlash".
+    **parameters
+        Its sizes, their units in the names: `torque_Nm=0.02`.
+
+    Returns
+    -------
+    Effect
+        For `simulate` and `SampledArm`.
+
+    Raises
+    ------
+    ValueError
+        An unknown name (the message lists the known ones) or an unsuitable parameter.
 
     Examples
     --------
@@ -84,13 +127,35 @@ def simulate(
     n_modes: int | None = None,
     substep_s: float = SUBSTEP_S,
 ) -> Simulation:
-    """Drive a machine from rest with a held voltage (T,).
+    """Drive a machine from rest with a held voltage.
 
-    effects: one or several of `effect`. rng: a generator or the seed of one, for the sensor noise; without it
-    there is none. dt_s: sampling time, s (default: the rig's). hub_torque_Nm, tip_force_N: (T,) from outside.
-    n_modes: of the link (default: those that the sampling time shows). substep_s: longest step, s, where the
-    machine is not linear. Raises ValueError for a signal that is not (T,) or not finite, or an effect given
-    twice.
+    Parameters
+    ----------
+    rig : Rig
+        The nominal arm.
+    voltage_V : (T,) array
+        Commanded voltage, V; before the first sample it is zero.
+    effects : Effect or sequence of them
+        What the machine has beside the rig.
+    rng : numpy Generator or int, optional
+        Source of the sensor noise, or its seed; without it there is no noise.
+    dt_s : float, optional
+        Sampling time, s; by default the rig's.
+    hub_torque_Nm, tip_force_N : (T,) array, optional
+        Torque on the hub and transverse force at the tip from outside, held over each sample.
+    n_modes : int, optional
+        Modes of the link; by default those that the sampling time shows.
+    substep_s : float
+        Longest step, s, where the machine is not linear.
+
+    Returns
+    -------
+    Simulation
+
+    Raises
+    ------
+    ValueError
+        A signal that is not (T,) or not finite, or an effect given twice.
 
     Examples
     --------

@@ -131,6 +131,13 @@ def identify_frf(
     ------
     ValueError
         A response that holds too little, or options that do not go together.
+
+    Examples
+    --------
+    >>> response = flexlink.empirical_frf(example_record(), omega_min_rad_s=5.0, omega_max_rad_s=60.0)
+    >>> fitted = flexlink.identify_frf(response, n_real=0, n_pairs=1)
+    >>> fitted.model.poles.omega_rad_s(response.dt_s).round()
+    array([20.])
     """
     chosen = options_of(IdentOptions, options, settings)
     return frequency_fit.identify_frf(response, chosen, embedding, shared_gain_std=shared_gain_std)
@@ -165,6 +172,12 @@ def identify_mimo(
     ------
     ValueError
         As of `identify`.
+
+    Examples
+    --------
+    >>> found = flexlink.identify_mimo(example_two_joints(), n_real=0, n_pairs=1)
+    >>> found.model.poles.omega_rad_s(0.01).round(1), found.rank_one
+    (array([30.]), (True,))
     """
     chosen = options_of(IdentOptions, options, settings)
     used = _records(records)
@@ -190,6 +203,14 @@ def matrix_posterior(
     -------
     MatrixPosterior
         `at(omega_rad_s)` has the balls.
+
+    Examples
+    --------
+    >>> found = flexlink.identify_mimo(example_two_joints(), n_real=0, n_pairs=1)
+    >>> omega = np.array([10.0, 30.0, 100.0])
+    >>> balls = flexlink.matrix_posterior(example_two_joints(), found).at(omega)
+    >>> balls.holds(found.model.frequency_response(omega))
+    array([ True,  True,  True])
     """
     return matrix_response.matrix_posterior(_records(records), identification, level=level)
 
@@ -273,6 +294,8 @@ def error_surface(
         omega in rad/s and zeta, or beta and gamma of the paper.
     first, second : (n,) array, optional
         Grids of these; by default n_points of each around the identified pair.
+    n_points : int
+        Points of each default grid.
 
     Returns
     -------

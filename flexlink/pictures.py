@@ -38,8 +38,20 @@ __all__ = ["bode", "nichols", "nyquist", "plot", "step"]
 def plot(result: object) -> Figure:
     """Draw records, poles, a response with its ellipses, loop gains or causes, as on the pages.
 
-    Returns a `matplotlib.figure.Figure`; save it with `figure.savefig("response.png")`. Raises TypeError if
-    there is no picture of the argument.
+    Parameters
+    ----------
+    result : object
+        A record, a model, an uncertainty, a design, a certificate or a diagnosis.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Save it with `figure.savefig("response.png")`.
+
+    Raises
+    ------
+    TypeError
+        There is no picture of the argument.
 
     Examples
     --------
@@ -161,7 +173,20 @@ def nyquist(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: A
 def nichols(loop: Any, controller: Any = None, *, ax: Any = None, omega_rad_s: Any = None) -> Figure:
     """Draw a loop on a Nichols chart: gain [dB] over phase, with lines of constant closed-loop gain.
 
-    Parameters and what is returned as of `nyquist`.
+    Parameters
+    ----------
+    loop : object
+        A design or a certificate, or a plant with a controller beside it, each as for `bode`.
+    controller : object, optional
+        Of a plant that is given alone.
+    ax : axes of matplotlib, optional
+        To draw on in place of a new figure.
+    omega_rad_s : (F,) array, optional
+        Frequencies, rad/s; by default those that show the loop.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
 
     Examples
     --------

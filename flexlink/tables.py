@@ -43,7 +43,20 @@ def table(result: object) -> pd.DataFrame:
     and parameter, with its 95 % interval and two probabilities: that the effect is `present`, and that it is
     the `main_cause` (these sum to one). Error surface: a row per grid point. Youla bracket: a row per plant.
     Summary of a run: a row per fact, with its key in the JSON answer.
-    Raises TypeError for anything else.
+
+    Parameters
+    ----------
+    result : object
+        One of these.
+
+    Returns
+    -------
+    pandas.DataFrame
+
+    Raises
+    ------
+    TypeError
+        For anything else.
 
     Examples
     --------

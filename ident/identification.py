@@ -131,7 +131,41 @@ class FittedRecords(Shown):
 
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Identification(FittedRecords):
-    """A fitted model of one input and one output, and how well it fits: residuals (T - delay,).
+    """A fitted model of one input and one output, and how well it fits.
+
+    Attributes
+    ----------
+    model : GobfModel
+        The model: poles, coefficients, sampling time, integrators and delay.
+    fit_percent : ndarray, shape (K,)
+        Of each of the K records: 100 (1 - |residual| / |y - mean y|).
+    residuals : tuple of ndarray, shape (T - delay,) each
+        Measured minus fitted output of each record, offset and initial state taken off, in its unit.
+    noise_std : float
+        Standard deviation of the residuals, output units.
+    rss : float
+        Residual sum of squares over all records.
+    structure : Structure
+        Integrators, delay, direct term, offset and initial state, after the data decided what was left open.
+    order_table : tuple of OrderStep
+        Every structure that was tried, with its residual sum of squares.
+    verdicts, prior_tests : tuple of Finding, tuple of PriorTest
+        What the data say on each question that was left to them and on each thing that was stated as known.
+    search, tangent_optimality : SearchTrace, float
+        What the search for the poles did, and the share of the residual (0 to 1) that moving the poles could
+        still take off to first order: 0 at an optimum.
+    records, record_names : tuple of Record, tuple of str
+        What it was made from; records are not stored in files.
+    n_fixed : tuple of int
+        Real poles and pairs that were given (integrators counted).
+    noise_filter : ndarray
+        A(q) of the noise model behind which everything was fitted; 1 for white noise.
+    order_given : bool
+        The order was stated, not chosen from the data.
+    fit_s : float
+        Seconds that the fit took, nan where nobody measured.
+    advise : callable
+        Further warnings, looked for when they are first asked for; `warnings` has them.
 
     Examples
     --------

@@ -65,6 +65,14 @@ class Uncertainty(ResponsePosterior):
 
     Attributes
     ----------
+    poles, mean, covariance_factor : Poles, ndarray (n,), ndarray (n, m)
+        Basis of the posterior, mean of its n coefficients and a factor of their covariance.
+    dt_s, integrators, input_delay_samples, has_feedthrough, fir_length, unstable
+        Sampling time, s, and the structure around the basis.
+    input_name, output_name : str
+        Columns of the record.
+    report : object
+        What the estimate rests on: samples, noise model, probability of a missing mode.
     nominal_poles : Poles
         Of the identified model.
     prior_missed_mode : float

@@ -55,6 +55,11 @@ def prbs(
     ------
     ValueError
         A register length outside 2..20, a hold or length below 1, a bad amplitude or register.
+
+    Examples
+    --------
+    >>> flexlink.prbs(register_length=3, hold_samples=1, amplitude_V=2.0, n_samples=7)
+    array([ 2.,  2.,  2., -2.,  2., -2., -2.])
     """
     if not 2 <= register_length <= 20:
         raise ValueError(f"register_length must be 2..20; got {register_length}")
@@ -187,6 +192,12 @@ def multisine(
     ------
     ValueError
         Lines that are none or stand twice, or a number that is out of its range.
+
+    Examples
+    --------
+    >>> voltage = flexlink.multisine(range(1, 100), 1000, 2.0, default_rng(1), periods=2)
+    >>> voltage.shape, float(voltage.std().round(6))
+    ((2000,), 2.0)
     """
     harmonics = np.asarray(lines, dtype=np.int64)
     if harmonics.ndim != 1 or harmonics.size == 0 or np.unique(harmonics).size != harmonics.size:

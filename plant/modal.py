@@ -262,6 +262,12 @@ def linear_arm(rig: Rig, n_modes: int | None = None) -> control.StateSpace:
     control.StateSpace
         States (theta, q_1..q_M, their rates); inputs voltage_V, hub_torque_Nm (on the hub, from ground) and
         tip_force_N (transverse); outputs hub_angle_rad and tip_m = (r + L) theta + w(L).
+
+    Examples
+    --------
+    >>> arm = flexlink.linear_arm(flexlink.paper_link(), n_modes=2)
+    >>> arm.nstates, arm.input_labels
+    (6, ['voltage_V', 'hub_torque_Nm', 'tip_force_N'])
     """
     import control  # here, because it brings a plotting library with it
 

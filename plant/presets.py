@@ -18,6 +18,16 @@ def paper_link() -> Rig:
     radius with three quarters of the link's inertia about the axis, and a geared motor strong enough to bend
     the link by centimetres: 0.55 N m/V at stall, back-EMF braking 0.5 N m s/rad. Noise is one milliradian and
     half a millimetre.
+
+    Returns
+    -------
+    Rig
+
+    Examples
+    --------
+    >>> rig = flexlink.paper_link()
+    >>> rig.link.length_m, rig.sampling.dt_s
+    (1.0, 0.005)
     """
     return Rig(
         link=Link(

@@ -124,6 +124,12 @@ class Rig(_Checked):
 
     `tolerances` holds relative standard deviations of nominal values under dotted keys such as
     "hub.inertia_kg_m2"; a parameter that is not listed is exact.
+
+    Examples
+    --------
+    >>> rig = flexlink.Rig.from_toml("examples/gap_case/rig.toml")
+    >>> rig.link.length_m, rig.tolerances["hub.inertia_kg_m2"]
+    (1.0, 0.05)
     """
 
     link: Link

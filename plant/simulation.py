@@ -293,15 +293,38 @@ class Simulator:
 class SampledArm(Simulator):
     """The machine as a controller sees it: measure at t_k, then hold a voltage until t_(k+1).
 
-    Same compiled stepper and same numbers as `simulate`. An object with a state.
+    Same compiled stepper and same numbers as `simulate`. It has a state: `measure`, `advance`, `reset`.
 
-    rig, effects, dt_s, n_modes, substep_s : see `simulate`.
+    Parameters
+    ----------
+    rig : Rig
+        The nominal arm.
+    effects : sequence of Effect
+        What the machine has beside it.
     rng : numpy.random.Generator, optional
         Source of the sensor noise; without it the measurement is noise-free.
+    dt_s : float, optional
+        Sampling time, s; by default the rig's.
+    n_modes : int, optional
+        Modes of the link; by default those that the sampling time shows.
+    substep_s : float
+        Longest step, s, where the machine is not linear.
     encoder_step_rad : float
         Step of the measured hub angle, 0 for none.
     tip_force_N : (T,), optional
         Acts at the tip from rest on, one value for each sample, beside what `advance` is given.
+
+    Raises
+    ------
+    ValueError
+        A time, a number of modes or an effect that cannot be.
+
+    Examples
+    --------
+    >>> arm = flexlink.SampledArm(flexlink.paper_link(), encoder_step_rad=0.001)
+    >>> arm.advance(6.0)
+    >>> arm.measure().shape
+    (2,)
     """
 
     output_names = OUTPUT_NAMES

@@ -219,7 +219,7 @@ def test_a_docstring_becomes_tables_text_and_drawn_formulas():
 
 
 def test_formulas_of_a_page_are_drawn_and_code_stays_code():
-    """MathML without a mark that Markdown would read, and a formula that begins a line stays in its sentence."""
+    """Without a mark that Markdown reads; a formula that begins a line stays in its sentence."""
     markdown = pytest.importorskip("markdown")
     hook = pages()
     page = "Of\n$`V V^*`$ and $`a_1 b_1`$ x_1:\n\n$$\n\\frac{a}{b}\n$$\n\n```text\n$`left`$\n```\n"

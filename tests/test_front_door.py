@@ -15,7 +15,9 @@ from pathlib import Path
 import control
 import numpy as np
 import pytest
+from docstring_parser import DocstringStyle, parse
 from matplotlib.figure import Figure
+from numpy.random import default_rng
 from scipy.signal import dlti, lfilter, lti
 from threadpoolctl import threadpool_info, threadpool_limits
 
@@ -51,17 +53,62 @@ def example_specification() -> flexlink.Specification:
     return flexlink.Specification(bandwidth_rad_s=1.0, integrator=True, controller_order=2)
 
 
+def example_two_joints() -> flexlink.Record:
+    """Two inputs and two outputs of one mode, 30 rad/s, that both motors drive and both sensors see."""
+    rng = np.random.default_rng(2)
+    u = rng.standard_normal((1000, 2))
+    poles = flexlink.Poles.from_continuous(omega_rad_s=[30.0], zeta=[0.05], dt_s=0.01)
+    seen, driven, shape = [1.0, 0.4], [1.0, -0.3], [1.0, 0.5]
+    y = 0.01 * rng.standard_normal((1000, 2))
+    for row, sensor in enumerate(seen):
+        for column, motor in enumerate(driven):
+            coefficients = [sensor * motor * part for part in shape]
+            y[:, row] += flexlink.GobfModel(poles, coefficients, dt_s=0.01).simulate(u[:, column])
+    return flexlink.Record(u, y, 0.01)
+
+
+def example_joint_plant() -> flexlink.MultivariablePlant:
+    """The plant of that record, with its uncertainty from 0.6 rad/s on: a period of the record's length."""
+    found = flexlink.identify_mimo(example_two_joints(), n_real=0, n_pairs=1)
+    posterior = flexlink.matrix_posterior(example_two_joints(), found)
+    ball = flexlink.ResponseBall.of(posterior, lowest_rad_s=0.6)
+    return flexlink.MultivariablePlant("two joints", found.to_control(), ball)
+
+
+def example_joint_specification() -> flexlink.MultivariableSpecification:
+    joint = flexlink.Specification(modulus_margin=0.3, effort_limit=1.0)
+    return flexlink.MultivariableSpecification(joints=(joint, joint), controller_order=2)
+
+
+def example_case() -> flexlink.Case:
+    """The paper's link with a joint that rubs, which its maker does not know."""
+    rig, rubbing = flexlink.paper_link(), flexlink.effect("coulomb_friction", torque_Nm=0.05)
+    experiments = []
+    for name, role, amplitude_V in (("a", "estimation", 6.0), ("b", "held_out", 4.0)):
+        voltage = flexlink.prbs(8, 4, amplitude_V, 600)
+        run = flexlink.simulate(rig, voltage, [rubbing], rng=default_rng(int(amplitude_V)))
+        experiments.append(flexlink.Experiment(name, role, run.voltage_V, run.output))
+    return flexlink.Case("arm", rig, tuple(experiments))
+
+
 @cache
 def example_spread() -> flexlink.Uncertainty:
     return flexlink.uncertainty(flexlink.identify(example_record(), n_pairs=1, n_real=0))
 
 
+# What examples of docstrings may use; the site shows these functions beside them.
 GIVEN = {
+    "control": control,
     "flexlink": flexlink,
-    "default_rng": np.random.default_rng,
+    "np": np,
+    "default_rng": default_rng,
     "example_record": example_record,
     "example_plant": example_plant,
     "example_specification": example_specification,
+    "example_two_joints": example_two_joints,
+    "example_joint_plant": example_joint_plant,
+    "example_joint_specification": example_joint_specification,
+    "example_case": example_case,
 }
 
 
@@ -169,6 +216,24 @@ def test_ellipses_that_miss_the_model_are_in_doubt_and_so_is_their_certificate()
     spread = flexlink.uncertainty(found, coloured_noise=True, max_ar_order=1)
     assert "the ellipses, and what is certified for them, may be too small" in repr(spread)
     assert "may be too small" in repr(flexlink.certify(law, spread, asked))
+
+
+def test_every_name_has_an_example_and_says_its_parameters_and_what_it_returns():
+    """A reference page is whole: numpydoc sections, a type beside every name, an example of each."""
+    for name in flexlink.__all__:
+        thing = getattr(flexlink, name)
+        described = parse(inspect.cleandoc(thing.__doc__), DocstringStyle.NUMPYDOC)
+        assert described.examples, name
+        if hasattr(thing, "model_fields"):
+            continue  # settings: the site has a table of their fields
+        listed = {
+            part.strip().lstrip("*") for entry in described.params for part in entry.arg_name.split(",")
+        }
+        # Settings by keyword are fields of the options that stand beside them.
+        asked = set(inspect.signature(thing).parameters) - {"settings"}
+        assert asked <= listed, f"{name}: {asked - listed}"
+        if inspect.isfunction(thing):
+            assert described.many_returns, name
 
 
 def test_every_name_is_there_and_shown_in_an_example():

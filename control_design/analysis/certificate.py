@@ -174,6 +174,13 @@ class Certificate(Shown):
     Notes
     -----
     Nothing is checked here: `certify` makes it.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    >>> certificate = flexlink.certify(law, example_plant(), example_specification())
+    >>> certificate.certified, round(certificate.plants[0].worst_margins.modulus, 2)
+    (True, 0.72)
     """
 
     table_in_notebook = True

@@ -372,6 +372,13 @@ class ClosedLoopTrajectory(Shown):
     ValueError
         The arrays differ in length, or `output` is not (T, Y). Values are not checked: a run that diverged
         holds inf and nan.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    >>> run = flexlink.simulate_loop(law, example_plant(), [1.0] * 400)
+    >>> run.output.shape, run.command.shape
+    ((400, 1), (400,))
     """
 
     time_s: Real
@@ -881,6 +888,13 @@ def step_metrics(trajectory: ClosedLoopTrajectory, *, settling_band: float = _SE
     -----
     An output of nan, as of a simulation that ran away, is inside of no band: it does not settle, and
     overshoot, undershoot and steady error are nan.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[0.0]], dt_s=0.01)
+    >>> metrics = flexlink.step_metrics(flexlink.simulate_loop(law, example_plant(), [1.0] * 400))
+    >>> round(metrics.rise_time_s, 2), round(metrics.overshoot_percent, 1)
+    (0.27, 6.8)
     """
     reference = trajectory.reference
     measured = trajectory.measured

@@ -219,6 +219,14 @@ class MultivariableCertificate(Shown):
     ------
     ValueError
         There are no verdicts (Python's error for the maximum of nothing).
+
+    Examples
+    --------
+    >>> law = flexlink.Controller.proportional(0.01, 0.01)
+    >>> both = control.append(law.to_control(), law.to_control())
+    >>> plant, asked = example_joint_plant(), example_joint_specification()
+    >>> flexlink.certify_multivariable(both, plant, asked).met
+    True
     """
 
     table_in_notebook = True

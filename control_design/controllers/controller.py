@@ -68,6 +68,14 @@ class Controller(Law):
     ------
     ValueError
         For matrices, limits, delay or gain that do not fit, or a gain that would wind up.
+
+    Examples
+    --------
+    >>> law = flexlink.Controller([[1.0]], [[0.05]], [[1.0]], [[2.0]], dt_s=0.01, input_limit=24.0)
+    >>> law.order
+    1
+    >>> law.engineers_numbers().rows()
+    [('PI', 'Kp = 1.975, Ti = 0.395 s')]
     """
 
     kind = "controller"

@@ -15,7 +15,14 @@ from control_design.plants.frequency_grid import GridOptions
 class YoulaOptions(GridOptions):
     """Size of the basis of Q and of the grids of `youla_bracket`; the defaults take about two seconds a
     plant, and were chosen for that. Further fields (points of the dense check and the like) are those of
-    `GridOptions`. A value out of its bounds or an unknown key is refused by pydantic (ValueError)."""
+    `GridOptions`. A value out of its bounds or an unknown key is refused by pydantic (ValueError).
+
+    Examples
+    --------
+    >>> small = flexlink.YoulaOptions(grid_points=60, dense_points=1000)
+    >>> flexlink.youla_bracket(example_plant(), example_specification(), small).floor <= 1.0
+    True
+    """
 
     real_poles: int = Field(default=32, ge=2, le=200, description="real poles of the basis of Q")
     mirrored_poles: int = Field(

@@ -106,6 +106,13 @@ class ResponseBall:
     ValueError
         For shapes that do not fit, values that are not finite, an unstable Li or a radius that is not
         positive.
+
+    Examples
+    --------
+    >>> found = flexlink.identify_mimo(example_two_joints(), n_real=0, n_pairs=1)
+    >>> posterior = flexlink.matrix_posterior(example_two_joints(), found)
+    >>> flexlink.ResponseBall.of(posterior, lowest_rad_s=0.6).lowest_rad_s
+    0.6
     """
 
     Lo: Real
@@ -209,6 +216,15 @@ class MultivariablePlant(NominalPlant):
     Notes
     -----
     Neglected: products of the ball and a channel's error.
+
+    Examples
+    --------
+    >>> found = flexlink.identify_mimo(example_two_joints(), n_real=0, n_pairs=1)
+    >>> posterior = flexlink.matrix_posterior(example_two_joints(), found)
+    >>> ball = flexlink.ResponseBall.of(posterior, lowest_rad_s=0.6)
+    >>> plant = flexlink.MultivariablePlant("two joints", found.to_control(), ball)
+    >>> plant.name, plant.dt_s
+    ('two joints', 0.01)
     """
 
     name: str

@@ -367,7 +367,9 @@ class UncertainPlant(NominalPlant, Shown):
         Discrete, one input and one output: of python-control (ss, tf), scipy (dlti), or anything with
         `to_control()`. A result of `flexlink.uncertainty` has its own ellipses, one of `identify_frf` those
         of its posterior; anything else is exact unless `uncertainty` is given. The state space that is made
-        of it is kept as `nominal`, which is accepted in its place.
+        of it is kept as `nominal`.
+    nominal : control.StateSpace, optional
+        In place of `plant`.
     name : str
         Not empty; errors and tables name the plant by it.
     uncertainty : object or None

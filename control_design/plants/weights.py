@@ -42,6 +42,12 @@ class RationalWeight(Settings):
         (of pydantic) for coefficients that are not finite, a first coefficient of 0, a numerator of higher
         degree than the denominator, or a pole in the right half plane. Poles on the imaginary axis are
         allowed.
+
+    Examples
+    --------
+    >>> weight = flexlink.RationalWeight(numerator=(0.5, 2.6), denominator=(1.0, 0.0026))
+    >>> flexlink.Specification(sensitivity_weight=weight, controller_order=3).bandwidth_rad_s is None
+    True
     """
 
     numerator: tuple[float, ...] = Field(min_length=1, description="coefficients, highest power of s first")

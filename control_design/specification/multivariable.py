@@ -55,6 +55,13 @@ class MultivariableSpecification(Settings):
     The weighted sensitivity is W1 S with W1 = diag of the joints' tracking weights, the effort W3 K S alike,
     the modulus m S with m = diag of the modulus margins: each in the largest singular value, by itself.
     Keys of a joint that no matrix design reads are refused.
+
+    Examples
+    --------
+    >>> joint = flexlink.Specification(modulus_margin=0.3, effort_limit=1.0)
+    >>> asked = flexlink.MultivariableSpecification(joints=(joint, joint), controller_order=2)
+    >>> len(asked.joints)
+    2
     """
 
     joints: tuple[Specification, ...] = Field(min_length=1, description="one specification per joint")

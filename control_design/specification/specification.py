@@ -117,7 +117,16 @@ class SpecificationError(ValueError):
 
 
 class Specification(Settings):
-    """Requirements on the closed loop, for every plant in the uncertainty set."""
+    """Requirements on the closed loop, for every plant in the uncertainty set.
+
+    Examples
+    --------
+    >>> asked = flexlink.Specification(
+    ...     bandwidth_rad_s=5.0, effort_limit=160.0, structure="pid", notches=[{"frequency_hz": 22.9}, {}]
+    ... )
+    >>> len(asked.notches), asked.modulus_margin
+    (2, 0.5)
+    """
 
     bandwidth_rad_s: _Positive | None = Field(
         default=None,

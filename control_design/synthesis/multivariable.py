@@ -116,6 +116,14 @@ class MultivariableResult(Shown):
         Where each requirement is worst, the largest first: plant, frequency in rad/s, value and joint.
     steps : int
         Of all descents, also those not accepted.
+
+    Examples
+    --------
+    >>> designed = flexlink.synthesise_multivariable(
+    ...     example_joint_plant(), example_joint_specification(), rounds=2, steps=2
+    ... )
+    >>> designed.outcome.name, designed.gamma <= 1.0
+    ('MET_ON_GRID', True)
     """
 
     outcome: Outcome

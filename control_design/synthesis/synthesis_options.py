@@ -17,6 +17,12 @@ class SynthesisOptions(GridOptions):
 
     Sizes of the grids come from `GridOptions`. A value out of its bounds or an unknown key is refused by
     pydantic (ValueError). The defaults are chosen for that time.
+
+    Examples
+    --------
+    >>> quick = flexlink.SynthesisOptions(starts=1, dense_points=1000)
+    >>> flexlink.synthesise(example_plant(), example_specification(), quick).outcome.name
+    'MET_ON_GRID'
     """
 
     starts: int = Field(
@@ -41,6 +47,13 @@ class MultivariableOptions(Settings):
     """Effort of the search for one controller of several joints; the defaults take seconds for two joints.
 
     Chosen for that time. A value out of its bounds or an unknown key is refused by pydantic (ValueError).
+
+    Examples
+    --------
+    >>> quick = flexlink.MultivariableOptions(rounds=2, steps=2)
+    >>> plant, asked = example_joint_plant(), example_joint_specification()
+    >>> flexlink.synthesise_multivariable(plant, asked, quick).controller.order
+    2
     """
 
     starts: int = Field(default=1, ge=1, le=50, description="starts to go down from; the best counts")

@@ -110,6 +110,12 @@ class SynthesisResult(Shown):
         What it is for; not stored.
     specification : Specification or None
         What it is for; not stored.
+
+    Examples
+    --------
+    >>> designed = flexlink.synthesise(example_plant(), example_specification(), starts=1, dense_points=1000)
+    >>> designed.gamma <= 1.0, designed.controller.dt_s
+    (True, 0.01)
     """
 
     outcome: Outcome

@@ -56,6 +56,13 @@ class Experiment:
     ValueError
         One line: a shape that does not fit, a value that is not finite, fewer than 20 samples, an output that
         never moves. Arrays are copied and cannot be written to.
+
+    Examples
+    --------
+    >>> voltage = flexlink.prbs(8, 4, 6.0, 600)
+    >>> run = flexlink.simulate(flexlink.paper_link(), voltage, rng=default_rng(1))
+    >>> flexlink.Experiment("prbs", "estimation", run.voltage_V, run.output).outputs
+    ('hub_angle_rad', 'tip_m')
     """
 
     name: str
@@ -141,6 +148,12 @@ class Case(RecordedCase[Experiment]):
     ValueError
         One line: no estimation or no held-out experiment, a name that comes twice, experiments that differ
         in their outputs, or a noise level of zero.
+
+    Examples
+    --------
+    >>> case = example_case()
+    >>> case.name, [experiment.role for experiment in case.experiments]
+    ('arm', ['estimation', 'held_out'])
     """
 
     name: str

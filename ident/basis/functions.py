@@ -174,6 +174,11 @@ def basis_response(poles: Poles, z: ComplexArray) -> ComplexArray:
         L_k(z) = \frac{\sqrt{1 - |p_k|^2}}{z - p_k} \prod_{i < k} \frac{1 - \bar p_i z}{z - p_i},
 
     in the real form that has two functions for a pair (Ninness and Gustafsson, IEEE TAC 42(4), 1997).
+
+    Examples
+    --------
+    >>> flexlink.basis_response(flexlink.Poles(real=[0.5]), np.array([1.0 + 0.0j])).round(4)
+    array([[1.7321+0.j]])
     """
     return _response_and_all_pass(poles, z)[0]
 
@@ -303,6 +308,13 @@ def regressor(poles: Poles, u: RealArray) -> RealArray:
     ------
     ValueError
         For another shape of u.
+
+    Examples
+    --------
+    >>> flexlink.regressor(flexlink.Poles(real=[0.5]), np.array([1.0, 0.0, 0.0])).round(3)
+    array([[0.   ],
+           [0.866],
+           [0.433]])
     """
     return _through(poles, u)[0].T
 

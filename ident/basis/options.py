@@ -45,6 +45,12 @@ class IdentOptions(Settings):
     What you know is kept and tested against the data (`ident.checks.prior_tests`). The data choose numbers of
     poles that are None, record length and sampling time the box of the search; bounds of yours also bind the
     refinement.
+
+    Examples
+    --------
+    >>> options = flexlink.IdentOptions(n_real=0, n_pairs=1, omega_max_rad_s=100.0)
+    >>> flexlink.identify(example_record(), options).model.poles.order
+    2
     """
 
     # Most numbers that may be stated (8, 12), and that are chosen from the data (4, 5): chosen for arms, with
@@ -302,7 +308,15 @@ class IdentOptions(Settings):
 
 
 class EmbeddingOptions(Settings):
-    """Settings of the uncertainty estimate."""
+    """Settings of the uncertainty estimate.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> spread = flexlink.uncertainty(found, flexlink.EmbeddingOptions(coloured_noise=False))
+    >>> spread.at([20.0]).level
+    0.95
+    """
 
     fir_length: int | None = Field(
         default=None,

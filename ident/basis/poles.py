@@ -34,6 +34,12 @@ class Poles:
     ------
     ValueError
         If a pole is not inside the unit circle, not finite, or of a pair and not above the real axis.
+
+    Examples
+    --------
+    >>> poles = flexlink.Poles.from_continuous(omega_rad_s=[20.0], zeta=[0.05], dt_s=0.01)
+    >>> poles.order, poles.omega_rad_s(0.01).round(6)
+    (2, array([20.]))
     """
 
     real: RealArray = field(default_factory=lambda: np.zeros(0))

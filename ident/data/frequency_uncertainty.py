@@ -60,6 +60,14 @@ class FrequencyUncertainty:
     ------
     ValueError
         A shape or a number does not fit; the message names the first frequency at fault.
+
+    Examples
+    --------
+    >>> omega = np.array([1.0, 10.0, 100.0])
+    >>> covariance = np.tile(1e-4 * np.eye(2), (3, 1, 1))
+    >>> measured = flexlink.FrequencyUncertainty(omega, 1 / (1 + 0.1j * omega), covariance, dt_s=0.005)
+    >>> measured.ellipse(0.95).semi_major.round(4)
+    array([0.0245, 0.0245, 0.0245])
     """
 
     omega_rad_s: RealArray

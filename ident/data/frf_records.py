@@ -55,6 +55,13 @@ class FrfRepeats:
     ------
     ValueError
         Other shapes, no point, or numbers that are not finite.
+
+    Examples
+    --------
+    >>> omega_rad_s, response = [1.0, 1.0, 10.0, 10.0], [1.0, 1.02, 0.5 - 0.5j, 0.51 - 0.5j]
+    >>> repeats = flexlink.FrfRepeats(omega_rad_s, response, ["monday"] * 4)
+    >>> repeats.band(5.0, 20.0).omega_rad_s
+    array([10., 10.])
     """
 
     omega_rad_s: RealArray

@@ -77,6 +77,12 @@ def empirical_frf(
     circular, from the residuals Y - G U of the same lines, widened to the quantile of F(2, 2 (n - 1)) at
     `level` for n independent terms. Records with one instrument repeat distortion: a line of all of them
     together is one term, unless h = 0, where distortion stays unseen.
+
+    Examples
+    --------
+    >>> measured = flexlink.empirical_frf(example_record(), omega_max_rad_s=50.0)
+    >>> measured.centre.shape == measured.omega_rad_s.shape
+    True
     """
     records = (records,) if isinstance(records, Record) else records
     spectra = spectra_of(records, periodic)

@@ -58,6 +58,11 @@ def band_limited(
     -----
     The filter starts with its steady state for the first sample, so that a lightly damped plant not at rest
     needs an unknown initial state in the fit.
+
+    Examples
+    --------
+    >>> flexlink.band_limited(example_record(), 1.0, 100.0, skip_s=1.0).output.shape
+    (1900, 1)
     """
     import scipy.signal  # half a second that logs which are refused do not need
 

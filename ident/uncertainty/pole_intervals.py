@@ -87,6 +87,14 @@ def pole_intervals(posterior: ResponsePosterior, poles: Poles, level: float = 0.
     ------
     ValueError
         Unless the posterior has each of these poles twice, and 0 < level < 1.
+
+    Examples
+    --------
+    >>> found = flexlink.identify(example_record(), n_pairs=1, n_real=0)
+    >>> intervals = flexlink.pole_intervals(flexlink.uncertainty(found), found.model.poles)
+    >>> low, high = intervals.omega_rad_s[0]
+    >>> bool(low < 20.0 < high)
+    True
     """
     everything = posterior.poles.values
     for pole in (*poles.real, *poles.pairs):
