@@ -102,6 +102,19 @@ def test_how_well_it_works_is_what_the_results_say():
     assert how_well.PAGE.read_text(encoding="utf-8") == how_well.page()
 
 
+def test_numbers_beside_other_tools_are_those_of_how_well_it_works():
+    text = (DOCS / "beside_others.md").read_text(encoding="utf-8")
+    measured = how_well.PAGE.read_text(encoding="utf-8")
+    rows = re.findall(r"^\| [^|]+ \| ([^|]*\d[^|]*) \| `python -m (benchmarks\.\w+)` \|$", text, re.MULTILINE)
+    assert len(rows) == 3
+    rows += [("52 of 64", "benchmarks.mujoco_cases"), ("0 of 16", "benchmarks.mujoco_cases")]
+    rows += [("100.0 of 100 with 6 parameters in 6.3 s", "benchmarks.landau_transmission")]
+    for numbers, command in rows:
+        assert numbers in text
+        assert numbers in measured
+        assert importlib.util.find_spec(command), command
+
+
 def test_files_and_tests_that_pages_name_are_there():
     defined = {
         name
