@@ -37,10 +37,10 @@ jupyter:
 """
 UNITS = {
     "V_per_rad": "V/rad", "Vs_per_rad": "V s/rad", "rad_per_V": "rad/V", "Vs_rad": "V s/rad", "Nm_A": "N m/A",
-    "per_s": "1/s", "rad_s2": "rad/s²", "rad_s": "rad/s", "m_s2": "m/s²", "m_s": "m/s", "Nms": "N m s", "Nm": "N m",
-    "kg_m3": "kg/m³", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg", "rad": "rad", "deg": "deg", "Hz": "Hz",
-    "hz": "Hz", "dB": "dB", "db": "dB", "percent": "%", "samples": "samples", "Pa": "Pa", "ohm": "ohm", "N": "N",
-    "V": "V", "m": "m", "s": "s",
+    "per_s": "1/s", "rad_s2": "rad/s²", "rad_s": "rad/s", "m_s2": "m/s²", "m_s": "m/s",
+    "Nms": "N m s", "Nm": "N m", "kg_m3": "kg/m³", "kg_m2": "kg m²", "kg_m": "kg/m", "kg": "kg",
+    "rad": "rad", "deg": "deg", "Hz": "Hz", "hz": "Hz", "dB": "dB", "db": "dB", "percent": "%",
+    "samples": "samples", "Pa": "Pa", "ohm": "ohm", "N": "N", "V": "V", "m": "m", "s": "s",
 }  # fmt: skip
 SHOWN = {
     "look.html": ("What a log holds", "flexlink look logs/09_prbs.csv --out look.html"),
@@ -163,8 +163,11 @@ def roots() -> dict[str, type[BaseModel]]:
 
 CONFIGURATION_OVERVIEW = """# Configuration
 
-The models that check the files make these pages. An unknown key is refused by name.
+For those who edit a TOML file: every key of a run, a design file and a study. The models that check the
+files make these pages. An unknown key is refused by name.
 Examples: `examples/*.toml`. For rig and case files see [case files](../case_files.md)."""
+KEYS_OF_A_PAGE = """Keys of these tables, with unit, default and meaning. Keys in bold are required;
+all others may be left out."""
 CONFIGURATION_SHARED = """A design file also has these tables of a run: `[specification]`, `[synthesis]`,
 `[certificate]`, `[achievable_performance]` and `[reference_filter]`."""
 # Pages of the configuration: title, which file, its tables.
@@ -186,7 +189,7 @@ def configuration() -> dict[str, str]:
     """Pages with every key of a run, a design file and a study: unit, default, meaning."""
     made, lines = {}, ["| page | tables |", "|---|---|"]
     for name, (title, root, tables) in CONFIGURATION.items():
-        parts = [f"# {title}", "Keys in bold are required."]
+        parts = [f"# {title}", KEYS_OF_A_PAGE]
         for place, model in sections(roots()[root]):
             rows = [row(key, field) for key, field in keys(model)]
             if rows and re.split(r"[.:]", place)[0] in tables:
@@ -224,6 +227,10 @@ def row(key: str, field: Any, otherwise: str = "") -> str:
     )
 
 
+COMMAND_LINE = """What `flexlink COMMAND -h` prints: every option of every command.
+[Every command with an example](../commands.md) is the place to begin."""
+
+
 def command_line() -> str:
     """What `flexlink COMMAND -h` prints."""
     from typer.main import get_command
@@ -232,9 +239,9 @@ def command_line() -> str:
     from workflow.cli import _plug_in, app
 
     _plug_in(["-h"])
-    runner, parts = CliRunner(), ["# Command line"]
+    runner, parts = CliRunner(), ["# Command line", COMMAND_LINE]
     for name in ("", *get_command(app).commands):
-        shown = runner.invoke(app, [*name.split(), "--help"], prog_name="flexlink", terminal_width=100)
+        shown = runner.invoke(app, [*name.split(), "--help"], prog_name="flexlink", terminal_width=94)
         parts.append(f"## {f'flexlink {name}'.strip()}\n\n```text\n{shown.stdout.strip()}\n```")
     return "\n\n".join(parts) + "\n"
 

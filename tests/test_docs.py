@@ -98,6 +98,21 @@ def test_no_snippet_is_left_out():
     assert {page.stem for page in (DOCS / "tutorials").iterdir()} == set(NOTEBOOKS)
 
 
+def test_pages_speak_of_what_is_here_and_not_of_commits():
+    for page in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *DOCS.rglob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        commits = [word for word in re.findall(r"\b[0-9a-f]{7,8}\b", text) if re.search("[a-f]", word)]
+        assert [word for word in commits if re.search("[0-9]", word)] == [], page.name
+        assert "git show" not in text, page.name
+
+
+def test_a_page_begins_with_a_sentence_and_not_with_a_heading():
+    for page in DOCS.rglob("*.md"):
+        title, _, rest = page.read_text(encoding="utf-8").partition("\n\n")
+        assert title.startswith("# "), page.name
+        assert re.match(r"[A-Z`a-z\"]", rest), page.name
+
+
 def test_how_well_it_works_is_what_the_results_say():
     assert how_well.PAGE.read_text(encoding="utf-8") == how_well.page()
 
@@ -152,6 +167,9 @@ def test_every_key_of_a_configuration_has_a_meaning():
     text = "\n".join(hook.configuration().values())
     assert [key for _, _, key, _ in found if f"`{key}`" not in text] == []
     assert "| `bandwidth_rad_s` | rad/s | none |" in text
+    # Of endings that end alike the longer one is the unit.
+    assert "| `decay_min_per_s` | 1/s | none |" in text
+    assert hook.unit_of("back_emf_Vs_rad", "") == "V s/rad"
     assert "| **`amplitude_V`** | V |  | largest voltage |" in text
 
 
