@@ -783,6 +783,6 @@ def test_a_plant_module_of_the_users_own_is_not_taken_for_ours(tmp_path):
 def test_the_help_of_settings_is_one_screen_of_ordinary_types():
     for kind in (flexlink.Specification, flexlink.SynthesisOptions, flexlink.YoulaOptions):
         told = pydoc.plain(pydoc.render_doc(kind))
-        assert len(told.splitlines()) <= 40  # lines of a screen
+        assert len(told.splitlines()) <= 45  # lines of a screen, with an example
         assert not re.search("Annotated|FieldInfo|model_|pydantic_", told.partition("Method resolution")[0])
         assert all(re.search(rf"^ \|  {name}\b.*: \S", told, re.MULTILINE) for name in kind.model_fields)

@@ -121,11 +121,8 @@ class Specification(Settings):
 
     Examples
     --------
-    >>> asked = flexlink.Specification(
-    ...     bandwidth_rad_s=5.0, effort_limit=160.0, structure="pid", notches=[{"frequency_hz": 22.9}, {}]
-    ... )
-    >>> len(asked.notches), asked.modulus_margin
-    (2, 0.5)
+    >>> flexlink.Specification(bandwidth_rad_s=5.0, structure="pid", notches=[{}]).modulus_margin
+    0.5
     """
 
     bandwidth_rad_s: _Positive | None = Field(
