@@ -344,7 +344,12 @@ def docstring(name: str, thing: Any) -> str:
     # A class of results lists its attributes, anything else its parameters.
     for title, section in (("Parameters", "param"), ("Attributes", "attribute")):
         listed = [
-            (f"`{entry.arg_name}`", entry.type_name, entry.description)
+            # Names that share a line of a docstring may stand on lines of their own in a narrow column.
+            (
+                ", ".join(f"`{part}`" for part in entry.arg_name.split(", ")),
+                entry.type_name,
+                entry.description,
+            )
             for entry in described.params
             if entry.args[0] == section
         ]

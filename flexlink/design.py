@@ -85,6 +85,7 @@ def synthesise(
     plants : UncertainPlant or what makes one, or a sequence of them
         A system of python-control (ss, tf), a model or an uncertainty makes one.
     specification : Specification
+        What every plant has to meet.
     options : SynthesisOptions, optional
         Or its fields as settings: `starts=1`.
     rng : numpy Generator or int
@@ -145,6 +146,7 @@ def synthesise_jointly(
     plants : UncertainPlant or what makes one, or a sequence of them
         With an uncertainty that can be drawn from, as of `flexlink.uncertainty`.
     specification : Specification
+        What every plant has to meet.
     options : SynthesisOptions, optional
         Or its fields as settings.
     rng : numpy Generator or int
@@ -297,6 +299,7 @@ def synthesise_multivariable(
     Parameters
     ----------
     plants : MultivariablePlant or sequence of them
+        One for each operating point.
     specification : MultivariableSpecification
         One joint for each channel.
     options : MultivariableOptions, optional
@@ -333,7 +336,9 @@ def certify_multivariable(
     controller : Controller, MultivariableResult or discrete control.StateSpace
         A system leads from errors to commands, as in `certify`.
     plants : MultivariablePlant or sequence of them
+        What the controller has to work for.
     specification : MultivariableSpecification
+        One joint for each channel.
     dense_points : int
         Points of the grid.
 
@@ -366,6 +371,7 @@ def c_source(controller: Any, prefix: str = "controller", number: c_code.Number 
     Parameters
     ----------
     controller : Controller, SynthesisResult, Certificate or discrete system of python-control
+        The law; of a system, from error to command.
     prefix : str
         Start of every name in the source.
     number : 'double' or 'float'

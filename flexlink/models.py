@@ -157,6 +157,7 @@ def identify_mimo(
     Parameters
     ----------
     records : Record or sequence of Record
+        Of one machine: inputs (T, U), outputs (T, Y), one sampling time.
     options : IdentOptions, optional
         Or its fields as settings; with several outputs at most one integrator and no relative degree.
     free_shapes : bool
@@ -196,6 +197,7 @@ def matrix_posterior(
     records : Record or sequence of Record
         Those of the identification.
     identification : MimoIdentification
+        Of `identify_mimo`.
     level : float
         Between 0 and 1.
 
@@ -227,6 +229,7 @@ def uncertainty(
     Parameters
     ----------
     identification : Identification
+        Of `identify`.
     records : Record or sequence of Record, optional
         Those of the identification; not needed if it came from `flexlink.identify`.
     options : EmbeddingOptions, optional
@@ -286,6 +289,7 @@ def error_surface(
     Parameters
     ----------
     identification : Identification
+        Of `identify`.
     records : Record or sequence of Record, optional
         Those of the identification; not needed if it came from `flexlink.identify`.
     pair : int

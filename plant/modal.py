@@ -254,6 +254,7 @@ def linear_arm(rig: Rig, n_modes: int | None = None) -> control.StateSpace:
     Parameters
     ----------
     rig : Rig
+        The nominal arm.
     n_modes : int, optional
         Modes of the link; None takes `default_n_modes`.
 

@@ -232,6 +232,7 @@ def test_every_name_has_an_example_and_says_its_parameters_and_what_it_returns()
         # Settings by keyword are fields of the options that stand beside them.
         asked = set(inspect.signature(thing).parameters) - {"settings"}
         assert asked <= listed, f"{name}: {asked - listed}"
+        assert all(entry.description for entry in described.params), name
         if inspect.isfunction(thing):
             assert described.many_returns, name
 

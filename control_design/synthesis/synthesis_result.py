@@ -95,6 +95,7 @@ class SynthesisResult(Shown):
     outcome : Outcome
         Says what gamma means.
     controller : Controller
+        The best that was found; it means nothing where the outcome is not converged.
     gamma : float
         Largest weighted worst case over plants, ellipses and the dense grid; inf where nothing stable was
         found. Nothing of this class is checked: a synthesis fills it.

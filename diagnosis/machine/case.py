@@ -28,6 +28,7 @@ class Experiment:
     Parameters
     ----------
     name : str
+        By which answers name the record.
     role : "estimation" or "validation" (kept as "held_out")
         No parameter is fitted to validation records.
     voltage_V : (T,)
@@ -137,8 +138,11 @@ class Case(RecordedCase[Experiment]):
     Parameters
     ----------
     name : str
+        Stands on the page and in names of files.
     rig : Rig
+        Nominal values with their tolerances.
     experiments : tuple of Experiment
+        Its records: at least one for estimation and one for validation.
     model_error : float
         Share of the motion (RMS of an output about its mean) that a good model may miss; zero where the
         simulation is as good as the sensors.

@@ -36,6 +36,7 @@ def band_limited(
     Parameters
     ----------
     record : Record
+        Any number of inputs and outputs.
     low_rad_s, high_rad_s : float, optional
         Edges of the band, rad/s (3 dB); None leaves a side open.
     filter_order : int
