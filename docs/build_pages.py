@@ -46,8 +46,8 @@ SHOWN = {
     "look.html": ("What a log holds", "flexlink look logs/09_prbs.csv --out look.html"),
     "identify.html": (
         "A model from logs",
-        "flexlink identify logs/0*_V_rms_*.csv --output hub_angle_rad "
-        "--response 'without friction' --report identify.html",
+        "flexlink identify logs/0*_V_rms_*.csv --validation logs/09_prbs.csv --output hub_angle_rad \\\n"
+        "  --integrators 1 --delay 1 --real 1 --pairs 2 --response 'without friction' --report identify.html",
     ),
     "run/report.html": ("From records to a certified controller", "flexlink run --out run"),
     "diagnosis/gap_case.html": (
@@ -488,11 +488,16 @@ def gallery() -> str:
     """Links to the pages that `make docs` has drawn, with the command of each."""
     parts = [
         "# Gallery",
-        "Pages as flexlink writes them, each one file, drawn for this site by the command under it.",
+        "For those who want to see results before they install anything: pages as flexlink writes them. "
+        "Each is one file that opens without a network, drawn for this site by the command above it. "
+        "`flexlink simulate --out logs` makes the logs.",
     ]
     for name, (title, command) in SHOWN.items():
         if (GALLERY / name).is_file():
-            parts.append(f"## {title}\n\n[Open the page](pages/{name})\n\n    {command}")
+            frame = f'<iframe src="pages/{name}" title="{title}" loading="lazy" class="page"></iframe>'
+            parts.append(
+                f"## {title}\n\n```bash\n{command}\n```\n\n[Open the page alone](pages/{name})\n\n{frame}"
+            )
     if len(parts) == 2:
         parts.append("No page has been drawn here: `make docs` does it.")
     return "\n\n".join(parts) + "\n"
