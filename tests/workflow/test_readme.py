@@ -42,10 +42,19 @@ TRUE_HZ = sorted(abs(pole) / (2 * np.pi) for pole in linear_arm(paper_link()).po
 def test_the_readme_has_the_commands_that_are_tested():
     names = [command[0] for command in COMMANDS]
     first = ["simulate", "look", "init", "identify", "excite"]
-    assert names == [*first, "run", "run", "certify", "tune", "study", "diagnose", "blind", "paper"]
+    assert names == [*first, "run", "run", "certify", "tune", "study", "diagnose", "check", "blind", "paper"]
     of_readme = commands_of(README, r"\.venv/bin/flexlink")
     assert [command[0] for command in of_readme] == ["simulate", "run", "diagnose", "paper"]
     assert all(command in COMMANDS for command in of_readme)
+
+
+def test_what_logs_can_tell_of_the_model_of_the_page(call):
+    pytest.importorskip("mujoco")
+    numbers = call("check")["numbers"]
+    # One direction of gravity hardly shows in these logs; a small dry friction of the elbow does.
+    assert "gravity.y" in numbers["hidden"]
+    assert 0.01 < numbers["least"]["elbow.frictionloss"] < 0.2
+    assert any({"forearm.mass", "forearm.payload"} <= set(group["names"]) for group in numbers["alike"])
 
 
 def test_the_readme_is_short():
