@@ -35,6 +35,43 @@ _USUAL_NAMES = {
 }
 
 
+class _EarlierName(NamedTuple):
+    """A key or a value that an earlier version read."""
+
+    known_beside: str  # a key or a value that is known where the earlier one stood, so that no other is meant
+    today: str  # what to write today, as the end of a sentence
+
+
+# Keys and values that were renamed or taken away: files of earlier versions still state them. They are not
+# read any more, because a file with two names for one thing would have two answers; what is refused says what
+# to write today.
+_EARLIER_NAMES = {
+    "yardstick": _EarlierName("achievable_performance", "it is called achievable_performance today"),
+    "prefilter": _EarlierName("reference_filter", "it is called reference_filter today"),
+    "promise": _EarlierName("response", "it is called response today"),
+    "search": _EarlierName("axes", "a study computes its whole grid: state from, to and points in [[axes]]"),
+    "kp": _EarlierName("fixed", "it is called fixed.kp today"),
+    "ti_s": _EarlierName("fixed", "it is called fixed.ti_s today"),
+    "td_s": _EarlierName("fixed", "it is called fixed.td_s today"),
+    "tf_s": _EarlierName("fixed", "it is called fixed.tf_s today"),
+    "pi_d_notch": _EarlierName(
+        "pid", "write 'pid' with integrator = true or 'pd', and notches = [{}] with {} for each notch"
+    ),
+    "iterations": _EarlierName("agreeing_starts", "leave it out: a descent ends by itself"),
+    "exchange_tolerance": _EarlierName("agreeing_starts", "leave it out: it is fixed today"),
+    "scale_rad_s": _EarlierName("agreeing_starts", "leave it out: it is fixed today"),
+    "jobs": _EarlierName("agreeing_starts", "leave it out: study --jobs computes several designs"),
+    "growth_rounds": _EarlierName("rounds", "leave it out: set rounds and steps"),
+    "growth_steps": _EarlierName("rounds", "leave it out: set rounds and steps"),
+    "candidates": _EarlierName("rounds", "leave it out: set starts, rounds and steps"),
+    "renewals": _EarlierName("rounds", "leave it out: set starts, rounds and steps"),
+    "hull": _EarlierName("pairs_per_mode", "leave it out: the bound has no hulls today"),
+    "ellipse_rounds": _EarlierName("pairs_per_mode", "leave it out: it is fixed today"),
+    "boundary_samples": _EarlierName("corner_rad_s", "leave it out: it is fixed today"),
+    "prior_no_remainder": _EarlierName("prior_missed_mode", "leave it out: set prior_missed_mode"),
+}
+
+
 class _Fields(ModelMetaclass):
     """Metaclass of settings: `help` lists what a reader sets, and nothing of pydantic's."""
 
@@ -119,9 +156,10 @@ def _encloses_another(detail: ErrorDetails, details: Sequence[ErrorDetails]) -> 
 
 
 def meant(word: str, known: Sequence[str], what: str) -> str:
-    """What to write in place of a word that nobody knows: what other tools mean by it, or a word like it.
+    """What to write in place of a word that nobody knows: what it is called today, what other tools mean by
+    it, or a word like it.
 
-    Where there is neither, all that is known.
+    Where there is none of these, all that is known.
 
     Without known words: the list in the answer is empty.
 
@@ -134,6 +172,9 @@ def meant(word: str, known: Sequence[str], what: str) -> str:
     what : str
         What these are, in the plural: 'keys'.
     """
+    earlier = _EARLIER_NAMES.get(word)
+    if earlier is not None and earlier.known_beside in known:
+        return earlier.today
     for keys in _USUAL_NAMES.get(word, ()):
         if set(keys) <= set(known):
             return f"did you mean {' and '.join(keys)}?"
@@ -178,6 +219,10 @@ def _complaint(model: type[BaseModel], detail: ErrorDetails) -> str:
         return where + message
     message = message[:1].lower() + message[1:]
     message = _IN_OUR_WORDS.get(kind, message)
+    if kind == "literal_error" and str(detail["input"]) in _EARLIER_NAMES:
+        earlier = _EARLIER_NAMES[str(detail["input"])]
+        if repr(earlier.known_beside) in detail["ctx"]["expected"]:
+            return f"{where}there is no {detail['input']!r} any more ({earlier.today})"
     try:
         value = f"{detail['input']!r:.80}"
     except ValueError:  # Python writes no integer of more than 4300 digits

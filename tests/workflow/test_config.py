@@ -278,3 +278,41 @@ def test_kinds_are_named_in_the_words_of_toml(tmp_path):
         minimal(tmp_path, MINIMAL + "fixed = 3\n")
     with pytest.raises(InputError, match=r"specification\.notches: expected a list, got 3"):
         minimal(tmp_path, MINIMAL + "notches = 3\n")
+
+
+@pytest.mark.parametrize(
+    ("earlier", "complaint"),
+    [
+        ("[yardstick]\ncompute = true", "unknown key yardstick (it is called achievable_performance today)"),
+        ("[prefilter]\norder = 2", "unknown key prefilter (it is called reference_filter today)"),
+        ("[synthesis]\njobs = 2", "unknown key synthesis.jobs (leave it out: study --jobs computes several"),
+        ("[achievable_performance]\nhull = true", "unknown key achievable_performance.hull (leave it out"),
+    ],
+)
+def test_a_key_of_an_earlier_version_names_what_to_write_today(tmp_path, earlier, complaint):
+    path = tmp_path / "arm.toml"
+    path.write_text(f"{built_in_config()[1]}\n{earlier}\n")
+    with pytest.raises(InputError) as caught:
+        load_config(path)
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("was", "now", "complaint"),
+    [
+        ("[specification]", "[specification]\nti_s = 1.0", "ti_s (it is called fixed.ti_s today)"),
+        (
+            "[specification]",
+            '[specification]\nstructure = "pi_d_notch"',
+            "structure: there is no 'pi_d_notch' any",
+        ),
+        ("response =", "promise =", "channels[0].uncertainty.promise (it is called response today)"),
+    ],
+)
+def test_an_earlier_key_or_value_in_a_table_names_what_to_write_today(tmp_path, was, now, complaint):
+    path = tmp_path / "arm.toml"
+    path.write_text(built_in_config()[1].replace(was, now))
+    with pytest.raises(InputError) as caught:
+        load_config(path)
+    assert complaint in str(caught.value)

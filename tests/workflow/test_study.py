@@ -326,7 +326,17 @@ PARETO = "[[pareto]]\nx = 'speed'\ny = 'modulus_margin'\n[study]"
         ('title = "small"', 'titel = "small"', "unknown key study.titel (did you mean title?)"),
         (str(FAST_ARM), "nowhere.toml", "study.base: no such file or run directory"),
         ("[study]", PARETO, "pareto[0].x: no column 'speed'"),
-        ("[study]", "[search]\nmethod = 'optuna'\n[study]", "unknown key search"),
+        (
+            "[study]",
+            "[search]\nmethod = 'optuna'\n[study]",
+            "unknown key search (a study computes its whole gr",
+        ),
+        (
+            "closed_loop.draws",
+            "yardstick.compute",
+            "unknown key yardstick (it is called achievable_performance ",
+        ),
+        (BANDWIDTH, "specification.kp", "specification.kp (it is called fixed.kp today)"),
     ],
 )
 def test_bad_studies_are_refused(refused, tmp_path, was, now, expected):
