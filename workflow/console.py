@@ -21,6 +21,7 @@ from workflow.engine import interrupts, progress
 from workflow.engine.errors import printable
 
 if TYPE_CHECKING:
+    from workflow.describe.facts import Row, Section
     from workflow.describe.summary import RunSummary
 
 
@@ -39,6 +40,15 @@ COMPILING_S = 25.0
 _LEAST_SHARE = 0.02
 # Width where standard output has none and COLUMNS says none, as in a pipe: rows stay on one line.
 _PIPE_COLUMNS = 120
+# Width below which a table becomes a list: at 40 three columns leave a value ten letters a line; from 72 on
+# they leave it forty.
+_LEAST_TABLE_COLUMNS = 72
+# Length of the bar of progress; on a narrow terminal the words beside it need the room.
+_BAR_COLUMNS = 30
+_SHORT_BAR_COLUMNS = 8
+# Steps of a list's indentation: sections, names, values.
+_NAME_INDENT = 2
+_VALUE_INDENT = 4
 # So much work as expected [s] is taken for granted before the speed of this machine counts.
 _PRIOR_S = 10.0
 
@@ -60,7 +70,9 @@ class TerminalProgress(progress.Progress):
         self._bar = Progress(
             SpinnerColumn(),
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
-            BarColumn(bar_width=30),
+            BarColumn(
+                bar_width=_BAR_COLUMNS if console.width >= _LEAST_TABLE_COLUMNS else _SHORT_BAR_COLUMNS
+            ),
             TextColumn("{task.percentage:>3.0f} %{task.fields[left]}"),
             console=console,
             transient=True,
@@ -184,32 +196,73 @@ class TerminalProgress(progress.Progress):
 
 
 def print_summary(summary: RunSummary, *, verbose: bool = False) -> None:
-    """The table of numbers on standard output, and the verdict where it is no complaint on standard error.
-    verbose: rows of parts, too."""
-    # It loads numpy, which a command that only says its version can do without.
-    from workflow.text.formats import BARS
-
+    """The numbers on standard output, and the verdict where it is no complaint on standard error: as a table,
+    on a narrow terminal as a list. verbose: rows of parts, too."""
     has_width = sys.stdout.isatty() or "COLUMNS" in os.environ
     console = Console(file=sys.stdout, width=None if has_width else _PIPE_COLUMNS)
-    table = Table(title=_text(summary.title), title_justify="left", show_header=False, pad_edge=False)
-    table.add_column("section", style="bold")
-    # Names of columns are folded, not cut: what tells two of them apart may stand at the end.
-    table.add_column("quantity", overflow="fold")
-    table.add_column("value", overflow="fold")
-    for section in summary.sections:
-        for part in section.whole() if verbose else (section,):
-            for index, row in enumerate(part.rows):
-                title = _text(part.title) if index == 0 else ""
-                value: str | Text = _text(row.text)
-                if row.text and not set(row.text) - set(BARS):
-                    # A curve is no use in two lines.
-                    value = Text(row.text, overflow="ellipsis", no_wrap=True)
-                table.add_row(title, _text(row.name), value, end_section=index == len(part.rows) - 1)
-    console.print(table)
+    sections = [
+        part
+        for section in summary.sections
+        for part in (section.whole() if verbose else (section,))
+        if part.rows
+    ]
+    if console.width < _LEAST_TABLE_COLUMNS:
+        _print_list(console, summary.title, sections)
+    else:
+        _print_table(console, summary.title, sections)
     if summary.certified is not False:
         console.print(_text(summary.verdict), highlight=False, soft_wrap=True)
     if summary.report_path:
         console.print(f"report: {_text(summary.report_path)}", highlight=False, soft_wrap=True)
+
+
+def _print_table(console: Console, title: str, sections: Sequence[Section]) -> None:
+    """Three columns: section, quantity, value."""
+    table = Table(title=_text(title), title_justify="left", show_header=False, pad_edge=False)
+    table.add_column("section", style="bold")
+    # Names of columns are folded, not cut: what tells two of them apart may stand at the end.
+    table.add_column("quantity", overflow="fold")
+    table.add_column("value", overflow="fold")
+    for section in sections:
+        for index, row in enumerate(section.rows):
+            heading = _text(section.title) if index == 0 else ""
+            is_last = index == len(section.rows) - 1
+            table.add_row(heading, _text(row.name), _value(row), end_section=is_last)
+    console.print(table)
+
+
+def _print_list(console: Console, title: str, sections: Sequence[Section]) -> None:
+    """A heading for each section, a line for each quantity; a longer value stands indented below its name."""
+    _print_wrapped(console, Text(printable(title), style="italic"), 0)
+    for section in sections:
+        _print_wrapped(console, Text(printable(section.title), style="bold"), 0)
+        for row in section.rows:
+            value = _value(row)
+            in_one_line = Text(f"{printable(row.name)}: ").append_text(value)
+            if not row.name:
+                _print_wrapped(console, value, _NAME_INDENT)
+            elif in_one_line.cell_len <= console.width - _NAME_INDENT:
+                _print_wrapped(console, in_one_line, _NAME_INDENT)
+            else:
+                _print_wrapped(console, Text(printable(row.name)), _NAME_INDENT)
+                _print_wrapped(console, value, _VALUE_INDENT)
+
+
+def _print_wrapped(console: Console, words: Text, indent: int) -> None:
+    """Words in lines of the terminal's width, each of them indented."""
+    width = max(console.width - indent, 1)
+    for line in words.wrap(console, width):
+        line.rstrip()
+        console.print(Text(" " * indent).append_text(line), highlight=False, soft_wrap=True)
+
+
+def _value(row: Row) -> Text:
+    """Value and remark of a fact; a curve is cut at the end of its line, for it is no use in two."""
+    # It loads numpy, which a command that only says its version can do without.
+    from workflow.text.formats import BARS
+
+    is_curve = bool(row.text) and not set(row.text) - set(BARS)
+    return Text(printable(row.text), overflow="ellipsis" if is_curve else "fold", no_wrap=is_curve)
 
 
 def _text(words: str) -> str:

@@ -138,6 +138,23 @@ STREAMS = {
 
 
 # Text and JSON in every encoding that differs between them; of closed streams each once.
+@pytest.mark.parametrize("width", [30, 40, 71])
+def test_a_narrow_terminal_has_whole_numbers_and_long_lines(width, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(width))
+    values = {"bandwidth": "at least 5.74 rad/s (smallest at 9.35 Hz)", "draws": "20", "": "3.468 to 3.775 %"}
+    rows = tuple(Row("", name, Quantity.words(value)) for name, value in values.items())
+    sections = (Section("closed loop", rows), Section("", ()))
+    console.print_summary(RunSummary("an arm with a title that is long", sections, {}, True, "certified", ""))
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= width
+    assert lines[1 + (width == 30)] == "closed loop"
+    assert "  draws: 20" in lines  # what fits stands on one line
+    for number in ("5.74", "9.35", "3.468", "3.775"):
+        assert any(re.search(rf"(?<![\d.]){re.escape(number)}(?![\d.])", line) for line in lines)
+    # As few lines as hold the words: a column of one letter would have many.
+    assert sum(map(len, lines)) / len(lines) > width / 4
+
+
 @pytest.mark.parametrize(
     ("kind", "more"),
     [(kind, "--json") for kind in ("ascii", "C locale", "reader leaves")] + [(kind, "") for kind in STREAMS],
