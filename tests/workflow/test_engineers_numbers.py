@@ -176,7 +176,7 @@ def test_a_fixed_notch_is_certified_on_the_simulated_link_and_runs_as_c(flexlink
     page = (out / "report.html").read_text()
     assert "The controller in numbers: PID, 1 notch, low-pass" in page
     assert "8 Hz, 10 dB deep" in page
-    assert "every crossover of the loop" in page
+    assert "every crossover at the centres" in page
 
     # The constants of the header are those of the law that runs.
     header = (out / "controller.h").read_text()

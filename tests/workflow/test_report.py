@@ -455,7 +455,7 @@ def test_two_lines_typed_give_the_margins_of_the_certificate(
 
 
 @pytest.mark.parametrize(
-    ("delay", "words"), [(0, "K has no computational delay"), (1, "K has its 1 sample of")]
+    ("delay", "words"), [(0, "Controller (K, without computational delay)"), (1, "Controller (K_with_delay)")]
 )
 def test_captions_say_where_the_delay_is(delay, words, tmp_path, undrawn, monkeypatch):
     own = replace(example.controller(), computational_delay_samples=delay)

@@ -249,12 +249,11 @@ def _margins_of(plant: PlantVerdict, view: RunView) -> list[Block]:
             )
         ]
     delay = view.specification.computational_delay_samples
-    in_loop = "no computational delay."
-    if delay:
-        in_loop = f"{count(delay, 'sample')} of computational delay is in the loop."
+    in_loop = count(delay, "sample") if delay else "none"
     caption = (
         f"{plant.plant}: closest to -1 at {frequency(plant.worst_margin_omega_rad_s)}; largest closed-loop "
-        f"pole radius {at_most(plant.pole_radius, 6)}. Nominal: at the centres of the ellipses; {in_loop}"
+        f"pole radius {at_most(plant.pole_radius, 6)}. Nominal: at the centres of the ellipses. "
+        f"Computational delay in the loop: {in_loop}."
     )
     pair = (plant.nominal_margins, plant.worst_margins)
     rows = (
@@ -273,9 +272,7 @@ def _in_python_control(view: RunView) -> Fold:
     delay = view.specification.computational_delay_samples
     about_delay = "Without computational delay both are the same."
     if delay:
-        about_delay = (
-            f"The margins of this page are about K_with_delay, with {count(delay, 'sample')} of delay."
-        )
+        about_delay = "The margins of this page are those of K_with_delay."
     factor = f"{view.loop_factor} * " if view.loop_factor != 1 else ""
     typed = (
         "import control, json, numpy, pathlib; G, K = (json.loads(pathlib.Path(name).read_text()) for name "
@@ -300,9 +297,8 @@ def _in_python_control(view: RunView) -> Fold:
     ]
     blocks: list[Block] = [
         Text(
-            "They print gain (a factor), phase [deg] and modulus margin of the nominal model (model.json) "
-            f"with each K of controller.json. {about_delay} The table above is about the centres of the "
-            "ellipses, from which the nominal model differs a little."
+            "Gain (a factor), phase [deg] and modulus margin of the nominal model (model.json), which "
+            f"differs a little from the centres of the ellipses. {about_delay}"
         ),
         Code(typed, typed=True),
         Code(printed),
@@ -338,8 +334,7 @@ def _requirements_table(certificate: Certificate, view: RunView, *, several: boo
     return Table(
         ("requirement", "required", "achieved", "at [rad/s (Hz)]", "proved", "met?"),
         tuple(rows),
-        "Weighted gains |W ...| must be 1 or less. Achieved: on the dense grid of frequencies. Proved: bound "
-        "at all frequencies.",
+        "Achieved: on the dense grid of frequencies. Proved: bound at all frequencies.",
         tuple(item.met for item in certificate.items),
     )
 

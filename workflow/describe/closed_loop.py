@@ -47,7 +47,6 @@ from workflow.engine import codec
 from workflow.tasks.results import ClosedLoopResult, LoopCheck, MeasuredPeak, RunResults
 from workflow.text.formats import (
     both_frequencies,
-    capitalised,
     count,
     extent,
     listing,
@@ -335,10 +334,7 @@ def closed_loop_page(view: RunView) -> PageSection:
             )
         )
     further_rows = loop_numbers(results, view.config)[ON_THE_FIRST_SCREEN:]
-    if further_rows:
-        rows = tuple((capitalised(row.name), row.value.text, row.remark) for row in further_rows)
-        blocks.append(Table(("quantity", "value", "predicted and achieved"), rows))
-    blocks.append(_metrics_table(check, view.output_unit))
+    blocks.append(_metrics_table(check, view.output_unit, further_rows))
     blocks += _sensitivity_blocks(check, view)
     if check.friction is not None:
         blocks.append(Fold("Dry friction in the loop", tuple(friction_blocks(check, view))))
@@ -354,6 +350,9 @@ def _what_was_run(check: LoopCheck, view: RunView) -> list[Block]:
     plants = f"{count(check.draws, 'plant')} drawn from the identified uncertainty"
     if simulated:
         plants = f"{count(check.draws, 'run')} on the simulated nonlinear arm"
+        if config.closed_loop.effects:
+            effects = effects_text(config.closed_loop.effects)
+            plants += f" with {effects}, which the records were made without"
     rounded = ""
     if check.quantisation:
         rounded = f", commands rounded to {si(check.quantisation, input_unit)}"
@@ -365,16 +364,9 @@ def _what_was_run(check: LoopCheck, view: RunView) -> list[Block]:
         )
     ]
     if check.filtered:
-        blocks.append(
-            Text(
-                "Every reference goes through the reference filter. Errors are against the reference itself."
-            )
-        )
+        blocks.append(Text("The reference is filtered; errors are against the unfiltered one."))
     if not check.tracking:
         blocks.append(Text("The specification requires no tracking; the step only shows what the loop does."))
-    if simulated and config.closed_loop.effects:
-        effects = effects_text(config.closed_loop.effects)
-        blocks.append(Text(f"The arm differs from the one the records came from: {effects}."))
     if not simulated:
         friction = "friction, " if check.friction is None else ""
         blocks.append(
@@ -424,8 +416,11 @@ def _command_remarks(check: LoopCheck, view: RunView) -> list[Block]:
     return blocks
 
 
-def _metrics_table(check: LoopCheck, output_unit: str) -> Table:
-    """Metrics that are not among the first numbers: predicted, smallest and largest of the runs."""
+def _metrics_table(check: LoopCheck, output_unit: str, further_rows: Sequence[Row]) -> Table:
+    """Metrics that are not on the first screen: predicted, smallest and largest of the runs.
+
+    further_rows: of `metric_rows`, for which the first screen has no room.
+    """
     unit = output_unit or "as logged"
     metrics = [
         ("limited_fraction", "time at a limit [%]", 100.0),
@@ -440,9 +435,17 @@ def _metrics_table(check: LoopCheck, output_unit: str) -> Table:
         ]
 
     def reached(value: float | None, factor: float) -> str:
-        return "not reached" if value is None else number(factor * value)
+        return "not reached" if value is None else number(factor * value, 4)
 
     rows = []
+    for row in further_rows:
+        name = row.name
+        never = [each for each in check.achieved if getattr(each, row.key.rpartition(".")[2]) is None]
+        if never:
+            name += f" ({len(never)} of {check.draws} runs never)"
+        ends = row.value.plain
+        values = (ends["predicted"], ends["smallest"], ends["largest"])
+        rows.append((f"{name} [{row.value.unit}]", *(reached(value, 1.0) for value in values)))
     for metric, name, factor in metrics:
         _, smallest, greatest = check.spread_of(metric)
         values = (getattr(check.predicted, metric), smallest, greatest)
@@ -466,11 +469,10 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
         certified = f"certified at most {number(sensitivity.certified_peak, 4)}"
     predicted = number(sensitivity.nominal_peak, 4)
     difference = percent(abs(large.off_nominal_percent), 2)
-    said_of = [
-        f"Peak of |S|: predicted {predicted}, {certified}. Measured and predicted are {difference} apart."
-    ]
+    said_of = [f"Peak of |S|: predicted {predicted}, {certified}."]
     if not agrees:
         said_of.append(
+            f"Measured and predicted are {difference} apart. "
             "The loop on the arm is not the predicted one. Check friction, the voltage limit and the "
             "validation of the model before you trust the margins."
         )
@@ -526,27 +528,30 @@ def _condition_blocks(check: LoopCheck, view: RunView) -> list[Block]:
         return []
     restless = [run.name for run in check.conditions if not run.settled]
     settled = len(check.conditions) - len(restless)
-    rows = [
-        (
+    rows = []
+    for run in check.conditions:
+        cells = [
             f"{run.name}: {run.words}",
             number(run.largest_difference_percent),
             number(run.overshoot_percent, 2),
             number(run.error_left_percent, 2),
             number(run.peak_command),
-            yes_no(run.settled),
-        )
-        for run in check.conditions
-    ]
-    head = (
+        ]
+        if restless:
+            cells.append(yes_no(run.settled))
+        rows.append(tuple(cells))
+    head = [
         "condition",
         "largest difference [%]",
         "overshoot [%]",
         "error left [%]",
         f"largest command [{view.input_unit or 'as logged'}]",
-        "settles?",
-    )
+    ]
+    # Where all settle the title says so.
+    if restless:
+        head.append("settles?")
     table = Table(
-        head,
+        tuple(head),
         tuple(rows),
         "One run each; % of the step; for the push, of the predicted swing. Difference: from the prediction.",
         tuple(run.settled for run in check.conditions),

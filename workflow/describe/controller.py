@@ -7,7 +7,7 @@ import math
 from control_design.analysis.certificate import PlantVerdict
 from control_design.controllers.engineers_numbers import ControllerNumbers
 from workflow.describe.facts import Block, Heading, Row, Section, Table, said, worded
-from workflow.text.formats import MISSING, both_frequencies, count, decibels, frequency, margin, sentence, si
+from workflow.text.formats import both_frequencies, count, decibels, frequency, margin, sentence, si
 
 
 def controller_section(numbers: ControllerNumbers | None, delay_samples: int, signals: str = "") -> Section:
@@ -69,15 +69,14 @@ def crossover_table(plant: PlantVerdict) -> list[Block]:
     rows = []
     for each in crossovers.gain:
         phase = margin(math.degrees(each.phase_margin_rad))
-        rows.append(
-            ("gain", both_frequencies(each.omega_rad_s), phase, margin(1000 * each.delay_margin_s), MISSING)
-        )
+        found = f"phase margin {phase} deg, delay margin {margin(1000 * each.delay_margin_s)} ms"
+        rows.append(("gain", both_frequencies(each.omega_rad_s), found))
     for crossing in crossovers.phase:
         rises = crossing.gain_margin > 1
-        gain = f"may {'rise by' if rises else 'fall to'} {decibels(crossing.gain_margin, rises)}"
-        rows.append(("phase", both_frequencies(crossing.omega_rad_s), MISSING, MISSING, gain))
-    head = ("crossover", "at [rad/s (Hz)]", "phase margin [deg]", "delay margin [ms]", "gain margin")
-    caption = f"{plant.plant}: every crossover of the loop at the centres of the ellipses."
+        gain = f"gain may {'rise by' if rises else 'fall to'} {decibels(crossing.gain_margin, rises)}"
+        rows.append(("phase", both_frequencies(crossing.omega_rad_s), gain))
+    head = ("crossover", "at [rad/s (Hz)]", "margin")
+    caption = f"{plant.plant}: every crossover at the centres of the ellipses."
     if any(each.phase_margin_rad < 0 for each in crossovers.gain):
         caption += " A negative phase margin: so much lead brings the loop to -1."
     return [Table(head, tuple(rows), caption)]
@@ -94,14 +93,11 @@ def controller_blocks(
         law = "Kp (1 + 1/(Ti s) + Td s/(Tf s + 1)), notches and low-passes in series"
     delay = "There is no computational delay."
     if delay_samples:
-        delay = (
-            f"Without the computational delay of {count(delay_samples, 'sample')}, which the machine adds: "
-            "K_without_delay of the files."
-        )
+        delay = "These are the numbers of K_without_delay."
     units = f" {sentence(signals)}" if signals else ""
     caption = (
         f"{law}; s = (2/dt)(z - 1)/(z + 1), dt = {si(numbers.dt_s, 's', 6)}. Frequencies are those of the "
-        f"discrete controller: a notch at f has its depth at f. {delay}{units} Files hold all digits "
+        f"discrete controller. {delay}{units} Files hold all digits "
         "(engineers_numbers in controller.json, constants in controller.h)."
     )
     return [

@@ -20,6 +20,7 @@ from workflow.describe.facts import (
     Picture,
     Remarks,
     Section,
+    Table,
     Text,
     said,
     worded,
@@ -354,9 +355,7 @@ def design_page(view: RunView) -> PageSection:
     synthesis = design.synthesis
     asked = view.specification
     delay = count(asked.computational_delay_samples, "sample")
-    keys = ", ".join(
-        f"{key} = {json.dumps(value)}" for key, value in asked.model_dump(exclude_defaults=True).items()
-    )
+    stated = asked.model_dump(exclude_defaults=True)
     to_be = "to be " if synthesis is None else ""
     starts = ""
     if isinstance(synthesis, SynthesisResult):
@@ -365,9 +364,9 @@ def design_page(view: RunView) -> PageSection:
     blocks: list[Block] = [
         Text(
             f"A controller of order {asked.controller_order} ({asked.structure}) with {delay} of "
-            f"computational delay was {to_be}optimised over the ellipses{starts}. Specified, beside "
-            f"defaults: {keys}."
-        )
+            f"computational delay was {to_be}optimised over the ellipses{starts}."
+        ),
+        Table(("specified", "value"), tuple((key, json.dumps(value)) for key, value in stated.items())),
     ]
     if synthesis is None:
         blocks.append(Remarks((sentence(design.reason),), "warning", "No controller was designed"))
@@ -398,15 +397,13 @@ def design_page(view: RunView) -> PageSection:
 def _loop_pictures(view: RunView) -> list[Block]:
     """Controller and loop gain, Nyquist curve, closed-loop gains."""
     delay = view.specification.computational_delay_samples
-    has = "K has no computational delay."
-    if delay:
-        has = f"K has its {count(delay, 'sample')} of computational delay (K_with_delay of the files)."
+    law = "K_with_delay" if delay else "K, without computational delay"
     part = f", {view.control.spread.about}" if view.control.spread.others else ""
     nyquist = f"Loop gain with its {share(view.level)} ellipses: Nyquist curve and Nichols chart{part}."
     return [
         Picture(
             "bode-loop",
-            f"Controller and loop gain, with the margins at the centres of the ellipses. {has}",
+            f"Controller ({law}) and loop gain, with the margins at the centres of the ellipses.",
             (view,),
         ),
         Picture("nyquist", nyquist, (view,)),

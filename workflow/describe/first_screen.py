@@ -9,7 +9,7 @@ from markupsafe import Markup
 from control_design.analysis.certificate import Certificate
 from workflow.config.run_config import RunConfig
 from workflow.describe.closed_loop import lasting_error, loop_numbers, measured_beyond, measured_beyond_text
-from workflow.describe.design import any_order, gave_way_text, sampled, watch_longer
+from workflow.describe.design import any_order, gave_way_text, watch_longer
 from workflow.describe.facts import FirstScreen, Picture, State, link
 from workflow.describe.friction import beside_recorded, friction_exceeds, stands_still, waits
 from workflow.describe.run import lowered_bandwidth, signals_where_scaled
@@ -153,8 +153,6 @@ def _bullets(view: RunView) -> list[str]:
     bullets.append(_all_settle(view))
     if not advice and results.achievable_performance.bracket is not None:
         bullets.append(any_order(results.achievable_performance, gamma, order))
-    if results.certify.sampled.joint is not None:
-        bullets.append(sampled(results.certify.sampled, None))
     return bullets
 
 

@@ -227,7 +227,7 @@ def _pair_table(
 def _decay(place: float, dt_s: float) -> str:
     """Decay rate of a real pole in the z plane, 1/s."""
     if place == 0:
-        return "deadbeat (z = 0)"
+        return "deadbeat"
     if place < 0:
         return "changes sign every sample"
     return number(-math.log(place) / dt_s, 4)
@@ -245,8 +245,8 @@ def who_chose(options: IdentOptions) -> str:
     if len(specified) == 1:
         return f"Structures tried; {specified[0]} was specified, the smallest criterion decides the rest."
     return (
-        f"Structures fitted. {listing(specified)} were specified; the criterion alone would choose the "
-        "structure with 0 in the last column."
+        f"{listing(specified)} were specified; the criterion alone would choose the structure with 0 in the "
+        "last column."
     )
 
 
@@ -281,9 +281,8 @@ def stabilisation_text(channel: ChannelView) -> str:
 
 
 ORDER_CAPTION = (
-    "Left: information criterion of every structure tried, above the best. Right: pole pairs found when 0, "
-    "1, 2 ... are allowed. Stable: moves by less than 1 % in frequency and 5 % in damping. Significant: the "
-    "criterion is worse without it."
+    "Left: information criterion above the best. Right: pole pairs found when 0, 1, 2 ... are allowed. "
+    "Stable: within 1 % in frequency and 5 % in damping. Significant: the criterion is worse without it."
 )
 
 

@@ -255,38 +255,43 @@ def distortion_blocks(channel: ChannelView) -> list[Block]:
         "distortion."
     )
     blocks.append(Picture("distortion", caption, (distortions, channel.units), channel.file))
-    for levels in distortions:
-        if levels.excited is None or not len(levels.bands_rad_s):
-            continue
-        blocks.append(_distortion_table(levels, channel.units[0]))
+    levels_told = [each for each in distortions if each.excited is not None and len(each.bands_rad_s)]
+    if levels_told:
+        blocks.append(_distortion_table(levels_told, channel.units[0]))
     return blocks
 
 
-def _distortion_table(levels: Distortion, input_unit: str) -> Table:
-    assert levels.excited is not None
+def _distortion_table(levels_told: Sequence[Distortion], input_unit: str) -> Table:
+    """Noise and distortion by amplitude and band; levels_told: of one band or more each."""
     rows = []
-    for low, high in levels.bands_rad_s:
-        at = levels.excited.within(low, high)
-        if at is None:
-            continue
-        # Odd and even lines where the input left some of them out; else the cell is empty.
-        odd_percent = None
-        if levels.odd is not None:
-            odd = levels.odd.within(low, high)
-            if odd is not None:
-                odd_percent = 100 * odd.distortion
-        even_percent = None
-        if levels.even is not None:
-            even = levels.even.within(low, high)
-            if even is not None:
-                even_percent = 100 * even.distortion
-        least, most = at.interval
-        band = f"{number(low)} to {number(high)}"
-        distortion = number(100 * at.distortion, 2)
-        interval = f"{number(100 * least, 2)} to {number(100 * most, 2)}"
-        noise = number(100 * at.noise, 2)
-        rows.append((band, distortion, interval, number(odd_percent, 2), number(even_percent, 2), noise))
+    for levels in levels_told:
+        assert levels.excited is not None
+        for low, high in levels.bands_rad_s:
+            at = levels.excited.within(low, high)
+            if at is None:
+                continue
+            # Odd and even lines where the input left some of them out; else the cell is empty.
+            odd_percent = None
+            if levels.odd is not None:
+                odd = levels.odd.within(low, high)
+                if odd is not None:
+                    odd_percent = 100 * odd.distortion
+            even_percent = None
+            if levels.even is not None:
+                even = levels.even.within(low, high)
+                if even is not None:
+                    even_percent = 100 * even.distortion
+            rms = number(levels.rms)
+            band = f"{number(low)} to {number(high)}"
+            distortion = number(100 * at.distortion, 2)
+            least, most = at.interval
+            interval = f"{number(100 * least, 2)} to {number(100 * most, 2)}"
+            odd_cell = number(odd_percent, 2)
+            even_cell = number(even_percent, 2)
+            noise = number(100 * at.noise, 2)
+            rows.append((rms, band, distortion, interval, odd_cell, even_cell, noise))
     head = (
+        f"input, rms [{input_unit or 'as logged'}]",
         "band [rad/s]",
         "distortion, of the gain [%]",
         "95 % interval [%]",
@@ -294,10 +299,17 @@ def _distortion_table(levels: Distortion, input_unit: str) -> Table:
         "even lines [%]",
         "noise [%]",
     )
-    rms = si(levels.rms, input_unit)
-    realisations = count(levels.realisations, "realisation")
-    periods = count(levels.periods, "period")
-    return Table(head, tuple(rows), f"{rms} rms: {realisations} of {periods}")
+    made = [
+        f"{count(levels.realisations, 'realisation')} of {count(levels.periods, 'period')}"
+        for levels in levels_told
+    ]
+    caption = f"{made[0]} at each amplitude."
+    if len(set(made)) > 1:
+        at_each = [
+            f"{how} at {si(each.rms, input_unit)}" for how, each in zip(made, levels_told, strict=True)
+        ]
+        caption = f"{listing(at_each)}."
+    return Table(head, tuple(rows), caption)
 
 
 def rig_page(notes: Notes) -> PageSection:

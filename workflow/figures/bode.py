@@ -171,7 +171,7 @@ def draw_bode(
             at = at[index]
             response = response[index]
         seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
-        gain.plot(x(at), seen, **_DOTS, label="straight from the records, no model", zorder=1)
+        gain.plot(x(at), seen, **_DOTS, label="records, no model", zorder=1)
         phase.plot(x(at), degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS, zorder=1)
     if model is not None:
         response = model.frequency_response(omega)
@@ -186,7 +186,7 @@ def draw_bode(
     relative = 100 * uncertainty.ellipse().semi_major[above_zero] / band.gain
     size.fill_between(x(omega), np.full_like(relative, _FOOT), relative, **style.BAND)
     size.plot(x(omega), relative, color=style.UNCERTAIN, lw=1.3)
-    size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response itself")
+    size.axhline(100, **style.LIMIT_LINE, label="ellipse as large as the response")
     size.set(yscale="log")
     can_be_drawn = np.isfinite(relative) & (relative > 0)
     finite = relative[can_be_drawn]

@@ -39,7 +39,7 @@ _MOST_BEYOND = 3.0
 # Within this time [s] two instants are one: far below any sampling period.
 _SAME_INSTANT_S = 1e-9
 # The loop on the identified model.
-_PREDICTED: dict[str, Any] = style.PREDICTED_LINE | {"label": "predicted, nominal model"}
+_PREDICTED: dict[str, Any] = style.PREDICTED_LINE | {"label": "predicted"}
 # What is asked for.
 _REFERENCE: dict[str, Any] = style.REFERENCE_STEPS | {"label": "reference"}
 

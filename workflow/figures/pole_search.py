@@ -261,7 +261,7 @@ def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncerta
             color=style.MEASURED,
             lw=0.8,
             alpha=0.4,
-            label="gain computed from the records (own log scale)",
+            label="gain from the records (own log scale)",
         )
         panel.set(xlim=(seen[0], seen[-1]))
     for mode in plot.columns():

@@ -59,11 +59,11 @@ def draw_poles(
         panel.plot(turn.real, turn.imag, color="#333333", lw=1.0)
         _grid(panel, model.dt_s, named=panel is near)
         if intervals is not None:
-            label = f"{share(intervals.level)} intervals of a pole"
+            label = f"{share(intervals.level)} intervals"
             areas = [np.column_stack([area.real, area.imag]) for area in _areas(intervals, model.dt_s)]
             panel.fill(areas, **style.BAND | {"lw": 1.5}, label=label)
         for at, marker, colour, label in (
-            (closed_loop, "s", style.PREDICTED, "closed loop, nominal plant"),
+            (closed_loop, "s", style.PREDICTED, "closed loop, nominal"),
             (zeros, "o", style.MEASURED, "zeros"),
             (poles, "x", style.MODEL, "identified basis poles"),
         ):

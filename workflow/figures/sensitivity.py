@@ -137,7 +137,7 @@ def draw_curve(panel: Panel, curve: SensitivityCurve, level: float) -> None:
     finite = np.where(np.isfinite(curve.worst) & (curve.worst < 1e200), curve.worst, np.nan)
     panel.fill_between(omega, curve.nominal, finite, **style.BAND)
     panel.plot(omega, finite, color=style.UNCERTAIN, lw=1.2, label=f"over the {share(level)} ellipses")
-    panel.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal (ellipse centres)")
+    panel.plot(omega, curve.nominal, **style.PREDICTED_LINE, label="nominal")
     if np.any(np.isfinite(curve.limit)):
         panel.plot(omega, curve.limit, **style.LIMIT_LINE, label="specification: stay below")
     panel.set(xscale="log", yscale="log", xlim=(omega[0], omega[-1]), ylim=_range(curve))

@@ -73,7 +73,7 @@ def draw_free_run(panels: Any, time_s: Real, fit: FreshFit, noise: float, part: 
     upper.plot(*outline(time, simulated + residual), **_THICK, label="measured")
     upper.plot(*outline(time, simulated), **_THIN, label="model, simulated")
     lower.plot(*outline(time, residual), **style.MEASURED_LINE | {"lw": 0.7}, label="residual")
-    lower.axhspan(-noise, noise, **style.BAND, zorder=0, label="±2 standard deviations of the noise")
+    lower.axhspan(-noise, noise, **style.BAND, zorder=0, label="±2 std of the noise")
     lower.set(xlabel="time [s]")
     upper.set(xlim=(time[0], time[-1]))
 

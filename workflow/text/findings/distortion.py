@@ -20,8 +20,8 @@ _CAUSE = {
 
 def linear(rms: float, unit: str, percent: float, from_Hz: float, to_Hz: float) -> str:
     return (
-        f"At an input of {formats.si(rms, unit)} rms, nonlinear distortion is at most {percent:.2g} % of the "
-        f"response from {from_Hz:.2g} to {to_Hz:.2g} Hz (with 95 % confidence)."
+        f"At {formats.si(rms, unit)} rms nonlinear distortion is at most {percent:.2g} % of the response "
+        f"from {from_Hz:.2g} to {to_Hz:.2g} Hz (95 % confidence)."
     )
 
 

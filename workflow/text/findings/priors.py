@@ -26,17 +26,14 @@ def _verdict(prior: str, refused: bool, imposed: bool, alternative: str, test: s
     """
     stated = prior_name(prior)
     if not refused:
-        return f"{stated} accepted: {alternative} does not fit significantly better {test}"
+        return f"{stated} accepted: {alternative} fits no better {test}"
     consequence = f"kept as specified, but {advice}" if imposed else "not imposed"
     return f"{stated} refused by the data: {alternative} fits significantly better {test}; {consequence}"
 
 
 def nuisance(name: str, needed: bool, columns: int, statistic: float, limit: float, level: float) -> str:
     """name: of what is estimated beside the model, as an offset; columns: its unknowns."""
-    if needed:
-        verdict = "estimated, as it improves the fit"
-    else:
-        verdict = "not estimated, as it does not improve the fit"
+    verdict = "estimated, as it improves the fit" if needed else "not estimated: no better fit"
     test = _test(statistic, limit, level).removeprefix("(")
     return f"{name} {verdict} ({columns} unknowns, {test}"
 

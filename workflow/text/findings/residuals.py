@@ -50,7 +50,7 @@ def coloured_residual(n_samples: int, worth: float) -> str:
 def whiteness(passed: bool, probability: float, max_lag: int, lag: int, correlation: float) -> str:
     p = _probability(probability)
     if passed:
-        return f"The residuals are consistent with white noise over {max_lag} lags ({p})."
+        return f"The residuals are white over {max_lag} lags ({p})."
     return f"The residuals are not white ({p}, largest correlation {correlation:+.2f} at lag {lag})."
 
 
@@ -58,10 +58,7 @@ def independence(passed: bool, probability: float, lag: int, correlation: float,
     """precedes_input: the residuals also come before the input."""
     p = _probability(probability)
     if passed:
-        verdict = (
-            f"The residuals are consistent with independence of the input ({p}): no linear dynamics are left "
-            "in them."
-        )
+        verdict = f"The residuals are independent of the input ({p})."
     else:
         verdict = (
             f"The residuals depend on the input {formats.count(lag, 'sample')} before "

@@ -23,7 +23,7 @@ def more_delay(delay_ms: float) -> str:
 
 def other_friction(effects: Sequence[str], times: int) -> str:
     """times: 2 or 0."""
-    names = " and ".join(effects).replace("_", " ")
+    names = " and ".join(effects).replace("_friction and", " and").replace("_", " ")
     return f"{'twice the' if times else 'without'} {names}"
 
 
@@ -33,5 +33,6 @@ def coarse_steps(command_V: float, measurement: float, unit: str) -> str:
 
 def overdriven(times: float, *, known: bool) -> str:
     """known: the controller knows its limit."""
-    controller = "has anti-windup" if known else "does not know the limit"
-    return f"a step that needs {times:g} times the command limit; the controller {controller}"
+    if not known:
+        return "the same step; the controller does not know the limit"
+    return f"a step that needs {times:g} times the command limit; the controller has anti-windup"
