@@ -13,6 +13,7 @@ from diagnosis.fit.residual import pooled_rms
 from diagnosis.machine.machine_protocol import CaseOfMachine, Real, RecordOfMachine
 from diagnosis.machine.rounding import rounding_effect
 from diagnosis.next_experiment.discrimination import CompetingHypothesis
+from ident.data.keywords import clear_constructor
 from ident.data.shown import Shown
 from plant.effects.search_space import Candidate
 
@@ -199,6 +200,7 @@ class Prediction:
     tried: tuple[tuple[tuple[str, ...], float], ...]
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Diagnosis(Shown):
     """What is wrong with a model, as far as its records tell.

@@ -14,6 +14,7 @@ from diagnosis.machine.case import Case, Experiment
 from diagnosis.machine.own_plant import PlantCase
 from diagnosis.search.loop import Progress
 from flexlink.keywords import front_door
+from ident.data.keywords import WrongArgumentError
 
 __all__ = ["Case", "Diagnosis", "Experiment", "diagnose", "load_case"]
 
@@ -62,6 +63,11 @@ def diagnose(
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
+    if not hasattr(case, "machine"):
+        raise WrongArgumentError(
+            f"diagnose: case is of type {type(case).__name__}, expected a flexlink.Case; "
+            "flexlink.load_case(place) reads one from a folder"
+        )
     return chain.diagnose(case, progress=progress, rng=rng, time_limit_s=time_limit_s)
 
 

@@ -20,7 +20,7 @@ from ident.comparators import n4sid as subspace, polynomial_fits
 from ident.comparators.innovation_model import InnovationModel, fit_percent
 from ident.comparators.polynomial_model import PolynomialModel
 from ident.data.arrays import RealArray
-from ident.data.keywords import WrongArgumentError
+from ident.data.keywords import WrongArgumentError, clear_constructor
 from ident.data.record import SAME_DT, Record
 from ident.data.shown import Shown
 from ident.frequency_fit import FrfIdentification
@@ -201,6 +201,7 @@ class ComparedModel:
     simulated: RealArray
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Comparison(Shown):
     """Models on one validation record: `table()`, `plot()`; `models` has a `ComparedModel` of each.

@@ -10,14 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from flexlink.keywords import front_door
-from ident.data.keywords import refuse_rate
+from ident.data.keywords import clear_constructor, refuse_rate
 from ident.data.record import Record
 from ident.data.shown import Shown
 from plant import excitation, modal, presets, simulation
 from plant.effects import Effect, parse_effect
 from plant.plan import SUBSTEP_S
 from plant.rig import Rig
-from plant.simulation import SampledArm
 
 __all__ = [
     "Rig",
@@ -38,6 +37,12 @@ paper_link = front_door(presets.paper_link)
 prbs = front_door(excitation.prbs)
 
 
+@clear_constructor
+class SampledArm(simulation.SampledArm):
+    __doc__ = simulation.SampledArm.__doc__
+
+
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Simulation(Shown, simulation.Trajectory):
     """A simulated experiment of T samples; `record` makes a `Record` of it. All arrays (T,), read-only.

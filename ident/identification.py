@@ -25,6 +25,7 @@ from ident.basis.model import GobfModel
 from ident.basis.structure import Structure
 from ident.data.arrays import RealArray, lock, readonly
 from ident.data.finding import Finding, PriorTest, distinct
+from ident.data.keywords import clear_constructor
 from ident.data.record import Record
 from ident.data.shown import NOT_STORED, Shown
 from ident.search.order_selection import OrderStep
@@ -129,6 +130,7 @@ class FittedRecords(Shown):
         return distinct((*self.search.warnings, *self.advise()))
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class Identification(FittedRecords):
     """A fitted model of one input and one output, and how well it fits.

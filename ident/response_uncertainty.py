@@ -35,6 +35,7 @@ from ident.checks.residual_tests import (
 from ident.data.arrays import ComplexArray, RealArray
 from ident.data.finding import Finding, distinct
 from ident.data.frequency_uncertainty import FREQUENCIES
+from ident.data.keywords import clear_constructor
 from ident.data.record import Record
 from ident.identification import Identification
 from ident.uncertainty.embedding import tangent
@@ -59,6 +60,7 @@ OptionsT = TypeVar("OptionsT", bound=EmbeddingOptions)
 Tests = tuple[ResidualTest, ResidualTest]
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(ResponsePosterior):
     """Posterior of a response, with ellipses at any frequency (`at`) and what to think of them.

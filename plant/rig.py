@@ -38,6 +38,17 @@ class _Checked(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
+    def __init__(self, **values: Any) -> None:
+        """Raises ValueError, one line, for a key or a value that cannot be used."""
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            known = tuple(type(self).model_fields)
+            raise ValueError(f"{type(self).__name__}: {one_line(error, known)}") from None
+
+    # As on BaseModel: validation of files does not pass through __init__.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
 
 class Link(_Checked):
     """A uniform Euler-Bernoulli link of rectangular cross section; it bends about I = b h^3 / 12."""
@@ -265,6 +276,8 @@ def one_line(error: ValidationError, known: Collection[str] = ()) -> str:
     if kind == "extra_forbidden":
         possible = known or (*parameter_keys(), *Rig.model_fields)
         close = get_close_matches(key, possible, n=1, cutoff=_ALIKE)
+        # A parameter without its section: "dt_s" of "sampling.dt_s".
+        close = close or [full for full in parameter_keys() if full.rpartition(".")[2] == key]
         if close:
             return f"{key}: unknown key (did you mean {close[0]}?)"
         # Those of a rig would fill a page.

@@ -626,6 +626,15 @@ def test_every_function_refuses_an_unknown_keyword_in_one_line():
                 each(quite_unheard_of=1)
 
 
+def test_every_class_refuses_an_unknown_keyword_in_one_line():
+    classes = list(filter(inspect.isclass, (getattr(flexlink, name) for name in flexlink.__all__)))
+    assert len(classes) > 25
+    for each in classes:
+        with pytest.raises(ValueError, match=f"^{each.__name__}: .*quite_unheard_of") as caught:
+            each(quite_unheard_of=1)
+        assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -666,6 +675,43 @@ def test_every_function_refuses_an_unknown_keyword_in_one_line():
         (lambda: flexlink.Record.from_file("log.csv", "u", "y", Time="t"), "unknown keyword Time .*time"),
         (lambda: example_spread().at([1e6]), r"from 0 to pi / dt_s = 314\.159; got 1e\+06"),
         (lambda: example_spread().at(5.0), r"got a number: give \[5\]"),
+        (
+            lambda: flexlink.SampledArm(flexlink.paper_link(), dt=0.01),
+            "unknown keyword dt .did you mean dt_s",
+        ),
+        (
+            lambda: flexlink.SampledArm([], flexlink.paper_link()),
+            "rig is of type list, expected Rig: Sampled",
+        ),
+        (
+            lambda: flexlink.SampledArm(flexlink.paper_link(), np.random.default_rng(1)),
+            r"effects is of type Generator, expected a list: SampledArm\(rig, effects, rng, dt_s",
+        ),
+        (
+            lambda: flexlink.SampledArm(flexlink.paper_link(), dt_s="5ms"),
+            "dt_s is of type str, expected a num",
+        ),
+        (lambda: flexlink.Rig(length_m=1.0), "^Rig: length_m: unknown key .did you mean link.length_m"),
+        (lambda: flexlink.Rig(links={}), "^Rig: links: unknown key .*link"),
+        (
+            lambda: flexlink.simulate([1.0], flexlink.paper_link()),
+            "rig is of type list, expected Rig: simulate",
+        ),
+        (
+            lambda: flexlink.identify(example_record(), 4),
+            "options is of type int, expected IdentOptions or No",
+        ),
+        (
+            lambda: flexlink.GobfModel([1.0], flexlink.Poles(real=[0.5]), 0.1),
+            "poles is of type list, expected",
+        ),
+        (lambda: flexlink.Record(0.1, np.ones(9), np.ones(9)), r"dt_s must be .*got values of shape \(9,\)"),
+        (lambda: flexlink.diagnose("examples/gap_case"), r"case is of type str, .*flexlink\.load_case"),
+        (
+            lambda: flexlink.Specification(3.0),
+            r"fields are given by name, as Specification\(bandwidth_rad_s=",
+        ),
+        (lambda: flexlink.paper_link(dt_s=0.01), "unknown keyword dt_s .it takes no arguments"),
     ],
 )
 def test_what_is_wrong_is_said_in_one_line(call, message):

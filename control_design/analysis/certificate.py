@@ -38,6 +38,7 @@ from control_design.plants.set_expansion import with_straight_between
 from control_design.specification import Specification
 from control_design.specification.requirement import Findings, SpecificationItem
 from ident.data.finding import Finding, distinct
+from ident.data.keywords import clear_constructor
 from ident.data.shown import NOT_STORED, Shown
 
 # Damping ratio of a controller's pole pair below which the certificate lists it: narrower than what anybody
@@ -136,6 +137,7 @@ class Resonance:
     gain: float
 
 
+@clear_constructor
 @dataclass(frozen=True, repr=False)
 class Certificate(Shown):
     """Verdict on a controller for a set of uncertain plants.

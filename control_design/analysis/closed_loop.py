@@ -23,6 +23,7 @@ import scipy.sparse
 from control_design.controllers.controller import Controller
 from control_design.plants.ellipses import Boolean, Complex, Real
 from ident.data.arrays import COMPILED, INSIDE, kernel_array, lock
+from ident.data.keywords import clear_constructor
 from ident.data.shown import Shown
 
 if TYPE_CHECKING:
@@ -346,6 +347,7 @@ def _run(
         x[:] = next_x
 
 
+@clear_constructor
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoopTrajectory(Shown):
     """What happened in one run of a loop over T samples.

@@ -37,6 +37,7 @@ from control_design.plants.scaled_bound import (
 )
 from control_design.plants.weights import RationalWeight
 from control_design.specification.multivariable import ChannelWeights, MultivariableSpecification, gram
+from ident.data.keywords import clear_constructor
 from ident.data.shown import Shown
 
 # Relative difference of two sampling times that counts as none: rounding of decimal numbers.
@@ -203,6 +204,7 @@ class MultivariableVerdict:
         return self.proved and max(self.bounds.values()) <= 1.0 and limited_ends
 
 
+@clear_constructor
 @dataclass(frozen=True, repr=False)
 class MultivariableCertificate(Shown):
     """Verdicts on one controller, a plant each.

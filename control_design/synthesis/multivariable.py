@@ -34,6 +34,7 @@ from control_design.synthesis.riccati_starts import central_controller, reduced,
 from control_design.synthesis.synthesis import part_of
 from control_design.synthesis.synthesis_options import MultivariableOptions
 from control_design.synthesis.synthesis_result import BlockingPoint, Outcome
+from ident.data.keywords import clear_constructor
 from ident.data.shown import Shown
 
 # "Doubled" says by how much the worst case rises of problem T of `benchmarks.mimo_designs` at order 4, for
@@ -98,6 +99,7 @@ _MOST_ADDED = 15
 _DENSE_OVER_LEAN = 5
 
 
+@clear_constructor
 @dataclass(frozen=True, repr=False)
 class MultivariableResult(Shown):
     """Controller of several joints, and how good it is. Certify it with `certify_multivariable` before use.

@@ -14,6 +14,7 @@ from typing import Any
 from control_design.controllers.controller import Controller
 from control_design.plants.plant_set import UncertainPlant
 from control_design.specification import Specification
+from ident.data.keywords import clear_constructor
 from ident.data.shown import NOT_STORED, Shown
 
 # What a descent that found no stable loop reports in place of infinity, which JSON does not know: near the
@@ -86,6 +87,7 @@ class StartReport:
         return self.gamma_dense is not None or is_stable_descent
 
 
+@clear_constructor
 @dataclass(frozen=True, repr=False)
 class SynthesisResult(Shown):
     """Best controller of a synthesis, and how good it is. Certify it with `certificate.certify` before use.

@@ -8,9 +8,11 @@ is right costs nothing. `refuse_rate` refuses a sampling time that is rather a r
 from __future__ import annotations
 
 import inspect
+import numbers
 from collections.abc import Callable, Iterable, Mapping
 from functools import wraps
-from typing import Any, TypeVar
+from types import UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import numpy as np
 
@@ -19,6 +21,21 @@ from ident.data.settings import meant
 F = TypeVar("F", bound=Callable[..., Any])
 ClassT = TypeVar("ClassT", bound=type)
 
+# Classes whose values stand for a number or a word of an annotation, too.
+_STANDING_IN: dict[type, list[type]] = {
+    float: [numbers.Real],
+    int: [numbers.Integral],
+    complex: [numbers.Complex],
+}
+# What classes are called in a complaint where their own name says less.
+_NAMES: dict[type, str] = {
+    numbers.Real: "a number",
+    numbers.Integral: "a whole number",
+    numbers.Complex: "a number",
+    str: "a text",
+    Iterable: "a list",
+    type(None): "None",
+}
 # Sampling times from here on, s, are refused as rates: no arm is sampled every 20 s, and few at fewer than
 # 20 Hz. Chosen; twice as much would take a rate of 25 Hz, of a camera, for seconds.
 _SLOWEST_S = 20.0
@@ -40,7 +57,8 @@ def clear_call(function: F) -> F:
     -------
     callable
         With the signature and the docstring of the function. It raises WrongArgumentError for an unknown
-        keyword, a missing argument or one too many; every other error is the function's own.
+        keyword, a missing argument or one too many, and for an argument of another type than its annotation
+        says where the function fails on it; every other error is the function's own.
     """
     return _clear(function, function.__qualname__)
 
@@ -61,8 +79,12 @@ def _clear(function: F, label: str) -> F:
     def called(*arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
-        except TypeError:
-            complaint = _complaint(function, label, arguments, named)
+        except WrongArgumentError:
+            raise
+        except (TypeError, AttributeError):
+            complaint = _complaint(function, label, arguments, named) or _wrong_type(
+                function, label, arguments, named
+            )
             if complaint is None:
                 raise
         raise WrongArgumentError(complaint)
@@ -85,11 +107,62 @@ def _complaint(
     known = [each.name for each in parameters if each.kind not in (each.VAR_KEYWORD, each.VAR_POSITIONAL)]
     for name in named:
         if name not in known:
-            return f"{label}: unknown keyword {name} ({meant(name, known, 'keywords')})"
+            instead = meant(name, known, "keywords") if known else "it takes no arguments"
+            return f"{label}: unknown keyword {name} ({instead})"
     # One too many or too few: an array among them is most likely a signal that belongs into a record.
     signals = any(isinstance(each, np.ndarray) for each in arguments)
     hint = "; signals are one argument: flexlink.Record(u=u, y=y, dt_s=dt_s)" if signals else ""
     return f"{label}: expected {label}({_call_of(parameters)}){hint}"
+
+
+def _wrong_type(
+    function: Callable[..., Any], label: str, arguments: tuple[Any, ...], named: Mapping[str, Any]
+) -> str | None:
+    """Return which argument is of another type than its annotation says; None where none surely is.
+
+    The call has failed, and its signature takes it: what is looked for is an argument in another's place.
+    """
+    signature = inspect.signature(function)
+    parameters = [each for each in signature.parameters.values() if each.name not in ("self", "cls")]
+    for name, value in signature.bind(*arguments, **named).arguments.items():
+        parameter = signature.parameters[name]
+        if parameter not in parameters or parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL):
+            continue
+        expected = _classes_of(_evaluated(parameter.annotation, function))
+        if expected and not isinstance(value, expected):
+            wanted = " or ".join(dict.fromkeys(_NAMES.get(each, each.__name__) for each in expected))
+            found = type(value).__name__
+            return f"{label}: {name} is of type {found}, expected {wanted}: {label}({_call_of(parameters)})"
+    return None
+
+
+def _evaluated(annotation: Any, function: Callable[..., Any]) -> Any:
+    """Return an annotation as a type; Any where it names what its module has for a type checker only."""
+    if not isinstance(annotation, str):
+        return annotation
+    try:
+        # Written by ourselves in the source of the function.
+        return eval(annotation, getattr(inspect.unwrap(function), "__globals__", {}))
+    except (NameError, TypeError, AttributeError):
+        return Any
+
+
+def _classes_of(annotation: Any) -> tuple[type, ...]:
+    """Return the classes of which a value of this annotation is an instance of one; () where any may do."""
+    members = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
+    classes: list[type] = []
+    for member in members:
+        kind = type(None) if member is None else get_origin(member) or member
+        if not isinstance(kind, type) or kind in (Any, object) or getattr(kind, "_is_protocol", False):
+            return ()
+        if kind in _STANDING_IN:
+            classes += _STANDING_IN[kind]
+        elif kind.__module__ in ("collections.abc", "numpy") or kind in (list, tuple, dict):
+            # What is read one by one may be an array, a list or a table's column.
+            classes.append(Iterable)
+        else:
+            classes.append(kind)
+    return tuple(classes)
 
 
 def _call_of(parameters: Iterable[inspect.Parameter]) -> str:

@@ -170,7 +170,8 @@ class Record(Shown):
         if dt_s is None:
             raise ValueError("a record needs dt_s, the sampling time in seconds")
         if isinstance(dt_s, bool) or not isinstance(dt_s, (int, float, np.integer, np.floating)):
-            raise ValueError(f"dt_s must be a positive number of seconds; got {dt_s!r}")
+            found = repr(dt_s) if np.ndim(dt_s) == 0 else f"values of shape {np.shape(dt_s)}"
+            raise ValueError(f"dt_s must be a positive number of seconds; got {found}")
         u = once("u", u, "input", input)
         y = once("y", y, "output", output)
         refuse_other_rows(u, y, reference)

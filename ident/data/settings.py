@@ -73,7 +73,15 @@ _EARLIER_NAMES = {
 
 
 class _Fields(ModelMetaclass):
-    """Metaclass of settings: `help` lists what a reader sets, and nothing of pydantic's."""
+    """Metaclass of settings: fields are keywords, and `help` lists them and nothing of pydantic's."""
+
+    def __call__(self, *arguments: Any, **values: Any) -> Any:
+        """A new object. Raises ValueError, one line, for a value without its keyword."""
+        if arguments:
+            name = self.__name__
+            first_field = next(iter(self.model_fields))
+            raise ValueError(f"{name}: fields are given by name, as {name}({first_field}=...)")
+        return super().__call__(**values)
 
     def __dir__(self) -> list[str]:
         """Names of the fields that this class declares."""
