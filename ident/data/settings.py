@@ -79,7 +79,7 @@ class _Fields(ModelMetaclass):
         """A new object. Raises ValueError, one line, for a value without its keyword."""
         if arguments:
             name = self.__name__
-            first_field = next(iter(self.model_fields))
+            first_field = next(iter(self.__dict__["__pydantic_fields__"]))
             raise ValueError(f"{name}: fields are given by name, as {name}({first_field}=...)")
         return super().__call__(**values)
 

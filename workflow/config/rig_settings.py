@@ -58,12 +58,22 @@ Real = npt.NDArray[np.float64]
 
 
 class _Table(Section):
+    """An excitation of the simulated arm: what its voltage is at every sample."""
+
     @abstractmethod
     def signal(self, dt_s: float, rng: np.random.Generator) -> Real:
         """Voltage (T,). Raises ValueError where the numbers do not fit together."""
 
 
 class Prbs(_Table):
+    """A pseudo-random binary sequence: the voltage is plus or minus `amplitude_V`, V.
+
+    Notes
+    -----
+    `register_length` and `hold_samples` set its period, (2^register_length - 1) hold_samples samples; a
+    longer record repeats it. Values out of their bounds are refused when the file is read.
+    """
+
     kind: Literal["prbs"] = Field(description="pseudo-random binary sequence")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")
@@ -75,6 +85,14 @@ class Prbs(_Table):
 
 
 class Multisine(_Table):
+    """A sum of sines of equal amplitude and random phase, `rms_V` large, V, repeated for whole periods.
+
+    Notes
+    -----
+    Lines lie between `from_Hz` and `to_Hz`, Hz, at multiples of one over the length of a period. A band
+    without a line, or one beyond half of the sampling rate, is refused (ValueError) when the record is made.
+    """
+
     kind: Literal["multisine"] = Field(description="sum of sines of random phase")
     rms_V: float = Field(gt=0, description="root mean square")
     period_samples: int = Field(ge=2, le=1_000_000, description="length of a period")
@@ -112,6 +130,14 @@ class Multisine(_Table):
 
 
 class LogChirp(_Table):
+    """A sine of `amplitude_V`, V, swept from `from_Hz` to `to_Hz`, Hz, by equal ratios in equal times.
+
+    Notes
+    -----
+    The sweep takes the whole record. Frequencies beyond half of the sampling rate, or two equal ones, are
+    refused (ValueError) when the record is made.
+    """
+
     kind: Literal["log_chirp"] = Field(description="sweep, as long in each octave")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")
@@ -123,6 +149,13 @@ class LogChirp(_Table):
 
 
 class Doublet(_Table):
+    """A pulse of `amplitude_V`, V, and its negative, each `pulse_s` long, s, after `start_s` of rest, s.
+
+    Notes
+    -----
+    The voltage is 0 before and after; what lies beyond the end of the record is cut off.
+    """
+
     kind: Literal["doublet"] = Field(description="a pulse and its negative")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")
@@ -134,6 +167,14 @@ class Doublet(_Table):
 
 
 class BangBang(_Table):
+    """A move at full voltage: `amplitude_V` one way, then the other, V, each for half of `slew_s`, s.
+
+    Notes
+    -----
+    It begins after `start_s` of rest, s. The voltage is 0 before and after; what lies beyond the end of the
+    record is cut off.
+    """
+
     kind: Literal["bang_bang"] = Field(description="full voltage one way, then the other")
     amplitude_V: float = Field(gt=0, description="largest voltage")
     samples: int = Field(ge=2, le=1_000_000, description="length of the record")

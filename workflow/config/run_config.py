@@ -33,6 +33,13 @@ RecordRole = Annotated[
 
 
 class RunSection(Section):
+    """Name, headline and seed of a run.
+
+    Notes
+    -----
+    The seed decides every random stream: the same configuration and seed give the same bytes.
+    """
+
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=60)] = Field(
         "run", description="name of the default output directory; letters, digits, '_', '-' and '.'"
     )
@@ -63,6 +70,14 @@ class SimulatedLoop(Section):
 
 
 class SimulatedSource(Section):
+    """Records of the simulated flexible arm in SI units, planned or listed one by one.
+
+    Notes
+    -----
+    The arm has the parameters of `rig` and, beside these, `effects`; `encoder_step_rad` is the step of its
+    hub angle, rad. Modes beyond `modes` are neglected. A source without a record is refused.
+    """
+
     kind: Literal["simulated"] = Field(description="records come from the simulated arm")
     rig: RigChoice = Field("paper_link", description="preset 'paper_link', or the path of a rig TOML file")
     modes: int | None = Field(
@@ -135,6 +150,14 @@ class FileRecord(Section):
 
 
 class FileSource(LogReading):
+    """Records read from log files, in units of the columns unless `scale` and `units` say otherwise.
+
+    Notes
+    -----
+    Every record needs a time base: a column (`time`) or a sampling period (`dt_s`, s), never both; another
+    source is refused.
+    """
+
     kind: Literal["files"] = Field(description="records are log files")
     references: tuple[str, ...] = Field((), description="reference columns of logs made in closed loop")
     records: tuple[FileRecord, ...] = Field(min_length=1)

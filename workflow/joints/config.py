@@ -34,6 +34,14 @@ class OperatingPoint(Section):
 
 
 class TwoJointSource(Section):
+    """Records of a simulated arm of two joints, in SI units: at every point a multisine at each motor.
+
+    Notes
+    -----
+    Angles are measured with white noise of `noise_rad`, rad; the amplifier has no limit here. Values out of
+    their bounds are refused when the file is read.
+    """
+
     kind: Literal["two_joint_arm"] = Field(description="records come from the simulated arm of two joints")
     points: tuple[OperatingPoint, ...] = Field(min_length=1, description="operating points, one plant each")
     dt_s: float = Field(0.002, gt=0, description="sampling period")
@@ -101,6 +109,13 @@ class JointsSearch(MultivariableOptions):
 
 
 class JointsDesign(Section):
+    """One controller for all joints: its states and structure, and how hard it is searched for.
+
+    Notes
+    -----
+    `controller_damping` is a damping ratio, without unit; real poles have none to keep.
+    """
+
     controller_order: int = Field(6, ge=0, le=40, description="number of controller states")
     structure: Literal["full", "decentralised"] = Field("full", description="decentralised: K is diagonal")
     controller_damping: float = Field(0.02, gt=0, le=1, description="smallest of the controller's pole pairs")

@@ -130,6 +130,14 @@ JOINTS_PLOTS = (
 
 
 class StudySection(Section):
+    """Headline, base and seed of a study.
+
+    Notes
+    -----
+    The base is the built-in arm where none is stated. A seed here holds for every point; an axis over
+    run.seed contradicts it and is refused.
+    """
+
     title: Annotated[str, Field(pattern=r"^[^\x00-\x1f\x7f]*$", max_length=120)] = Field(
         "", description="headline of the page; default: that of the base"
     )
