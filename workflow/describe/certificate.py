@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import reduce
 from typing import TYPE_CHECKING, Any
 
 from control_design.analysis.certificate import Certificate, PlantVerdict
@@ -57,6 +58,9 @@ from workflow.text.sentences.certificate import (
 if TYPE_CHECKING:
     from workflow.figures.subjects import RunView
 
+# Where the rows of `margins_by_key` stand in the JSON answer.
+WORST_AT = "certificate.worst"
+NOMINAL_AT = "certificate.nominal"
 # Anchor, title and short name of two sections of a page.
 UNCHECKED = ("unchecked", "What was not checked", "Not checked")
 _MARGINS = ("margins", "Margins and certificate", "Margins")
@@ -129,6 +133,43 @@ def margin_rows(certificate: Certificate) -> tuple[Row, ...]:
         for plant in certificate.plants
         if plant.stable
     )
+
+
+def margins_by_key(certificate: Certificate) -> tuple[Row, ...]:
+    """Worst-case gamma, and the margins of the worst case and of the nominal loop, for readers by key.
+
+    Keys begin with `WORST_AT` and `NOMINAL_AT`. Of several plants the worst case is the least of each margin,
+    the nominal loop that of the first. None: unlimited, or not known since a nominal loop is unstable.
+    """
+    bound = certificate.gamma_bound
+    gamma = certificate.gamma if bound is None else bound
+    worst = reduce(Margins.worse, (plant.worst_margins for plant in certificate.plants))
+    nominal = certificate.plants[0].nominal_margins
+    return (
+        Row(f"{WORST_AT}.gamma", "worst-case gamma", Quantity.of(gamma, digits=4, bound=Bound.AT_MOST)),
+        *_each_margin(WORST_AT, worst, "worst case"),
+        *_each_margin(NOMINAL_AT, nominal, "nominal"),
+    )
+
+
+def _each_margin(place: str, margins: Margins, of: str) -> tuple[Row, ...]:
+    """A row for each margin; an infinite one is unlimited."""
+    # A gain may rise up to one factor and fall down to another: the margin is the nearer of the two.
+    factors = [margins.gain_up] if math.isfinite(margins.gain_up) else []
+    factors += [1.0 / margins.gain_down] if margins.gain_down else []
+    gain_dB = 20 * math.log10(min(factors)) if factors and min(factors) > 0 else None
+    phase_deg = math.degrees(margins.phase_rad) if math.isfinite(margins.phase_rad) else None
+    delay_ms = 1e3 * margins.delay_s if math.isfinite(margins.delay_s) else None
+    rows = []
+    for name, words, value, unit_of_value in (
+        ("modulus_margin", "modulus margin", margins.modulus, ""),
+        ("gain_margin_dB", "gain margin", gain_dB, "dB"),
+        ("phase_margin_deg", "phase margin", phase_deg, "deg"),
+        ("delay_margin_ms", "delay margin", delay_ms, "ms"),
+    ):
+        quantity = Quantity.of(value, unit_of_value, digits=4, bound=Bound.AT_LEAST, missing="unlimited")
+        rows.append(Row(f"{place}.{name}", words, quantity, of))
+    return tuple(rows)
 
 
 def certificate_section(

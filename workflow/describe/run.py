@@ -11,7 +11,7 @@ from control_design.synthesis.synthesis_result import BlockingPoint
 from ident.command_timing import CommandTiming
 from ident.data.finding import Finding
 from workflow.config.run_config import AnyConfig, RunConfig
-from workflow.describe.certificate import certificate_section, margin_rows
+from workflow.describe.certificate import certificate_section, margin_rows, margins_by_key
 from workflow.describe.closed_loop import closed_loop_numbers, loop_numbers, loop_section
 from workflow.describe.controller import controller_section, pid_row
 from workflow.describe.design import design_section, filter_section, gave_way_text, run_verdict
@@ -33,13 +33,13 @@ from workflow.text.sentences.design import lowered, tracking_begins
 
 def summarise(results: RunResults, config: RunConfig) -> RunSummary:
     """What a run of one loop says whose stages are all there."""
-    return summary_of(
-        results,
-        config,
-        run_sections(results, config),
-        run_document(results, config),
-        verdict_of_run(results, config),
-    )
+    document = run_document(results, config)
+    certificate = results.certify.certificate
+    if certificate is not None:
+        # For programs: a terminal has them in one line of words.
+        document = with_rows(document, [Section("margins", margins_by_key(certificate))])
+    sections = run_sections(results, config)
+    return summary_of(results, config, sections, document, verdict_of_run(results, config))
 
 
 def summary_of(

@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import reduce
 from typing import TYPE_CHECKING, Any, Literal
 
 from workflow.config.run_config import AnyConfig, RunConfig
 from workflow.describe.loop_metrics import LOOP_METRICS
 
 if TYPE_CHECKING:
-    from control_design.analysis.margins import Margins
     from workflow.joints import JointsResults
     from workflow.tasks.results import AnyResults, RunResults
 
@@ -90,9 +88,8 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     that was identified, at the larger of two sizes.
     """
     # Here: a study that is refused needs the names of the columns only.
-    from control_design.analysis.margins import Margins
+    from workflow.describe.certificate import NOMINAL_AT, WORST_AT, margins_by_key
     from workflow.describe.closed_loop import metric_rows
-    from workflow.engine.codec import plain
     from workflow.tasks.design import bracket_numbers
 
     gamma = results.design.gamma
@@ -116,11 +113,10 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
     certificate = certify.certificate
     if certificate is not None:
         verdict = certificate.plants[0]
-        bound = certificate.gamma_bound
-        # Of several plants a stated number is the least, and an unstable one has none.
-        least_margins = reduce(Margins.worse, (plant.worst_margins for plant in certificate.plants))
-        numbers |= _margins("", least_margins) | _margins("nominal_", verdict.nominal_margins)
-        numbers["worst_gamma"] = plain(certificate.gamma if bound is None else bound)
+        for row in margins_by_key(certificate):
+            place, _, name = row.key.rpartition(".")
+            prefix = {WORST_AT: "", NOMINAL_AT: "nominal_"}[place]
+            numbers["worst_gamma" if name == "gamma" else prefix + name] = row.value.plain
         numbers["bandwidth_rad_s"] = min(plant.bandwidth_rad_s for plant in certificate.plants)
         low, high = config.specification.mode_band_rad_s or (0.0, math.inf)
         modes = [mode for mode in verdict.closed_loop_modes if low <= mode.omega_rad_s <= high]
@@ -170,17 +166,3 @@ def _of_joints(results: JointsResults) -> dict[str, Number]:
         if all(run.settled for run in runs):
             numbers["overshoot_percent"] = 100.0 * max(0.0, *(float(run.overshoot.max()) for run in runs))
     return numbers
-
-
-def _margins(prefix: str, margins: Margins) -> dict[str, Number]:
-    """Columns of margins, their names behind a prefix; an infinite one is None."""
-    sides = [margins.gain_up] if math.isfinite(margins.gain_up) else []
-    sides += [1.0 / margins.gain_down] if margins.gain_down else []
-    phase = margins.phase_rad
-    delay = margins.delay_s
-    return {
-        f"{prefix}modulus_margin": margins.modulus,
-        f"{prefix}gain_margin_dB": 20 * math.log10(min(sides)) if sides and min(sides) > 0 else None,
-        f"{prefix}phase_margin_deg": math.degrees(phase) if math.isfinite(phase) else None,
-        f"{prefix}delay_margin_ms": 1e3 * delay if math.isfinite(delay) else None,
-    }
