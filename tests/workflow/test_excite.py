@@ -5,7 +5,10 @@ import json
 import numpy as np
 import pytest
 
+from plant import paper_link
 from workflow.cli import main
+from workflow.excite.experiment import ExperimentLimits, plan_experiment
+from workflow.excite.page import experiment_page
 
 LIMITS = ["--band", "0.5", "40", "--dt-s", "0.005", "--duration", "60", "--voltage", "10"]
 
@@ -67,3 +70,25 @@ def test_impossible_limits_are_one_line(tmp_path, capsys, options, words):
     for word in words:
         assert word in error
     assert not (tmp_path / "plan").exists()
+
+
+@pytest.mark.parametrize("stated", [{"rig": paper_link(), "angle_deg": 40.0}, {"gain_rad_per_Vs": 2.0}, {}])
+def test_the_page_says_what_is_planned_and_what_to_expect(stated):
+    limits = ExperimentLimits(band_Hz=(0.5, 90.0), dt_s=0.005, duration_s=40.0, peak_V=24.0, **stated)
+    plan = plan_experiment(limits, seed=1, realisations=1)
+    page = experiment_page(plan)
+    rows = {row.name: row for row in page.first.rows}
+    assert rows["records"].value.plain == plan.plan.n_records
+    assert rows["highest voltage"].value.plain == max(record.peak_V for record in plan.records) <= 24.0
+    turns = rows["hub turns by at most"]
+    if stated:
+        assert turns.value.plain == max(record.peak_angle_deg for record in plan.records)
+        assert ("40 allowed" in turns.remark) == ("rig" in stated)
+    else:
+        assert (turns.value.text, turns.remark) == ("not predicted", "give --rig or --gain")
+    radius = rows["95 % radius of the response"]
+    assert radius.value.unit == ("%" if stated else "rad/V")
+    assert any("One realisation" in bullet for bullet in page.first.bullets)
+    uncertainty, files = page.sections
+    assert len(uncertainty.blocks[0].rows) == len(plan.plan.rms_V)
+    assert [row[0] for row in files.blocks[0].rows] == [record.file for record in plan.records]

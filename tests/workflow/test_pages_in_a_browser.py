@@ -15,11 +15,12 @@ from tests.browser import AXE, PROGRAM, Browser, barriers
 from tests.workflow import report_examples as example
 from tests.workflow.page_shape import shape_faults
 from workflow.excite.experiment import ExperimentLimits, plan_experiment
+from workflow.excite.page import experiment_page
 from workflow.figures.bode import draw_bode
 from workflow.figures.poles import draw_poles
 from workflow.report import rendering
 from workflow.report.pages import write_report
-from workflow.report.rendering import render_page
+from workflow.report.rendering import render_described, render_page
 from workflow.tasks.results import RunResults
 from workflow.text.templates import environment
 
@@ -268,5 +269,5 @@ def test_page_of_a_planned_experiment(faults_seen, tmp_path):
     )
     plan = plan_experiment(limits, seed=1, realisations=2)
     path = tmp_path / "plan.html"
-    path.write_text(render_page("experiment.html.j2", title="Planned experiment", found=plan).html)
+    path.write_text(render_described(experiment_page(plan)).html)
     assert faults_seen(path) == []

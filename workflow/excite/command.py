@@ -34,7 +34,8 @@ def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settin
     RunDirectory(out).refuse_unless_free()
     experiment = plan_experiment(limits, seed=seed, **settings)
     # Here: these take seconds to load, and limits that are refused do not need them.
-    from workflow.report.rendering import render_page
+    from workflow.excite.page import experiment_page
+    from workflow.report.rendering import render_described
     from workflow.tasks.simulated_rig import INPUT_NAME
 
     time = np.arange(experiment.plan.n_samples) * limits.dt_s
@@ -55,7 +56,7 @@ def write_experiment(limits: ExperimentLimits, out: Path, *, seed: int, **settin
             "records": experiment.records,
         }
     )
-    texts[PAGE_FILE] = render_page("experiment.html.j2", title="Planned experiment", found=experiment).html
+    texts[PAGE_FILE] = render_described(experiment_page(experiment)).html
     return storage.write_new_directory(out, texts)
 
 
