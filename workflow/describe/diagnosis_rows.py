@@ -129,13 +129,18 @@ def _said(name: str, words: str) -> Row:
     return Row("", name, Quantity.words(words))
 
 
+def _keyed(key: str, name: str, words: str, plain: Any) -> Row:
+    """A row in words, for people, of what the answer has under a key."""
+    return Row(key, name, Quantity(words, plain))
+
+
 def _answer_rows(document: Document) -> Iterator[Row]:
     presence = document["presence"]
     answer = short_answer(document)
     if nothing_tried(document):
         yield _said("answer", f"{answer}. Give more time: --time-limit")
         return
-    yield _said("repair", repair_words(document))
+    yield _keyed("repair.effects", "repair", repair_words(document), document["repair"]["effects"])
     probability = document["probability"]
     answer += f", {probability_words(probability)}"
     unsure = [
@@ -148,6 +153,11 @@ def _answer_rows(document: Document) -> Iterator[Row]:
     yield Row("probability", "answer", Quantity(answer, probability))
 
 
+def _presence_key(name: str) -> str:
+    """Where the answer has the probability of an effect; "" for "elbow.delay", whose dot is no level."""
+    return "" if "." in name else f"presence.{name}.probability"
+
+
 def _small(document: Document) -> Sequence[str]:
     """Effects of the repaired model that carry less than the threshold beside the answer."""
     small: Sequence[str] = document["shares"]["small"] if "shares" in document else ()
@@ -157,7 +167,8 @@ def _small(document: Document) -> Sequence[str]:
 def _effect_rows(document: Document) -> Iterator[Row]:
     """Every effect that is present or in the repaired model, with its sizes."""
     presence = document["presence"]
-    for name in present_of(document):
+    present = present_of(document)
+    for name in present:
         effect = presence[name]
         parts = [probability_words(effect["probability"])]
         for key, value in effect["parameters"].items():
@@ -165,14 +176,16 @@ def _effect_rows(document: Document) -> Iterator[Row]:
             parts.append(parameter_words(key, value, effect["intervals"].get(key)) + remark)
         if effect["explains"][0] is not None:
             parts.append(f"explains {portion(effect['explains'][0])} of the error")
-        yield _said(name, "; ".join(parts))
+        yield _keyed(_presence_key(name), name, "; ".join(parts), effect["probability"])
     for name in _small(document):
         effect = presence[name]
         parts = [f"in the repaired model, present with {probability_words(effect['probability'])}"]
         for key, value in effect["parameters"].items():
             parts.append(parameter_words(key, value, effect["intervals"].get(key)))
         parts.append(f"explains {portion(document['shares']['carried'][name][0])} of the error")
-        yield _said(name, "; ".join(parts))
+        # One that is present has the key above.
+        key = "" if name in present else _presence_key(name)
+        yield _keyed(key, name, "; ".join(parts), effect["probability"])
 
 
 def _completeness_rows(document: Document) -> Iterator[Row]:
@@ -211,9 +224,10 @@ def _open_rows(document: Document) -> Iterator[Row]:
         yield _said("not tried", f"{names_words(name for _, name in items)}: needs {needs}")
     for doubt in document["doubts"]:
         yield _said("doubtful", doubt)
-    yield _said("or instead", names_words(document["instead"]))
-    yield _said("perhaps also", names_words(document["perhaps"]))
-    yield _said("next", document["next_experiment"]["words"][0])
+    yield _keyed("instead", "or instead", names_words(document["instead"]), document["instead"])
+    yield _keyed("perhaps", "perhaps also", names_words(document["perhaps"]), document["perhaps"])
+    following = document["next_experiment"]["words"]
+    yield _keyed("next_experiment.words", "next", following[0], following)
 
 
 def _partial_rows(document: Document) -> Iterator[Row]:
@@ -244,10 +258,12 @@ def _replay_rows(document: Document) -> Iterator[Row]:
             "; worse than nominal: without its controller the machine drifts, or a column has the wrong sign "
             "or is another joint's"
         )
-    yield _said(
+    yield _keyed(
+        "replayed",
         "replayed",
         f"{listing(document['validation'])} by plain simulation, from the start under the commands alone; "
         f"RMS error of {'; '.join(outputs)}{worse}",
+        replayed,
     )
 
 
@@ -259,7 +275,7 @@ def _model_rows(document: Document, folder: Path) -> Iterator[Row]:
             value = document["repair"]["values"][key]
             stated, repaired = number(value["stated"], 4), number(value["repaired"], 4)
             moved.append(f"{key_words(key)} {stated} to {repaired} ({signed(tolerances)} tolerances)")
-    yield _said("moved", ", ".join(moved))
+    yield _keyed("deviations", "moved", ", ".join(moved), document["deviations"])
     for file in document["files"]:
         if file.endswith((".xml", ".toml")):
             yield _said("repaired model", f"{folder}/{file}")
