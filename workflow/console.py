@@ -43,11 +43,13 @@ _PIPE_COLUMNS = 120
 # Width below which a table becomes a list: at 40 three columns leave a value ten letters a line; from 72 on
 # they leave it forty.
 _LEAST_TABLE_COLUMNS = 72
-# Length of the bar of progress; on a narrow terminal the words beside it need the room.
+# Length of the bar of progress: a step of it is three percent.
 _BAR_COLUMNS = 30
+# The same on a narrow terminal, where the words beside it need the room: at 40 columns they get half.
 _SHORT_BAR_COLUMNS = 8
-# Steps of a list's indentation: sections, names, values.
+# Indentation of a name in a list, behind its section; more would take room from its value.
 _NAME_INDENT = 2
+# Indentation of a value below its name.
 _VALUE_INDENT = 4
 # So much work as expected [s] is taken for granted before the speed of this machine counts.
 _PRIOR_S = 10.0
