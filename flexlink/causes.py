@@ -63,12 +63,15 @@ def diagnose(
     >>> found.verdict, found.effects[0].name
     ('effect', 'coulomb_friction')
     """
-    if not hasattr(case, "machine"):
-        raise WrongArgumentError(
-            f"diagnose: case is of type {type(case).__name__}, expected a flexlink.Case; "
-            "flexlink.load_case(place) reads one from a folder"
-        )
-    return chain.diagnose(case, progress=progress, rng=rng, time_limit_s=time_limit_s)
+    try:
+        return chain.diagnose(case, progress=progress, rng=rng, time_limit_s=time_limit_s)
+    except AttributeError:
+        if hasattr(case, "machine"):
+            raise
+    raise WrongArgumentError(
+        f"diagnose: case is of type {type(case).__name__}, expected a flexlink.Case; "
+        "flexlink.load_case(place) reads one from a folder"
+    )
 
 
 @front_door
