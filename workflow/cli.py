@@ -190,6 +190,10 @@ Cases = Annotated[
         "beside logs of your own, or one that names a simulator's model; several give an overview as well."
     ),
 ]
+SimulatorCaseFile = Annotated[
+    Path | None,
+    typer.Argument(help="TOML file that names a simulator's model and logs, in place of the options below."),
+]
 # Any number: it is fixed so that results repeat.
 _SEED = 2006
 Seed = Annotated[int, typer.Option(min=0, help="Root of the random starts.")]
@@ -650,20 +654,20 @@ def study(
 @app.command(short_help="What logs can tell of a simulator's model, in seconds.")
 @with_fields(simulator=_SIMULATOR)
 def check(
-    case: Cases = None,
+    case: SimulatorCaseFile = None,
     time_limit: TimeLimit = None,
     as_json: Json = False,
     **of_fields: Any,
 ) -> None:
-    """Quality of logs, smallest sizes that show, candidates that act alike, what a next record needs."""
-    stated = _of_simulator("check", case or [], of_fields)
-    need(*case or [])
-    if case and len(case) > 1:
-        raise InputError("check: expected one case file")
+    """What logs of a MuJoCo, FMU or Python model tell: their quality, smallest sizes that show, candidates
+    that act alike, what a next record needs."""
+    cases = [] if case is None else [case]
+    stated = _of_simulator("check", cases, of_fields)
+    need(*cases)
     from workflow.diagnose.check import check as look_at_case
     from workflow.diagnose.simulator_settings import settings_of
 
-    _show(look_at_case(case[0] if case else settings_of(stated, "--log")), as_json)
+    _show(look_at_case(case or settings_of(stated, "--log")), as_json)
 
 
 @app.command(short_help="Cause and size of a model error; how much of it is explained.")
