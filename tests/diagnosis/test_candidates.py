@@ -10,6 +10,7 @@ from diagnosis.evidence.hypotheses import Hypothesis
 from diagnosis.fit.discrepancy import discrepancy
 from diagnosis.machine.case import Case, Experiment
 from diagnosis.search.moves import in_place_of
+from plant.effects import LOOK_ALIKES
 from plant.presets import paper_link
 from tests.diagnosis.recorded import end_of_fit
 
@@ -65,6 +66,27 @@ def test_a_pulled_inertia_is_another_inertia_of_that_size_or_the_nearest_worth_a
     candidate, x = in_place_of("hub.inertia_kg_m2", factor, listed)
     assert candidate.effect == "hub_inertia"
     assert candidate.parameters(x)["ratio"] == pytest.approx(ratio, rel=1e-12)
+
+
+def test_a_body_on_a_spring_is_looked_for_where_it_swings_and_a_log_shows_it(listed):
+    """From a swing in two seconds to eight samples a swing; faster, it is inertia of the hub."""
+    inertia = next(c for c in listed if c.effect == "hub_inertia")
+    rig = paper_link()
+    body = LOOK_ALIKES["attached_body"].in_place_of(inertia, np.array([np.log(3.0)]), rig)
+    axes = {axis.parameter: axis for axis in body.axes}
+    seeming = (3.0 - 1) * rig.hub.inertia_kg_m2  # what three times the hub's inertia leaves for the body
+    period_s = [
+        2 * np.pi * np.sqrt(seeming / stiffness)
+        for stiffness in (axes["stiffness_Nm_rad"].low, axes["stiffness_Nm_rad"].high)
+    ]
+    assert period_s == pytest.approx([2.0, 8 * rig.sampling.dt_s])
+    assert len(body.starts) == 6
+    for start in body.starts:
+        found = body.parameters(start)
+        assert found["inertia_kg_m2"] == pytest.approx(seeming)
+        swing_rad_s = np.sqrt(found["stiffness_Nm_rad"] / seeming)
+        assert 2 * np.pi / period_s[0] < swing_rad_s < 2 * np.pi / period_s[1]
+        assert found["damping_Nms"] == pytest.approx(2 * 0.1 * swing_rad_s * seeming)
 
 
 def test_a_value_that_no_effect_multiplies_has_none_in_its_place(listed):

@@ -224,6 +224,10 @@ def test_an_arm_at_another_step_is_the_same_in_continuous_time() -> None:
     before = fit.arm.continuous_response(omega) @ fit.coefficients
     after = other.arm.continuous_response(omega) @ other.coefficients
     assert np.max(np.abs(after / before - 1)) < 0.01
+    # The sampled model is the continuous one behind a hold, which lags by half a sample and rolls off.
+    half = omega * DT_S / 2
+    held = before * np.exp(-1j * half) * np.sin(half) / half
+    assert np.max(np.abs(held / fit.model.frequency_response(omega) - 1)) < 0.01
 
 
 def test_the_lag_of_a_drive_is_the_mean_over_each_sample() -> None:
