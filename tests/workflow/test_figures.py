@@ -351,7 +351,7 @@ def test_the_step_is_shown_until_it_has_settled():
         )  # fmt: skip
         figure = figure_of(picture)
         ends.append(figure.axes[0].get_xlim()[1])
-        first = max(line.get_xdata()[-1] for line in figure.axes[0].lines if "nominal" in line.get_label())
+        first = max(line.get_xdata()[-1] for line in figure.axes[0].lines if "predicted" in line.get_label())
         assert first < 4.0  # where the disturbance begins
     assert ends[0] < 4.0
     step_s = 0.4
