@@ -53,7 +53,9 @@ def tune() -> bytes:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         browser, picture, small = Browser(), Path(name) / "page.png", BytesIO()
         browser.go(server.url, 1280, 860)
-        while browser.ask("document.querySelectorAll('#numbers dd')[1]?.textContent ?? '–'") == "–":
+        # The bound over controllers of any order comes last, seconds after the first design.
+        bound = "[...document.querySelectorAll('#numbers dt')].find(name => name.textContent.includes('bound'))"
+        while browser.ask(f"{bound}?.nextElementSibling.textContent ?? '–'") == "–":
             time.sleep(0.5)
         browser.ask("document.getElementById('state').textContent = ''")  # how long it took here
         browser.picture(picture, whole=False)
