@@ -54,7 +54,8 @@ def tune() -> bytes:
         browser, picture, small = Browser(), Path(name) / "page.png", BytesIO()
         browser.go(server.url, 1280, 860)
         # The bound over controllers of any order comes last, seconds after the first design.
-        bound = "[...document.querySelectorAll('#numbers dt')].find(name => name.textContent.includes('bound'))"
+        names = "[...document.querySelectorAll('#numbers dt')]"
+        bound = f"{names}.find(name => name.textContent.includes('bound'))"
         while browser.ask(f"{bound}?.nextElementSibling.textContent ?? '–'") == "–":
             time.sleep(0.5)
         browser.ask("document.getElementById('state').textContent = ''")  # how long it took here

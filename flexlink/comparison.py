@@ -444,7 +444,10 @@ def _innovation_model(model: Any, record: Record, what: str) -> InnovationModel:
 
 
 def _gobf_on_record(model: Any, record: Record, what: str) -> ComparedModel:
-    """A GOBF model, or a result that has one, on a record, run as validation runs it."""
+    """A GOBF model, its posterior, or an identification that has one, on a record, as validation runs it.
+
+    what: its name in a refusal. one_step_percent is nan where no noise model was found.
+    """
     # A result of an identification has the model, and the noise that was found beside it.
     bare_model = getattr(model, "model", model)
     _refuse_other_step(bare_model.dt_s, record, what)
@@ -461,7 +464,8 @@ def _gobf_on_record(model: Any, record: Record, what: str) -> ComparedModel:
         one_step = fit_percent(measured, measured - innovation)
     return ComparedModel(
         name="GOBF posterior" if isinstance(model, ResponsePosterior) else "GOBF",
-        order=bare_model.order if isinstance(bare_model, GobfModel) else bare_model.poles.order,
+        # Those of a posterior are doubled where it is of the tangent method.
+        order=bare_model.poles.order,
         fit_percent=fresh.fit_percent,
         one_step_percent=one_step,
         fit_s=getattr(model, "fit_s", np.nan),

@@ -418,7 +418,7 @@ def simulate_loop(
     measured_index : int
         Signal of the machine that is fed back.
     hub_torque_Nm, input_disturbance, output_disturbance : (T,) array, optional
-        From outside.
+        Torque on the machine [N m]; added to the applied command; added to the measured output, in its units.
     measurement_step, command_step : float
         Quantisation of the two signals; 0 for none.
     clip : float

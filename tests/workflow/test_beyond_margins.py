@@ -141,6 +141,10 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
     proved = replace(certify, certificate=SimpleNamespace(plants=plants))
     numbers = bandwidth_numbers(lower, proved, asked)
     assert numbers == {"specified": 16.0, "designed_for": 7.43, "reached": 8.5}
+    for bandwidths in ((3.0, np.nan), (np.nan, 3.0)):  # one nominal loop is unstable
+        plants = [SimpleNamespace(bandwidth_rad_s=bandwidth) for bandwidth in bandwidths]
+        proved = replace(certify, certificate=SimpleNamespace(plants=plants))
+        assert bandwidth_numbers(lower, proved, asked)["reached"] is None
     given = SimpleNamespace(certified=True, plants=[]), ""
     assert design_verdict(lower, *given, asked).startswith("; bandwidth_rad_s = 16 was not met")
     soft = Specification(effort_limit=2.2, highest_effort_limit=8.8, mode_peak_ratio=1.0)

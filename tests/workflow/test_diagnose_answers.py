@@ -244,6 +244,9 @@ def test_every_verdict_is_drawn_with_every_proposal(loaded, monkeypatch, kind):
     for i, j in product(range(len(VERDICTS)), range(len(comings))):
         (verdict, detail), coming = VERDICTS[i], comings[j]
         found = beside(answer) if (i + j) % 2 else answer
+        if (i + j) % 4 == 1 and found.shares:
+            # A time limit left no time to share the error out among the effects.
+            found = replace(found, shares=replace(found.shares, carried={}))
         document, page, rows = drawn(case, as_judged(found, verdict, detail), coming, monkeypatch)
         assert (document["verdict"], document["detail_verdict"]) == (verdict, detail)
         assert document["next_experiment"]["advice"] == coming.advice

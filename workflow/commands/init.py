@@ -253,14 +253,16 @@ def _refuse_missed_friction(results: RunResults, found: Found) -> None:
 
 
 def _is_described(results: RunResults, at: int) -> bool:
-    """Whether the model of the channel of a number explains a log, and its ellipses are narrow somewhere.
+    """Whether the model of channel number `at` explains a log, and its ellipses are narrow in some band.
 
-    What is fallen back on when no model with friction explains the logs must explain more than that did.
+    For the model that is taken instead when none with friction explains the logs: it has to pass the least
+    fit that those missed.
     """
     from workflow.tasks.first_look import TOLD
     from workflow.tasks.uncertainty import LEAST_FIT_PERCENT
 
     bands = results.uncertainty.channels[at].bands
+    # Semi-axis over |G|; TOLD is for a standard deviation, which is smaller: this asks for more.
     is_narrow = min(band.median_radius_percent for band in bands) <= 100 * TOLD
     return is_narrow and results.identify.channels[at].best_fit_percent >= LEAST_FIT_PERCENT
 

@@ -400,11 +400,13 @@ def closure_sentences(view: DiagnosisView) -> Iterator[str]:
         return
     shares = answer.shares
     if shares and shares.small:
-        parts = [
-            f"{portion(shares.carried[name][0])} of the error, present with "
-            f"{probability_words(answer.presence(name))}"
-            for name in shares.small
-        ]
+        parts = []
+        for name in shares.small:
+            part = f"present with {probability_words(answer.presence(name))}"
+            # Nothing is shared out where a time limit came first, or there is no error to share out.
+            if name in shares.carried:
+                part = f"{portion(shares.carried[name][0])} of the error, {part}"
+            parts.append(part)
         verb = "is" if len(shares.small) == 1 else "are"
         yield (
             f"{names_words(shares.small)} {verb} in the repaired model too, but not certain: "
@@ -502,11 +504,12 @@ def first_bullets(
 
     Args:
         view: The diagnosis.
-        where: Where the error lies, in a sentence.
+        where: Where the error lies, in a sentence; left out where no candidate effect is needed.
         advice: What to do next.
         of_model: What is to be said of the repaired model's file.
     """
     bullets = [*repair_sentences(view), *which_sentences(view), *of_model]
+    # "none" says that no candidate effect is needed, not that there is no model error.
     if view.found.verdict != "none":
         bullets.append(where)
     return (*bullets, *advice, *closure_sentences(view), *size_sentences(view))

@@ -307,8 +307,10 @@ def _size_section(view: DiagnosisView) -> PageSection:
 
 
 def _where_section(view: DiagnosisView) -> PageSection:
-    place, model_error = view.place, view.found.case.model_error
+    place = view.place
+    model_error = view.found.case.model_error
     model = "nominal parameters re-estimated" if view.found.deviations else "nominal parameters"
+    # One search finds all dependences, on logs or on blocks; without any the picture is not drawn.
     on_logs = bool(place.dependences) and place.dependences[0].judged_on == "logs"
     floor = "the threshold" if view.rough else "the sensor noise"
     residuals = "in per cent of the motion" if view.rough else "over noise"
@@ -320,7 +322,7 @@ def _where_section(view: DiagnosisView) -> PageSection:
             *map(Text, at_length(place, view.floor, model)),
             Picture(
                 "gap_bands",
-                f"Size above {floor}, nominal parameters re-estimated. Pale: not significant.",
+                f"Size above {floor}, {model}. Pale: not significant.",
                 (place, model_error),
             ),
             Picture(

@@ -165,7 +165,11 @@ def _small(document: Document) -> Sequence[str]:
 
 
 def _effect_rows(document: Document) -> Iterator[Row]:
-    """Every effect that is present or in the repaired model, with its sizes."""
+    """Every effect that is present, then those of the repaired model that carry little, with their sizes.
+
+    An effect may be both: it has two rows then, the second without a key. "explains" and "carried" are a
+    share, 0 to 1, and the two ends of its interval.
+    """
     presence = document["presence"]
     present = present_of(document)
     for name in present:
@@ -182,14 +186,22 @@ def _effect_rows(document: Document) -> Iterator[Row]:
         parts = [f"in the repaired model, present with {probability_words(effect['probability'])}"]
         for key, value in effect["parameters"].items():
             parts.append(parameter_words(key, value, effect["intervals"].get(key)))
-        parts.append(f"explains {portion(document['shares']['carried'][name][0])} of the error")
+        # Nothing is shared out where a time limit came first, or there is no error to share out.
+        carried = document["shares"]["carried"].get(name)
+        if carried is not None:
+            parts.append(f"explains {portion(carried[0])} of the error")
         # One that is present has the key above.
         key = "" if name in present else _presence_key(name)
         yield _keyed(key, name, "; ".join(parts), effect["probability"])
 
 
 def _completeness_rows(document: Document) -> Iterator[Row]:
-    """Whether the effects are all, and what remains."""
+    """Whether the effects are all, and what remains; no row where nothing was tried.
+
+    "remains" has for every output (one at least) the share of its motion, 0 to 1, left in validation records;
+    "remains_in_record" the same in the record that is furthest off. Threshold 0: sensor noise alone may
+    remain.
+    """
     if nothing_tried(document):
         return
     complete = document["completeness"]
@@ -197,8 +209,9 @@ def _completeness_rows(document: Document) -> Iterator[Row]:
     left = ", ".join(f"{percentage(share, 3)} of {name_words(name)}" for name, share in remains.items())
     words = f"{probability_words(complete['probability'])}: {left} remain{'s' if len(remains) == 1 else ''}"
     elsewhere = max(complete["remains_in_record"].values(), default=0.0)
-    below = max(remains.values()) < complete["threshold"] <= elsewhere
-    if complete["probability"] < PRESENT and below:
+    # Validation records stay below the threshold, but another record does not.
+    only_elsewhere = max(remains.values()) < complete["threshold"] <= elsewhere
+    if complete["probability"] < PRESENT and only_elsewhere:
         words += f" in validation records, but {percentage(elsewhere, 3)} in {complete['in_record']}"
     if complete["threshold"]:
         of_forces = ""

@@ -64,12 +64,20 @@ def headline_of(results: RunResults, config: RunConfig) -> str:
 
 
 def first_screen(view: RunView) -> FirstScreen:
-    """What the page of a run of one loop begins with."""
+    """What the page of a run of one loop begins with.
+
+    Its state is "refused" where the run is not certified or a simulated loop does not settle, "plain" where
+    the certificate has a reservation, and "certified" without one.
+    """
     results = view.results
     headline = headline_of(results, view.config)
-    state: State = "refused"
-    if results.certified and results.settles:
-        state = "certified" if headline.startswith("Certified:") else "plain"
+    does_not_settle = results.closed_loop.check is not None and not results.settles
+    state: State = "plain"
+    if not results.certified or does_not_settle:
+        state = "refused"
+    # "Certified: ..." has no reservation, "Certified, but ..." has one.
+    elif headline.startswith("Certified:"):
+        state = "certified"
     if results.closed_loop.check is not None:
         picture = Picture(
             "overview",

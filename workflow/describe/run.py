@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -320,13 +321,18 @@ def timing_numbers(timing: CommandTiming | None) -> dict[str, Any] | None:
 def bandwidth_numbers(
     design: DesignResult, certify: CertifyResult, asked: Specification
 ) -> dict[str, float | None]:
-    """Specified, designed for, and reached: up to there every plant has |S| below -3 dB."""
+    """Bandwidths [rad/s] specified, designed for, and reached: up to there every plant has |S| below -3 dB.
+
+    "reached" is None without a certificate, and where a nominal loop is unstable.
+    """
     used = design.specification or asked
     # The slowest of several plants counts.
     reached = None
     if certify.certificate is not None:
         bandwidths = [plant.bandwidth_rad_s for plant in certify.certificate.plants]
-        reached = min(bandwidths, default=None)
+        # nan of an unstable loop: min would pass over it or not, by the order of the plants.
+        if not any(math.isnan(bandwidth) for bandwidth in bandwidths):
+            reached = min(bandwidths, default=None)
     return {
         "specified": asked.bandwidth_rad_s,
         "designed_for": used.bandwidth_rad_s,

@@ -108,7 +108,7 @@ def described(
             "the sensor does not see: it was told by inverse dynamics, and taken off the command. What is "
             "not known of it widens them"
         )
-    if options.response != "as recorded" and equivalent is not None and friction is not None:
+    if options.response == "this amplitude" and equivalent is not None and friction is not None:
         return (
             "They describe the dynamics with friction (best linear approximation) for random-phase "
             f"multisines of {si(equivalent.rms, input_unit)} rms with the spectrum of these records. "

@@ -325,7 +325,8 @@ def common_words(where: Where) -> str:
 def amplitude_words(amplitude: AmplitudeFinding | None, linear: LinearCorrection | None) -> str:
     """How the error grows with the voltage.
 
-    Nothing where a linear correction explains the error: two inputs never excite it quite alike.
+    Another growth than "linear" is not told where a linear correction explains the error: two inputs never
+    excite it quite alike.
     """
     if amplitude is None or amplitude.growth not in _GROWTHS:
         return ""

@@ -171,10 +171,10 @@ def saved(picture: Picture, kinds: Iterable[str]) -> dict[str, bytes]:
         figure.set_layout_engine("none")
         for kind in kinds:
             buffer = io.BytesIO()
-            dated = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
-            figure.savefig(buffer, format=kind, metadata=dict.fromkeys(dated), dpi=_PNG_DPI)
+            varying = ("Software",) if kind == "png" else ("Creator", "Producer", "CreationDate")
+            figure.savefig(buffer, format=kind, metadata=dict.fromkeys(varying), dpi=_PNG_DPI)
             files[kind] = buffer.getvalue()
-    # Compiled parts of matplotlib make anything of one.
+    # An interrupt may be lost in compiled parts of matplotlib: then the files are not to be kept.
     interrupts.check()
     return files
 

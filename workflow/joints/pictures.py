@@ -190,7 +190,8 @@ def draw_joint_requirements(run: AnyRunView) -> Picture | None:
             if weighted_signal == "y":
                 on_outputs = size
                 on_inputs = nothing
-            rows = BoundRows(G, seen, entering, on_outputs, on_inputs, False)
+            # The uncertainty keeps its size: the worst-case gain.
+            rows = BoundRows(G, seen, entering, on_outputs, on_inputs, together=False)
             worst = scaled_bound(rows, K).gamma
             before = largest.get(name, np.zeros(omega.size))
             largest[name] = np.maximum(before, worst)

@@ -390,7 +390,12 @@ def _model_blocks(view: AnyRunView, names: Sequence[str]) -> list[Block]:
 def joints_document(
     models: PointModels, design: DesignResult, certify: JointsCertificate, loop: JointsLoopResult
 ) -> dict[str, Any]:
-    """The stages for programs."""
+    """The stages of a run for several joints, for programs that read JSON.
+
+    gamma: the design's weighted worst case, no unit, met up to 1; None where nothing could be designed. The
+    certificate is None without a controller. Of points and runs all arrays are left out, those of one number
+    a joint (fit_percent, noise_std, overshoot) too: the rows have them in words.
+    """
     return {
         "points": [codec.plain(point, arrays=False) for point in models.points],
         "design": {"gamma": design.gamma, "reason": design.reason},

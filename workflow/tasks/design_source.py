@@ -309,6 +309,7 @@ def _read_response(path: Path, design: DesignFile) -> tuple[FrequencyUncertainty
             "variance_real, variance_imag or a stated uncertainty, as [uncertainty] multiplicative = 0.1 in "
             f"{design.name}"
         )
+    # Every frequency stands here once: this only sorts.
     grid, first = np.unique(measured.omega_rad_s, return_index=True)
     centre = measured.response[first]
     weight = design.uncertainty.multiplicative or design.uncertainty.additive

@@ -396,12 +396,16 @@ def refuse_unexplained(
 def posterior_of(
     model: GobfModel, bounded: Sequence[Record], options: UncertaintyOptions
 ) -> ResponsePosterior:
-    """The posterior of a model by the method of the options.
+    """The posterior of a model by the method of the options: "tangent", or "records", from their scatter.
+
+    bounded: estimation records as the ellipses see them (`ChannelResult.bounded`), one input and one output
+    each.
 
     Raises ValueError, one line, where the method needs more records than there are.
     """
     if options.method == "tangent":
         return tangent(bounded, model, options)
+    # From fewer the ellipses of one more record have no level (`combine_posteriors`).
     if len(bounded) < 4:
         raise ValueError(
             f"uncertainty.method = {options.method!r} needs at least four estimation records; found "
