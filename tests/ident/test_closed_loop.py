@@ -32,8 +32,9 @@ def log(rng, noise=0.3, n=3000):
     return Record(u[:, None], y[:, None], DT, name="log", reference=r[:, None])
 
 
+@pytest.mark.slow
 def test_two_stage_is_free_of_the_direct_method_s_bias():
-    records = [log(np.random.default_rng([1, seed])) for seed in range(4)]
+    records = [log(np.random.default_rng([1, seed])) for seed in range(2)]
     stage = two_stage(records, OPTIONS)
     assert all(record.reference is None for record in stage.records)
     # The noise-free input itself is known here: S r with S = A / (A + g B).
@@ -54,6 +55,7 @@ def test_two_stage_is_free_of_the_direct_method_s_bias():
     assert direct.contains(TRUTH).mean() < 0.5
 
 
+@pytest.mark.slow
 def test_any_model_of_the_plant_will_do_and_a_good_one_does_better():
     """G0 = 0 is the plain two-stage method: unbiased, with the error of u_hat."""
     record = log(np.random.default_rng(8), noise=0.05)
@@ -70,7 +72,13 @@ def test_any_model_of_the_plant_will_do_and_a_good_one_does_better():
     assert found[0].noise_std == pytest.approx(0.07, rel=0.1)
 
 
-@pytest.mark.parametrize(("start", "offset"), [(0, 0.0), (1000, 0.0), (0, 100.0)])
+@pytest.mark.parametrize(
+    ("start", "offset"),
+    [
+        (1000, 100.0),
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((0, 0.0), (1000, 0.0), (0, 100.0))),
+    ],
+)
 def test_a_log_may_begin_in_motion_and_stand_anywhere(start, offset):
     """The same rows of one loop: from rest, from the middle, and around another position."""
     record = log(np.random.default_rng(9), noise=0.05)

@@ -25,6 +25,7 @@ def frequencies_Hz(found):
     return np.sort(found.model.poles.omega_rad_s(found.model.dt_s)) / (2 * np.pi)
 
 
+@pytest.mark.slow
 def test_both_modes_are_found_under_dry_friction_where_plain_least_squares_miss_one():
     records = arm_records(4)
     options = IdentOptions(**STATED, n_real=1, n_pairs=2)
@@ -41,7 +42,7 @@ def test_both_modes_are_found_under_dry_friction_where_plain_least_squares_miss_
     assert plain.rss < found.rss
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_slow_pair_is_called_a_mode_when_the_data_choose():
     records = arm_records(0)
     found = identify(records, IdentOptions(**STATED))
@@ -55,7 +56,10 @@ def test_no_slow_pair_is_called_a_mode_when_the_data_choose():
     assert np.any(np.abs(hertz / 33.16 - 1) < 0.042)
 
 
-@pytest.mark.parametrize(("truth", "numbers"), [(p1, {}), (p1, {"n_real": 2, "n_pairs": 1}), (p2, {})])
+@pytest.mark.parametrize(
+    ("truth", "numbers"),
+    [(p1, {}), (p1, {"n_real": 2, "n_pairs": 1}), pytest.param(p2, {}, marks=pytest.mark.long)],
+)
 def test_white_noise_leaves_every_digit_as_it_is(truth, numbers):
     record = truth(3).record
     auto, white = (identify([record], IdentOptions(noise=noise, **numbers)) for noise in ("auto", "white"))

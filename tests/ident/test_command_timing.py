@@ -59,7 +59,9 @@ def fast_log(rows, averaged=False, n=6000, seed=5):
     return Record(u[every, None], y[every, None], STEP_S, name="log")
 
 
-@pytest.mark.parametrize(("rows", "averaged"), [(2, False), (5, False), (4, True)])
+@pytest.mark.parametrize(
+    ("rows", "averaged"), [pytest.param(2, False, marks=pytest.mark.long), (5, False), (4, True)]
+)
 def test_the_arm_identified_from_a_slower_log_is_the_arm_under_a_held_command(rows, averaged):
     record = fast_log(rows, averaged)
     timing = timing_of([record], in_loop=False, stated_period_s=STEP_S / rows, averaged=averaged)
@@ -184,7 +186,7 @@ def faster_log(rows, *, late=0, seed=11):
     return log.slice(late, log.n_samples)
 
 
-@pytest.mark.parametrize("lost", [[8000], [5000, 11000]])
+@pytest.mark.parametrize("lost", [[8000], pytest.param([5000, 11000], marks=pytest.mark.long)])
 def test_rows_that_lost_the_phase_of_the_command_are_not_thinned(lost):
     """Every fourth row of what follows a lost one would hold a command that is about to change."""
     log = faster_log(4).each(lambda signal: np.delete(signal, lost, axis=0))

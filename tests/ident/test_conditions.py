@@ -23,7 +23,9 @@ def condition(rng, noise=0.02):
     return true, ResponsePosterior(POLES, estimate, noise * np.eye(3), DT)
 
 
-@pytest.mark.parametrize(("level", "expected"), [(0.95, 0.95), (None, 0.79)])
+@pytest.mark.parametrize(
+    ("level", "expected"), [(0.95, 0.95), pytest.param(None, 0.79, marks=pytest.mark.long)]
+)
 def test_next_condition_is_covered_at_the_small_sample_level(level, expected):
     hits = []
     for seed in range(400):
@@ -95,6 +97,7 @@ def swept_repeats(rng):
     ]
 
 
+@pytest.mark.slow
 def test_other_repeats_predict_the_scatter_where_noise_changes_and_distortion_repeats():
     model, options = GobfModel(Poles([0.9]), np.zeros(1), DT), EmbeddingOptions(fir_length=5)
     slow, fast = (OMEGA > 10) & (OMEGA < 40), (OMEGA > 80) & (OMEGA < 120)

@@ -67,7 +67,10 @@ CASES = [("motor", 14, 2000.0), ("motor", 3, -5000.0), ("mode", 14, 2000.0), ("i
 
 
 # All cases, with both colours of noise, are in the long run.
-@pytest.mark.parametrize(("kind", "delay", "offset"), [CASES[0], *CASES[2:]])
+@pytest.mark.parametrize(
+    ("kind", "delay", "offset"),
+    [pytest.param(*CASES[0], marks=pytest.mark.long), *CASES[2:]],
+)
 def test_ellipses_hold_the_truth_wherever_the_log_begins(kind, delay, offset):
     hits = []
     for seed in range(2):
@@ -124,6 +127,7 @@ def test_a_record_no_longer_than_the_delay_is_refused_by_name():
         fit_on_fresh_data(found.model, short)
 
 
+@pytest.mark.slow
 def test_friction_leaves_the_rows_out_that_answer_to_no_recorded_input():
     rng = np.random.default_rng(6)
     u = np.repeat(rng.choice([-2.0, 2.0], 60), 10)

@@ -62,7 +62,7 @@ DAMPED = {
     "near the Nyquist frequency": (0.45 * np.exp(2.8j), 0.96),
     "between them": (0.56 * np.exp(2.1j), 0.93),
 }
-FURTHER = {"between them": pytest.mark.long}
+FURTHER = {place: pytest.mark.long for place in ("near the Nyquist frequency", "between them")}
 
 
 @pytest.mark.slow
@@ -96,7 +96,7 @@ def test_a_damped_mode_that_nobody_asked_for_is_inside(hidden, measured):
     assert np.mean(hits) > measured - 0.03
 
 
-@pytest.mark.parametrize("share", [0.0, 0.04])
+@pytest.mark.parametrize("share", [pytest.param(0.0, marks=pytest.mark.long), 0.04])
 def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
     """A gain that is larger in the faster half of the rows; without it the classes add little."""
     pole, n, widths = 0.9 * np.exp(0.3j), 3000, []
@@ -118,6 +118,7 @@ def test_what_classes_of_rows_differ_in_widens_the_ellipses(share):
     assert plain <= wider < 1.6 * plain if share == 0 else wider > 2.5 * plain
 
 
+@pytest.mark.slow
 def test_coloured_noise_needs_the_noise_model():
     white = coverage(tangent, 1, noise_pole=0.9)
     coloured = coverage(tangent, 1, EmbeddingOptions(coloured_noise=True), noise_pole=0.9)

@@ -420,7 +420,21 @@ LOGS |= {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", LOGS)
+# A process each for what other logs of their kind hold too, test_other_logs.py (times of parquet) and
+# test_hostile_logs.py (damaged files).
+FURTHER = (
+    "parquet with instants",
+    "parquet with lists",
+    "parquet, lists of several lengths",
+    "a cut ROS 1 bag",
+    "a spreadsheet that is none",
+    "recorder, in other words",
+)
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name in FURTHER else name for name in LOGS]
+)
 def test_forty_logs(name, tmp_path: Path):
     log, path = LOGS[name], tmp_path / LOGS[name].file
     path.write_bytes(log.content if isinstance(log.content, bytes) else log.content())

@@ -92,6 +92,7 @@ def test_level_is_found_with_its_standard_deviation(torque_Nm: float) -> None:
     assert found.level_std < 0.02 * found.level
 
 
+@pytest.mark.long
 def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is() -> None:
     """Noise of which its past predicts .002: long records tell it from white, as one in some hundred are."""
     records, found = rubbing()
@@ -108,7 +109,7 @@ def test_a_trace_of_colour_in_long_records_leaves_a_free_run_as_it_is() -> None:
     assert fit.level == pytest.approx(found.level, rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pair_that_does_not_swing_takes_no_mode_from_the_arm() -> None:
     """Records of the default arm whose start has two overdamped pairs: their fit had a level 2 % too low, a
     Stribeck excess that is not there, and no mode at 33 Hz."""
@@ -156,7 +157,7 @@ def test_friction_that_falls_with_speed_is_told_from_coulomb_friction() -> None:
     assert np.all(std < [0.02 * truth[0], 1.0, 0.15 * truth[2], 0.2])
 
 
-@pytest.mark.parametrize("torque_Nm", [0.02, 0.1])
+@pytest.mark.parametrize("torque_Nm", [0.02, pytest.param(0.1, marks=pytest.mark.long)])
 def test_ellipses_hold_the_arm_behind_its_friction(torque_Nm: float) -> None:
     """As recorded, hardly any ellipse of these records does."""
     records, found = rubbing(torque_Nm)

@@ -147,7 +147,7 @@ def test_a_pole_that_moves_leaves_the_response_where_it_is_anchored() -> None:
     assert np.max(np.abs(moved.model.coefficients / fit.model.coefficients - 1)) > 0.02
 
 
-@pytest.mark.parametrize(("delay", "lag"), [(1, 1.5), pytest.param(2, 0.0, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("delay", "lag"), [(1, 1.5), pytest.param(2, 0.0, marks=pytest.mark.long)])
 def test_dead_time_and_lag_of_the_drive_are_found(delay: int, lag: float) -> None:
     whole = logs(delay, lag, 2e-5)
     search = Search(whole, OPTIONS, 1, True)
@@ -167,6 +167,7 @@ def test_no_structure_is_added_that_the_logs_do_not_ask_for() -> None:
         assert step(search, candidate) is candidate
 
 
+@pytest.mark.slow
 def test_a_needless_pair_is_given_up() -> None:
     search = Search(logs(), OPTIONS, 1, False)
     start = begun()
@@ -324,6 +325,7 @@ def test_rows_of_a_reading_are_those_of_a_moving_shaft() -> None:
     assert logs().rows_of_a_reading == 1
 
 
+@pytest.mark.slow
 def test_friction_is_found_through_a_coarse_sensor() -> None:
     """Of five rows four read as the one before: what is rounded off there is no white noise."""
     (record,) = logs(noise=1e-9).records
@@ -344,6 +346,7 @@ def test_the_bias_is_the_one_of_free_runs() -> None:
     assert abs(told.bias) < 0.1 * fit.level, told.bias
 
 
+@pytest.mark.long
 def test_a_dead_time_of_five_samples_is_found_from_none() -> None:
     """Poles first take the place of a part of it, so that the next dead time explains less."""
     one = drafted("late", 1, 21)

@@ -22,6 +22,7 @@ from ident.friction.gauss_newton import LostError, least_squares
 from ident.friction.inverse_dynamics import direction_of, level_of, smoothed
 from ident.friction.posterior import of_force
 from ident.friction.spring import Spring
+from ident.identification import Identification
 
 
 @cache
@@ -63,6 +64,15 @@ def belt() -> tuple[Machine, list[Record], FrictionFit]:
     return one, records, fit_friction(records, IdentOptions(integrators=1))
 
 
+@pytest.fixture(scope="module")
+def arm_of_the_belt(belt) -> Identification:
+    """Behind the friction that was found in its logs."""
+    _, records, found = belt
+    return identify_behind(
+        found, [found.taken_off(record) for record in records], IdentOptions(integrators=1)
+    )
+
+
 @pytest.mark.slow
 def test_level_and_dead_time_of_a_belt_are_found(belt) -> None:
     one, _, found = belt
@@ -90,8 +100,8 @@ def every(record: Record, rows: int) -> Record:
 @pytest.mark.parametrize(
     ("at_motor", "delay", "rows"),
     [
-        pytest.param(1.0, 1, 2, marks=pytest.mark.slow),
         pytest.param(0.8, 1, 3, marks=pytest.mark.slow),
+        pytest.param(1.0, 1, 2, marks=pytest.mark.long),
         pytest.param(1.0, 0, 2, marks=pytest.mark.long),
         pytest.param(1.0, 1, 3, marks=pytest.mark.long),
         pytest.param(0.8, 1, 2, marks=pytest.mark.long),
@@ -121,12 +131,11 @@ def test_friction_is_in_its_interval_in_a_log_of_every_few_rows(
     assert found.beyond / found.level == pytest.approx(1 - at_motor, abs=0.03)
 
 
-def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
+@pytest.mark.slow
+def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt, arm_of_the_belt) -> None:
     one, records, found = belt
+    about = arm_of_the_belt
     mode, omega = modes_of(one)[0], np.geomspace(1.0, 200.0, 80)
-    about = identify_behind(
-        found, [found.taken_off(record) for record in records], IdentOptions(integrators=1)
-    )
     k = int(np.argmin(np.abs(about.model.poles.omega_rad_s(one.plant.dt_s) - abs(mode))))
     assert about.model.poles.omega_rad_s(one.plant.dt_s)[k] == pytest.approx(abs(mode), rel=1e-3)
     assert about.model.poles.zeta()[k] == pytest.approx(-mode.real / abs(mode), rel=0.02)
@@ -143,14 +152,13 @@ def test_ellipses_and_mode_of_a_belt_are_those_without_friction(belt) -> None:
     assert behind.poles.real.max() == pytest.approx(poles.real.max(), abs=0.2 * (1 - poles.real.max()))
 
 
-@pytest.mark.parametrize("times", [12, 40])
-def test_a_hardly_known_rate_is_raised_to_where_a_tangent_follows(belt, times: int) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("times", [pytest.param(12, marks=pytest.mark.long), 40])
+def test_a_hardly_known_rate_is_raised_to_where_a_tangent_follows(belt, arm_of_the_belt, times: int) -> None:
     """.4 s of a log tell a rate of .57 / s to a factor of some ten, so that a tenth of it lies within its
     interval; but a tangent there has a mean that no arm has."""
     one, records, found = belt
-    about = identify_behind(
-        found, [found.taken_off(record) for record in records], IdentOptions(integrators=1)
-    )
+    about = arm_of_the_belt
     poles = about.model.poles
     slow = Poles(poles.real ** np.where(poles.real > 0.9, 1 / times, 1.0), poles.pairs)
     short = [record.slice(0, record.n_samples // 5) for record in records]
@@ -162,6 +170,7 @@ def test_a_hardly_known_rate_is_raised_to_where_a_tangent_follows(belt, times: i
     assert np.mean(np.any(holds, axis=0)) > 0.9
 
 
+@pytest.mark.slow
 def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(belt) -> None:
     """5 % of the friction, one standard deviation: no residual shows it where it moves with the speed."""
     one, records, found = belt
@@ -176,7 +185,9 @@ def test_ellipses_hold_a_part_of_the_friction_that_looks_like_damping(belt) -> N
         assert not np.any(ellipses.contains(far))
 
 
-@pytest.mark.parametrize("kind", ["belt", "fast", pytest.param("pendulum", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "kind", ["belt", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("fast", "pendulum"))]
+)
 def test_a_loop_is_told_by_its_reference_or_by_its_command(kind: str) -> None:
     one = machine(kind, 1)
     assert recorded_in_loop([logged(one, 0)])
@@ -243,7 +254,10 @@ def test_a_command_that_nobody_closes_a_loop_around_is_none(seed: int) -> None:
     assert with_commands_in_time([replace(logged(one, 0), reference=None, reference_names=())])[0].notes == ()
 
 
-@pytest.mark.parametrize("kind", ["belt", "pendulum", pytest.param("slow", marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "kind",
+    ["belt", pytest.param("pendulum", marks=pytest.mark.long), pytest.param("slow", marks=pytest.mark.long)],
+)
 def test_inverse_dynamics_give_a_start_of_the_level(kind: str) -> None:
     """Within a third, which is what the fit takes: it never moves by more at once."""
     one = machine(kind, 0)

@@ -58,11 +58,17 @@ def damaged(name, folder, count) -> Tally:
 
 # That whole ones are read says test_forty_logs.py. Those that a child reads are fewer, a third of a second
 # each. With 93 % 15 of a kind show what one in six does, and the 135 of all kinds what one in fifty does.
-@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.long)])
-@pytest.mark.parametrize("name", IN_PROCESS + IN_A_CHILD)
-def test_damaged_bytes(name, many, tmp_path):
-    few, often = (1, 15) if name in IN_A_CHILD else (100, 2000)
-    assert damaged(name, tmp_path, often if many else few).wrong == []
+@pytest.mark.parametrize(
+    ("name", "count"),
+    [
+        *(pytest.param(name, 100, marks=pytest.mark.slow) for name in IN_PROCESS),
+        *(pytest.param(name, 1, marks=pytest.mark.slow) for name in ("MATLAB 5", "ROS 2 bag")),
+        *(pytest.param(name, 2000, marks=pytest.mark.long) for name in IN_PROCESS),
+        *(pytest.param(name, 15, marks=pytest.mark.long) for name in IN_A_CHILD),
+    ],
+)
+def test_damaged_bytes(name, count, tmp_path):
+    assert damaged(name, tmp_path, count).wrong == []
 
 
 def child_answer(folder, code, **limits) -> bytes:

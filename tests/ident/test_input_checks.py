@@ -21,6 +21,7 @@ def warnings_of(record, **options):
     return identify([record], IdentOptions(**options)).warnings
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2))])
 def test_clean_records_are_quiet(seed):
     assert warnings_of(p2(seed).record) == ()

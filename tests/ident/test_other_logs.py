@@ -36,10 +36,12 @@ def written(path, write, *arrays, **named):
 
 
 def as_hdf5(path, columns, **attributes):
+    """Columns, and by their names the attributes of some."""
     with h5py.File(path, "w") as file:
         for name, values in columns.items():
             file[name] = values
-        file["y_rad"].attrs.update(attributes)
+        for name, of_column in attributes.items():
+            file[name].attrs.update(of_column)
     return path
 
 
@@ -80,7 +82,9 @@ def test_a_matrix_is_offered_by_its_signals(tmp_path, shape):
     holds(path, u=rows[1], y=rows[2], names=("ans[0]", "ans[1]", "ans[2]"))
 
 
-@pytest.mark.parametrize(("dtype", "step_ns"), [("int64", 1_000), ("uint64", 250_000)])
+@pytest.mark.parametrize(
+    ("dtype", "step_ns"), [("int64", 1_000), pytest.param("uint64", 250_000, marks=pytest.mark.long)]
+)
 def test_nanoseconds_since_1970_keep_their_digits(tmp_path, dtype, step_ns):
     """As doubles they are multiples of 256."""
     stamps = (EPOCH_NS + step_ns * K).astype(dtype)
@@ -92,26 +96,22 @@ def test_nanoseconds_since_1970_keep_their_digits(tmp_path, dtype, step_ns):
         record(written(tmp_path / "b.npz", np.savez, t_ns=stamps[::-1], u_V=U, y_rad=Y), time="t_ns")
 
 
-def test_large_numbers_beside_the_signals_do_no_harm(tmp_path):
-    ids = 2**60 + 7919 * K
-    holds(as_parquet(tmp_path / "a.parquet", ["t_s", "u_V", "y_rad", "id"], 0.01 * K, U, Y, ids))
-
-
-def test_parquet_has_many_times(tmp_path):
+def test_parquet_has_many_times_and_numbers(tmp_path):
+    """Beside them a number that no double holds."""
     times = {
         "durations": pa.array((10_000_000 * K).astype("m8[ns]")),
         "times of day": pa.array((10 * K).astype("i4")).cast(pa.time32("ms")),
         "instants": pa.array((EPOCH_NS + 10_000_000 * K).astype("M8[ns]")).cast(pa.timestamp("ns", "UTC")),
     }
-    table = read_table(as_parquet(tmp_path / "a.parquet", [*times, "u_V", "y_rad"], *times.values(), U, Y))
+    signals = {
+        "u_V": pa.array(U).dictionary_encode(),
+        "y_rad": pa.array((4 * Y).astype("i8")).cast(pa.decimal128(25, 2)),
+        "id": 2**60 + 7919 * K,
+    }
+    columns = times | signals
+    table = read_table(as_parquet(tmp_path / "a.parquet", [*columns], *columns.values()))
     for name in times:
-        holds(table, names=(name, "u_V", "y_rad"))
-
-
-def test_other_numbers_of_parquet(tmp_path):
-    tenths = pa.array((4 * Y).astype("i8")).cast(pa.decimal128(25, 2))
-    encoded = pa.array(U).dictionary_encode()
-    holds(as_parquet(tmp_path / "a.parquet", ["t_s", "u_V", "y_rad"], 0.01 * K, encoded, tenths), y=4 * Y)
+        holds(table, y=4 * Y, names=(name, "u_V", "y_rad"))
 
 
 def test_columns_of_one_name_are_told_apart(tmp_path):
@@ -127,45 +127,45 @@ def test_columns_of_one_name_are_told_apart(tmp_path):
     assert record(tmp_path / "a.csv").n_samples == N
 
 
-@pytest.mark.parametrize(
-    ("attributes", "true"),
-    [
-        ({"scale_factor": 0.01, "add_offset": 2.5}, 0.01 * np.round(100 * Y) + 2.5),
-        ({"scale_factor": np.array([0.5], "f4")}, 0.5 * np.round(100 * Y)),
-        ({"add_offset": -7}, np.round(100 * Y) - 7),
-        ({"_FillValue": np.int16(-32768), "scale_factor": 0.01}, 0.01 * np.round(100 * Y)),
-    ],
-)
-def test_packed_numbers_of_netcdf(tmp_path, attributes, true):
-    columns = {"t_s": 0.01 * K, "u_V": U, "y_rad": np.round(100 * Y).astype("i2")}
-    holds(as_hdf5(tmp_path / "a.h5", columns, **attributes), y=true)
+def test_packed_numbers_of_netcdf(tmp_path):
+    packed = np.round(100 * Y).astype("i2")
+    attributes = {
+        "both": {"scale_factor": 0.01, "add_offset": 2.5},
+        "scaled": {"scale_factor": np.array([0.5], "f4")},
+        "moved": {"add_offset": -7},
+        "filled": {"_FillValue": np.int16(-32768), "scale_factor": 0.01},
+    }
+    true = {"both": 0.01 * packed + 2.5, "scaled": 0.5 * packed, "moved": packed - 7, "filled": 0.01 * packed}
+    columns = {"t_s": 0.01 * K, "u_V": U} | dict.fromkeys(attributes, packed)
+    table = read_table(as_hdf5(tmp_path / "a.h5", columns, **attributes))
+    for name, values in true.items():
+        holds(table, y=values, names=("t_s", "u_V", name))
 
 
-@pytest.mark.parametrize("key", ["_FillValue", "missing_value"])
-def test_what_netcdf_calls_missing_is_no_number(tmp_path, key):
+def test_what_netcdf_calls_missing_is_no_number(tmp_path):
     y = np.where(K == 7, -9999.0, Y)
-    path = as_hdf5(tmp_path / "a.h5", {"t_s": 0.01 * K, "u_V": U, "y_rad": y}, **{key: -9999.0})
-    with pytest.raises(ValueError, match=r"index 7: column 'y_rad' is nan"):
-        record(path)
-    with pytest.raises(ValueError, match="'y_rad': its scale_factor is no number"):
-        record(as_hdf5(tmp_path / "b.h5", {"t_s": 0.01 * K, "u_V": U, "y_rad": y}, scale_factor="ten"))
+    attributes = {"filled": {"_FillValue": -9999.0}, "missing": {"missing_value": -9999.0}}
+    columns = {"t_s": 0.01 * K, "u_V": U} | dict.fromkeys(attributes, y)
+    table = read_table(as_hdf5(tmp_path / "a.h5", columns, **attributes))
+    for name in attributes:
+        with pytest.raises(ValueError, match=f"index 7: column '{name}' is nan"):
+            record(table, y=name)
+    with pytest.raises(ValueError, match="'filled': its scale_factor is no number"):
+        read_table(as_hdf5(tmp_path / "b.h5", columns, filled={"scale_factor": "ten"}))
 
 
 TABLE = [["t_s", "u_V", "y_rad"], *zip((0.01 * K).tolist(), U.tolist(), Y.tolist(), strict=True)]
 OTHER = [["t_s", "u_V", "y_rad"], *zip((0.02 * K).tolist(), U.tolist(), (-Y).tolist(), strict=True)]
 
 
-@pytest.mark.parametrize(
-    "beside",
-    [
+def test_the_sheet_that_is_meant(tmp_path):
+    """Neither a hidden one nor one of settings."""
+    beside = (
         ("old", "hidden", OTHER),
-        ("old", "veryHidden", OTHER),
+        ("older", "veryHidden", OTHER),
         ("gains", "visible", [["Kp", "Ki"], [3.0, 1.0]]),
-    ],
-    ids=["hidden", "very hidden", "settings"],
-)
-def test_the_sheet_that_is_meant(tmp_path, beside):
-    holds(as_sheets(tmp_path / "a.xlsx", beside, ("Data", "visible", TABLE))[1])
+    )
+    holds(as_sheets(tmp_path / "a.xlsx", *beside, ("Data", "visible", TABLE))[1])
 
 
 def test_sheets_beside_a_chart_and_beside_each_other(tmp_path):
@@ -307,7 +307,7 @@ def saved(variables, **options):
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize("packed", [pytest.param(False, marks=pytest.mark.long), True])
 def test_everything_that_scipy_writes_comes_back(packed):
     nested = {"t": np.arange(3.0), "inner": {"y": np.ones(2)}, "label": "Größe [µm]", "cells": CELLS}
     found = mat_variables(saved(VALUES | {"log": nested, "rows": ["ab", "cde"]}, do_compression=packed), "f")
@@ -367,6 +367,7 @@ def test_a_reader_keeps_to_limits_that_are_there():
     assert done.stdout
 
 
+@pytest.mark.slow
 def test_names_that_crash_compiled_readers_are_refused():
     once = saved({"ab": 1.0})
     # The name of two letters stands beside its tag.
@@ -377,6 +378,7 @@ def test_names_that_crash_compiled_readers_are_refused():
             mat_variables(content, "f")
 
 
+@pytest.mark.slow
 def test_lengths_are_believed_no_further_than_the_bytes_go():
     content = saved({"x": np.arange(4.0)})
     dimensions = struct.pack("<ii", 1, 4)

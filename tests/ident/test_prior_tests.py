@@ -164,6 +164,7 @@ def test_delays_are_judged():
     assert refused(stated) == {"input_delay_samples = 0": True}
 
 
+@pytest.mark.slow
 def test_several_records_in_mid_run_are_judged_alike():
     """Unknown initial states and biases beside the structure, a search on a part of the records."""
     truth = p1(5, 4000)
@@ -202,7 +203,7 @@ def test_impossible_settings_are_refused(options, message):
 @pytest.mark.parametrize(
     ("colour", "runs"),
     [
-        pytest.param(0.9, 2, marks=pytest.mark.slow),
+        pytest.param(0.9, 1, marks=pytest.mark.slow),
         *(pytest.param(c, 10, marks=pytest.mark.long) for c in (0.0, 0.9)),
     ],
 )

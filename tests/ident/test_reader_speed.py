@@ -11,7 +11,7 @@ from ident.data.record_files import read_table
 from ident.data.roles import roles_of
 
 # Characters of the shorter of two texts: enough that a square of the length would show.
-SIZE = 100_000
+SIZE = 50_000
 # Twice the text takes twice the time; a square takes four times it.
 MOST_TIMES = 2.6
 # Whatever a table looks like, reading it takes at most this many times as long as splitting a plain one and
@@ -105,7 +105,21 @@ def plain_cpu_s(text):
     return time.process_time() - begin
 
 
-@pytest.mark.parametrize("kind", TEXTS)
+# What another kind of text goes through as well, and a little more beside it.
+FURTHER = (
+    "a cell of letters",
+    "a cell of names and signs",
+    "columns",
+    "columns of inputs",
+    "long lists",
+    "rows",
+    "rows with decimal commas",
+)
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.long) if kind in FURTHER else kind for kind in TEXTS]
+)
 def test_time_is_linear_in_the_length(kind, tmp_path):
     """What takes less than a tenth of a second has no square in it that matters.
 
@@ -125,7 +139,7 @@ def test_time_is_linear_in_the_length(kind, tmp_path):
         assert longer_s < MOST_TIMES * shorter_s
 
 
-@pytest.mark.parametrize("count", [4000, 20_000])
+@pytest.mark.parametrize("count", [4000, pytest.param(20_000, marks=pytest.mark.long)])
 def test_rows_of_json_with_a_name_each_are_refused_before_they_are_cells(count):
     rows_of_names = "\n".join(f'{{"k{number}": {number}}}' for number in range(count))
     begin = time.process_time()

@@ -56,7 +56,7 @@ def test_a_law_that_ran_at_every_row_is_found_to_the_rounding_of_the_log(integra
     assert law.residual == pytest.approx(law.rounding, rel=0.1)
 
 
-@pytest.mark.parametrize("rows", [2, 4, 5])
+@pytest.mark.parametrize("rows", [2, *(pytest.param(rows, marks=pytest.mark.long) for rows in (4, 5))])
 def test_a_law_that_ran_faster_than_the_log_does_not_repeat_its_command(rows):
     law = law_of([loop_log(*pid(), rows=rows)])
     assert not law.repeats_command
@@ -71,8 +71,14 @@ def test_where_signals_are_smooth_the_log_does_not_tell_the_period():
     assert not every.tells_period
 
 
-@pytest.mark.parametrize("rows", [2, 4])
-@pytest.mark.parametrize("decimals", [3, 5, 9])
+@pytest.mark.parametrize(
+    ("rows", "decimals"),
+    [
+        (2, 3),
+        (4, 5),
+        *(pytest.param(*case, marks=pytest.mark.long) for case in ((4, 3), (2, 5), (2, 9), (4, 9))),
+    ],
+)
 def test_steps_that_fall_on_rows_do_not_tell_a_period_that_the_rest_does_not(rows, decimals):
     """A simulator steps its reference at whole tenths of a second, and nothing else is new from row to row:
     what a faster controller used between the rows can be guessed wherever no step is."""

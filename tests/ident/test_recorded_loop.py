@@ -120,8 +120,13 @@ KINDS = {
 }
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if kind == "in motion, elsewhere" else pytest.mark.long)
+        for kind in KINDS
+    ],
+)
 def test_the_arm_is_found_whatever_moves_it_besides(kind):
     records = [log(seed=seed, gain=gain, **KINDS[kind]) for seed, gain in ((1, 150.0), (2, 156.0))]
     law = law_of(records)

@@ -39,14 +39,15 @@ def experiments(systems, noise, rng, repeats=3):
     ]
 
 
-def test_a_linear_loop_is_accused_in_one_experiment_of_a_hundred():
+@pytest.mark.parametrize(("count", "most"), [(40, 3), pytest.param(100, 6, marks=pytest.mark.long)])
+def test_a_linear_loop_is_accused_in_one_experiment_of_a_hundred(count, most):
     system = closed_loop(6.0)
     accused = 0
-    for seed in range(100):
+    for seed in range(count):
         (found,) = repeats_of(experiments([system, system], 0.05, np.random.default_rng(seed)))
         accused += bool(found.amplitude_effects)
-    # Level 0.99: 1 of 100 expected, sd 1; 6 is 5 sd above.
-    assert accused <= 6
+    # Level 0.99: of 100 one is expected, sd 1, and 6 is 5 sd above; of 40 0.4, sd 0.63, and 3 is 4 sd above.
+    assert accused <= most
 
 
 def test_a_resonance_that_falls_with_amplitude_is_named_with_its_shift():

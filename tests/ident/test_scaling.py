@@ -54,7 +54,7 @@ ONE = [(1e6, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1.0, 1e6), (1.0, 1.0, 1e-6)]
     ("name", "delay", "scales"),
     [
         *((name, 0, ALL) for name in OPTIONS),
-        ("white", 12, ALL),
+        pytest.param("white", 12, ALL, marks=pytest.mark.long),
         *(pytest.param("white", 0, scales, marks=pytest.mark.long) for scales in ONE),
     ],
 )

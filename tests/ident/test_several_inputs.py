@@ -176,6 +176,7 @@ def test_one_motor_at_a_time_in_records_of_their_own():
     assert len(result.residuals) == 2
 
 
+@pytest.mark.slow
 def test_initial_state_is_noticed():
     start = np.array([3.0, 2.0, 0.0, -1.0, 0.0])
     result = identify_mimo([record(0, start=start)])

@@ -91,6 +91,7 @@ def test_any_numbers_of_inputs_and_outputs_are_realised(n_outputs, n_inputs, int
     np.testing.assert_allclose(response(model.to_control()), model.frequency_response(OMEGA), rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_two_modes_at_one_place_keep_a_free_residue():
     """A second structure beside the first, at the same frequency: the residue has rank two."""
     one = structure()
@@ -106,7 +107,9 @@ def test_two_modes_at_one_place_keep_a_free_residue():
     assert len(result.model.state_space()[0]) == one.nstates + 2
 
 
-@pytest.mark.parametrize("runs", [2, pytest.param(14, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "runs", [pytest.param(2, marks=pytest.mark.slow), pytest.param(14, marks=pytest.mark.long)]
+)
 def test_balls_hold_the_response_as_often_as_they_say(runs):
     """60 frequencies of one record are not independent, so the bounds are wide: the lower one is two standard
     deviations of the mean of the shares, .12 or so each."""
@@ -119,7 +122,7 @@ def test_balls_hold_the_response_as_often_as_they_say(runs):
     assert not np.any(balls.holds(2 * truth))
 
 
-@pytest.mark.parametrize("integrators", [0, 1])
+@pytest.mark.parametrize("integrators", [pytest.param(0, marks=pytest.mark.long), 1])
 def test_the_rational_factor_is_that_of_the_balls(integrators):
     system = structure()
     if integrators:
@@ -134,6 +137,7 @@ def test_the_rational_factor_is_that_of_the_balls(integrators):
     )
 
 
+@pytest.mark.slow
 def test_a_start_in_motion_is_estimated():
     item = record(structure(), 4, samples=3400)
     result = identify_mimo([item.slice(200, 3200)])

@@ -16,7 +16,7 @@ def p2_plot():
     return stabilisation([record], identify([record]), max_pairs=7)
 
 
-@pytest.mark.parametrize("seed", [2, 3, 4])
+@pytest.mark.parametrize("seed", [2, *(pytest.param(seed, marks=pytest.mark.long) for seed in (3, 4))])
 def test_the_three_modes_are_columns_and_nothing_else_is(seed):
     record = p2(seed).record
     plot = stabilisation([record], identify([record]))
