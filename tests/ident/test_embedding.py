@@ -62,7 +62,7 @@ DAMPED = {
     "near the Nyquist frequency": (0.45 * np.exp(2.8j), 0.96),
     "between them": (0.56 * np.exp(2.1j), 0.93),
 }
-FURTHER = {place: pytest.mark.long for place in ("near the Nyquist frequency", "between them")}
+FURTHER = dict.fromkeys(("near the Nyquist frequency", "between them"), pytest.mark.long)
 
 
 @pytest.mark.slow
