@@ -125,6 +125,7 @@ def stated(plant, law):
     return {"worst_margins": margins, "bandwidth_rad_s": bandwidth}
 
 
+@pytest.mark.slow
 def test_what_the_true_loop_keeps_is_no_violation_and_what_it_does_not_keep_is(tmp_path):
     one = machine("belt", 0)
     law = controller_file(tmp_path)

@@ -149,7 +149,7 @@ def test_what_needs_absent_data_is_skipped_and_counted(asking, tmp_path):
     assert "skipped 1;" in said
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_questions_are_answered_in_processes_and_one_that_takes_too_long_is_given_up():
     change = "benchmarks.frozen_answers:LONGEST_S=0.3"
     (found,) = frozen_answers.answers(["flexible link A"], 2, change, "")

@@ -72,6 +72,7 @@ MODULES = sorted(
 )
 
 
+@pytest.mark.long
 def test_every_benchmark_explains_its_options():
     assert len(MODULES) >= 20
     code = (

@@ -6,7 +6,11 @@ from benchmarks import log_oracle
 from tests.ident.generated_logs import generated
 
 
-@pytest.mark.parametrize("text_share", [1.0, 0.0], ids=["text", "others"])
+@pytest.mark.parametrize(
+    "text_share",
+    [pytest.param(1.0, marks=pytest.mark.slow), pytest.param(0.0, marks=pytest.mark.long)],
+    ids=["text", "others"],
+)
 def test_no_log_is_misread_in_silence_and_every_hint_helps(tmp_path, text_share):
     count = 20 if text_share else 2  # which take a process each
     logs = [generated(4711, number, text_share) for number in range(count)]

@@ -61,7 +61,7 @@ def test_a_simple_plant_has_a_simple_controller():
     assert designed("lag").gamma <= 1.02 * bound * 1.001
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_same_generator_same_design():
     one, other = designed("lag"), synthesise([lag(0.5)], auto(WISH), rng=np.random.default_rng(7))
     assert np.array_equal(one.controller.A, other.controller.A)
@@ -120,6 +120,7 @@ def test_from_a_controller_for_other_requirements(order):
     assert near.gamma <= 1.03 * whole.gamma
 
 
+@pytest.mark.long
 def test_an_order_that_misses_the_damping_of_the_modes_gives_way_to_one_that_meets_it(monkeypatch):
     """Gamma does not see it: the order that is nearest to the bound may miss it."""
     free = designed("lag").controller.order

@@ -61,7 +61,7 @@ def _sampled(controller: Controller, plant: UncertainPlant, spec: Specification,
     return largest
 
 
-@pytest.mark.parametrize("scenario", ["A", "C"])
+@pytest.mark.parametrize("scenario", [pytest.param("A", marks=pytest.mark.long), "C"])
 def test_link_is_bounded_for_all_frequencies_within_half_a_percent(scenario):
     plant, spec = flexible_link(scenario), flexible_link_specification(1)
     controller = Controller(

@@ -22,6 +22,7 @@ def _met(asked: Specification, seed: int = 1) -> bool:
     return synthesise([_inertia()], without_limits(asked), _EFFORT, rng=rng).gamma <= 1.0
 
 
+@pytest.mark.slow
 def test_an_effort_limit_gives_way_by_as_little_as_is_needed():
     asked = _asked(highest_effort_limit=400.0)
     assert not _met(asked)

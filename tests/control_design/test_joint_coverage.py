@@ -14,7 +14,7 @@ from validation.example_plants import ResponseRecord, flexible_link, flexible_li
 from .plants import RelativeDisc, gain, hub_arm, tip_acceleration, uncertain_lag
 
 
-@pytest.mark.parametrize("coverage", [0.8, 0.95])
+@pytest.mark.parametrize("coverage", [pytest.param(0.8, marks=pytest.mark.long), 0.95])
 def test_one_uncertain_gain_gives_the_one_sided_normal_quantile(coverage):
     """|S| peaks higher the larger the gain, so P(gamma <= worst case of |x| <= r) = P(x <= r), exactly."""
     plant = uncertain_lag(0.1)
@@ -78,6 +78,7 @@ def test_certificate_uses_the_calibrated_level_and_says_so():
     assert low.gamma == plain.gamma > low.joint.gamma
 
 
+@pytest.mark.slow
 def test_performance_channel_and_several_plants_are_drawn_together():
     system, tip = hub_arm(), tip_acceleration()
     measured, performed = (GaussianGain(g, n, 0.05) for g, n in ((system, 1), (tip, 0)))

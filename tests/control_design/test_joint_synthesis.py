@@ -92,6 +92,7 @@ def test_joint_design_is_stable_for_the_share_asked():
     assert unstable <= 30 + 3 * np.sqrt(30)
 
 
+@pytest.mark.slow
 def test_certificate_asks_for_the_stable_share():
     plant, free = _free()
     found = control_design.certify(

@@ -118,6 +118,7 @@ def test_no_number_of_a_certificate_promises_more_than_eigenvalues_and_members_k
     assert not false, case
 
 
+@pytest.mark.slow
 @settings(max_examples=10, deadline=None)
 @given(
     st.sampled_from([1e-6, 1e-3, 1e3, 1e6]),

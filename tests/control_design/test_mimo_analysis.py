@@ -29,7 +29,7 @@ def given(abcd) -> Controller:
     return Controller(*tustin(*abcd, TS), TS, computational_delay_samples=0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_judges_give_the_published_values():
     at = np.array([2j / TS * np.tan(10 * TS / 2)])
     expected = [[-0.012486 - 0.004415j, 0.006810 + 0.005085j], [0.011351 + 0.008474j, -0.027103 - 0.012788j]]

@@ -107,7 +107,7 @@ def test_central_controllers_reach_their_norm_and_no_smaller_one_is_found(scalin
     assert np.max(np.abs(same(1j * np.geomspace(0.1, 100, 9)))) < 1e-3 * np.max(np.abs(D))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_design_every_time():
     first, second = (synthesise_multivariable(plant_t(), specification_t(4), LEAST) for _ in range(2))
     np.testing.assert_array_equal(first.controller.A, second.controller.A)
@@ -176,6 +176,7 @@ def test_joints_alike_are_controlled_nearly_as_well_as_one():
     assert max(found[1:]) < 1.15 * found[0]
 
 
+@pytest.mark.slow
 def test_two_operating_points_share_one_controller():
     light, heavy = plant_t(), plant_t(2.0)
     specification = specification_t(4)

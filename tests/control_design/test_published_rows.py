@@ -36,6 +36,7 @@ def test_order_6_comes_within_2_percent_of_what_any_order_was_published_to_reach
     assert certificate.gamma <= limit
 
 
+@pytest.mark.long
 def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controller():
     """One design with the peak halved lies below all three published points: damping 0.05 and more at less
     than the cost published for 0.015."""
@@ -63,6 +64,7 @@ def test_damping_of_the_mode_costs_less_than_published_for_a_full_order_controll
     assert cost <= min(cost for _, cost in PUBLISHED)
 
 
+@pytest.mark.long
 def test_first_order_reference_filter_of_scenario_b_divides_the_worst_matching_error_by_four():
     plant, specification = flexible_link("B"), flexible_link_specification(5)
     result = control_design.synthesise([plant], specification, rng=np.random.default_rng(1))

@@ -115,6 +115,7 @@ def test_active_damping_through_the_tip_without_tracking():
     assert min(m.zeta for m in near) > 0.02
 
 
+@pytest.mark.slow
 def test_two_plants_are_met_by_one_controller():
     heavy = hub_arm() * 0.6
     plants = [
@@ -127,6 +128,7 @@ def test_two_plants_are_met_by_one_controller():
     assert [v.plant for v in certificate.plants] == ["hub", "heavy"]
 
 
+@pytest.mark.slow
 def test_a_requirement_out_of_reach_names_how_far_and_where():
     """Order 2, tracking at 3.9 rad/s against the zero at 10.8 rad/s (at most 4.08 for any order)."""
     plant = flexible_link("B")
@@ -148,6 +150,7 @@ def test_a_requirement_out_of_reach_names_how_far_and_where():
 _FRUITLESS = SynthesisOptions(starts=1, grid_points=60, mode_points=0, dense_points=1500, exchange_rounds=0)
 
 
+@pytest.mark.slow
 def test_without_a_stable_design_the_unstable_pole_is_named():
     """A pole at z = 1.05 right of one real zero outside the circle: no stable controller stabilises it."""
     system = control.ss(control.zpk([1.02], [1.05, 0.5], 1.0, dt=0.01))
@@ -185,6 +188,7 @@ def test_damping_of_the_measured_output_over_ellipses():
     assert mode.zeta > 0.05  # open loop 0.015
 
 
+@pytest.mark.slow
 def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
     effort = {"effort_limit": 8.0, "effort_rolloff_rad_s": 60.0}
     fields = {"bandwidth_rad_s": 3.0, "controller_order": 4} | effort
@@ -205,6 +209,7 @@ def test_controller_keeps_the_damping_of_its_own_poles_that_was_asked_for():
     assert damping[0.7] >= 0.7 * (1 - 1e-3)
 
 
+@pytest.mark.slow
 def test_a_controller_has_no_resonance_between_the_points_of_a_measured_response():
     """Sixty points from .5 to 200 rad/s are 10 % apart: what is narrower than half of that lies between."""
     system = hub_arm()

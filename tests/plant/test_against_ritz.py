@@ -61,6 +61,7 @@ def test_smooth_effects_agree_with_an_independent_arm_to_a_millionth(name):
     assert _compare(options, parse_effects(effects)) < 1e-6
 
 
+@pytest.mark.slow
 def test_a_drag_that_no_configuration_has_agrees_with_an_independent_arm():
     drag = LOOK_ALIKES["quadratic_drag"](coefficient_Nms2=0.2)
     assert _compare({"drag": 0.2}, (drag,), voltage=LONGER) < 1e-6

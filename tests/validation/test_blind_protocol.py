@@ -152,10 +152,10 @@ def test_answers_without_effects_are_toml():
 
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory):
-    """A run of two cases whose 'diagnosis' says none with p = 0.7. They are without effects, whose sizes take
-    most of the time that a case takes to be made."""
+    """A run of one case whose 'diagnosis' says none with p = 0.7; without effects, whose sizes take most of
+    the time that a case takes to be made."""
     out = tmp_path_factory.mktemp("blind") / "run"
-    run_blind(2, 8, out, jobs=1, only="none", diagnose=_says_none)
+    run_blind(1, 8, out, jobs=1, only="none", diagnose=_says_none)
     return out
 
 
@@ -175,12 +175,12 @@ def _says_none(folder):
 @pytest.mark.slow
 def test_a_run_leaves_scores_and_a_verified_seal(finished_run):
     document = json.loads((finished_run / "scores.json").read_text())
-    assert document["diagnosis"]["n_cases"] == 2
+    assert document["diagnosis"]["n_cases"] == 1
     assert document["commitment"] == read_json(finished_run / COMMITMENT)["sha256"]
     assert set(document["baselines"]) == {"parameters only"}
     assert "commitment" in (finished_run / "scores.txt").read_text()
     assert (finished_run / "confusion.png").is_file()
-    assert set(read_json(finished_run / "predictions.json")) == {"case_0001", "case_0002"}
+    assert set(read_json(finished_run / "predictions.json")) == {"case_0001"}
 
 
 @pytest.mark.slow
@@ -189,12 +189,12 @@ def test_a_finished_run_resumes_without_a_diagnosis_and_only_as_itself(finished_
         raise AssertionError("everything is there")
 
     before = (finished_run / "scores.json").read_bytes()
-    run_blind(2, 8, finished_run, only="none", resume=True, diagnose=never)
+    run_blind(1, 8, finished_run, only="none", resume=True, diagnose=never)
     assert (finished_run / "scores.json").read_bytes() == before
     with pytest.raises(InputError, match="seed \\(was 8, now 9\\)"):
-        run_blind(2, 9, finished_run, only="none", resume=True, diagnose=never)
+        run_blind(1, 9, finished_run, only="none", resume=True, diagnose=never)
     with pytest.raises(InputError, match="--resume continues it"):
-        run_blind(2, 8, finished_run, only="none", diagnose=never)
+        run_blind(1, 8, finished_run, only="none", diagnose=never)
 
 
 def test_no_label_is_in_a_file_while_cases_are_diagnosed(tmp_path):
@@ -213,8 +213,8 @@ def test_a_run_killed_while_it_diagnosed_draws_its_labels_again(finished_run, tm
     shutil.copytree(finished_run, out)
     sealed = json.loads((out / "seal" / "labels.json").read_text())
     (out / "seal" / "labels.json").write_text(json.dumps({"salt": sealed["salt"]}))
-    (out / "predictions" / "case_0002.json").unlink()
-    run_blind(2, 8, out, resume=True, jobs=1, only="none", diagnose=_says_none)
+    (out / "predictions" / "case_0001.json").unlink()
+    run_blind(1, 8, out, resume=True, jobs=1, only="none", diagnose=_says_none)
     assert (out / "scores.json").read_bytes() == (finished_run / "scores.json").read_bytes()
     assert json.loads((out / "seal" / "labels.json").read_text()) == sealed
 
@@ -226,7 +226,7 @@ def test_records_exchanged_after_sealing_are_noticed(finished_run):
     path.write_bytes(before + b"# changed\n")
     try:
         with pytest.raises(InputError, match="records of case_0001"):
-            run_blind(2, 8, finished_run, only="none", resume=True, diagnose=_says_none)
+            run_blind(1, 8, finished_run, only="none", resume=True, diagnose=_says_none)
     finally:
         path.write_bytes(before)
 
@@ -306,6 +306,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_the_diagnosing_process_cannot_reach_the_labels(tmp_path):
     """Nor start anything that could; each attempt is one that the head of the worker's module names."""
     place = tmp_path / "run"

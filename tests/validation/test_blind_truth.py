@@ -141,8 +141,13 @@ def test_bad_effects_are_refused_in_one_line():
         Truth(RIG, [{"name": "gravity", "acceleration_m_s2": 1.0}] * 2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["gravity", "periodic_disturbance", "coulomb_friction_and_tip_payload"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("coulomb_friction_and_tip_payload", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("gravity", "periodic_disturbance")),
+    ],
+)
 def test_recorded_cases_are_explained_to_the_noise(gap_cases, name):
     # Records of a third rig, by others: driven by the logged voltage, slew under control included.
     folder = gap_cases / "labelled" / name
