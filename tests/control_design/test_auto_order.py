@@ -41,8 +41,8 @@ def designed(size: str) -> SynthesisResult:
 WISH = Specification(bandwidth_rad_s=2.0, modulus_margin=0.5, effort_limit=10.0, integrator=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", ["A", pytest.param("C", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("size", ["A", "C"])
 def test_the_order_is_enough_and_one_less_is_not_by_fits(size):
     plant, asked = flexible_link(size), flexible_link_specification(5)
     bound = youla_bracket(plant, asked).ellipse
@@ -55,7 +55,7 @@ def test_the_order_is_enough_and_one_less_is_not_by_fits(size):
 
 
 def test_a_simple_plant_has_a_simple_controller():
-    """The link of the slow test has order 5."""
+    """The link of the long test has order 5."""
     bound = youla_bracket(lag(0.5), WISH).ellipse
     assert 1 <= designed("lag").controller.order <= 3
     assert designed("lag").gamma <= 1.02 * bound * 1.001

@@ -52,7 +52,7 @@ def test_a_bandwidth_that_is_met_stays():
     assert (used.bandwidth_rad_s, result.gamma <= 1.0) == (1.0, True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_lowered_unless_it_is_asked_for():
     asked = _asked(lowest_bandwidth_rad_s=None, bandwidth_rad_s=6.0, controller_order=1)
     plant = _inertia(20)

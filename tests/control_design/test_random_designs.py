@@ -39,7 +39,7 @@ def test_sampled_plants_of_a_proved_loop_are_stable_and_of_a_bad_one_are_not():
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(155, marks=pytest.mark.slow), pytest.param(107, marks=pytest.mark.long)]
+    "seed", [pytest.param(155, marks=pytest.mark.long), pytest.param(107, marks=pytest.mark.long)]
 )
 def test_a_step_below_the_grids_is_seen(seed):
     """Both lack an integrator and ask for rejection down to zero frequency: a slow pole below every grid

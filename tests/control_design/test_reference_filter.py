@@ -85,7 +85,7 @@ def test_designed_filter_improves_over_all_members_and_keeps_unit_gain():
     assert error > 0.9 * reference_filter.error_after
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_more_poles_never_hurt_and_two_plants_cost():
     controller, plant = _hub_loop()
     one = design_reference_filter(controller, plant, _MODEL, _FAST.model_copy(update={"poles_rad_s": (3.0,)}))

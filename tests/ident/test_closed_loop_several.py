@@ -94,7 +94,7 @@ def test_balls_hold_the_response_in_a_loop_but_not_around_a_direct_fit():
 
 @pytest.mark.slow
 def test_records_of_the_open_loop_stay_as_they_are():
-    item = log(0, 0.03, 0.0, samples=1500)
+    item = log(0, 0.03, 0.0, samples=600)
     free = Record(item.input, item.output, DT_S, name="free", input_names=NAMES[0], output_names=NAMES[1])
     stages = two_stage_several([free, item], KNOWN)
     np.testing.assert_array_equal(stages.records[0].input, free.input)

@@ -111,7 +111,7 @@ def test_hopeless_logs_are_refused_by_their_check_with_column_and_number(kind):
     assert complaint(record(signals)) == ""
 
 
-@pytest.mark.parametrize("make", [opened, pytest.param(looped, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("make", [opened, pytest.param(looped, marks=pytest.mark.long)])
 def test_the_output_of_another_machine_is_named(make):
     """Held commands of two machines that move at the same samples. Chance passes for an answer now and then:
     ten tests, each of many lines or lags, at a thousandth."""

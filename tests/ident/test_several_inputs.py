@@ -171,15 +171,14 @@ def test_one_motor_at_a_time_in_records_of_their_own():
         only[:, i] = record(i, n=2000).input[:, i]
         y = signal.dlsim((*sampled(), DT_S), only)[1] + 0.02 * np.random.default_rng(i).normal(size=(2000, 1))
         items.append(Record(only, y, DT_S, name=f"motor {i}", input_names=("a", "b"), output_names=("tip",)))
-    result = identify_mimo(items)
+    result = identify_mimo(items, IdentOptions(n_real=1, n_pairs=2))
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
     assert len(result.residuals) == 2
 
 
-@pytest.mark.slow
 def test_initial_state_is_noticed():
     start = np.array([3.0, 2.0, 0.0, -1.0, 0.0])
-    result = identify_mimo([record(0, start=start)])
+    result = identify_mimo([record(0, start=start)], IdentOptions(n_real=1, n_pairs=2))
     assert result.structure.estimate_initial_state
     np.testing.assert_allclose(result.model.poles.omega_rad_s(DT_S), [20.0, 90.0], rtol=2e-3)
 

@@ -17,6 +17,8 @@ DT_S = 0.01
 OMEGA = np.geomspace(0.5, 300, 60)
 NAMES = ("u1", "u2"), ("y1", "y2")
 NOISE = np.array([[4e-6, 2e-6], [2e-6, 3e-6]])
+# The poles of the structure below, for what is not about their number.
+KNOWN = {"n_real": 1, "n_pairs": 2}
 
 
 def structure(shapes=((1.0, -0.4), (0.5, 1.0)), drives=((1.0, 0.2), (0.3, -1.0))) -> control.StateSpace:
@@ -108,27 +110,29 @@ def test_two_modes_at_one_place_keep_a_free_residue():
 
 
 @pytest.mark.parametrize(
-    "runs", [pytest.param(2, marks=pytest.mark.slow), pytest.param(14, marks=pytest.mark.long)]
+    ("runs", "numbers"), [(2, KNOWN), pytest.param(14, {}, marks=pytest.mark.long)], ids=["2", "14"]
 )
-def test_balls_hold_the_response_as_often_as_they_say(runs):
+def test_balls_hold_the_response_as_often_as_they_say(runs, numbers):
     """60 frequencies of one record are not independent, so the bounds are wide: the lower one is two standard
     deviations of the mean of the shares, .12 or so each."""
     truth, held = response(structure()), []
     for seed in range(runs):
         item = record(structure(), 100 + seed, samples=1500)
-        balls = matrix_posterior([item], identify_mimo([item])).at(OMEGA)
+        balls = matrix_posterior([item], identify_mimo([item], IdentOptions(**numbers))).at(OMEGA)
         held.append(np.mean(balls.holds(truth)))
     assert 0.945 - 2 * 0.12 / np.sqrt(runs) < np.mean(held) < (0.995 if runs > 2 else 1.01)
     assert not np.any(balls.holds(2 * truth))
 
 
-@pytest.mark.parametrize("integrators", [pytest.param(0, marks=pytest.mark.long), 1])
+@pytest.mark.parametrize("integrators", [0, 1])
 def test_the_rational_factor_is_that_of_the_balls(integrators):
     system = structure()
     if integrators:
         system = control.ss(np.eye(2), np.eye(2), DT_S * np.eye(2), np.zeros((2, 2)), DT_S) * system
     item = record(system, 5)
-    posterior = matrix_posterior([item], identify_mimo([item], IdentOptions(integrators=integrators)))
+    posterior = matrix_posterior(
+        [item], identify_mimo([item], IdentOptions(integrators=integrators, **KNOWN))
+    )
     factor = control.ss(*posterior.input_factor(0.01), DT_S, remove_useless_states=False)
     assert np.max(np.abs(factor.poles())) < 1
     values, own = response(factor), posterior.at(OMEGA).input_factor
@@ -137,10 +141,9 @@ def test_the_rational_factor_is_that_of_the_balls(integrators):
     )
 
 
-@pytest.mark.slow
 def test_a_start_in_motion_is_estimated():
     item = record(structure(), 4, samples=3400)
-    result = identify_mimo([item.slice(200, 3200)])
+    result = identify_mimo([item.slice(200, 3200)], IdentOptions(**KNOWN))
     assert result.structure.estimate_initial_state
     np.testing.assert_allclose(result.model.frequency_response(OMEGA), response(structure()), atol=0.02)
 
@@ -194,7 +197,7 @@ def test_a_refusal_names_in_one_line_what_cannot_be_fitted(spoil, options, fact)
 
 def test_one_long_record_of_which_the_start_was_searched_is_fitted_as_a_whole():
     log = record(structure(), seed=8)
-    options = {"n_real": 1, "n_pairs": 2, "estimate_initial_state": False}
+    options = {**KNOWN, "estimate_initial_state": False}
     searched = identify_mimo([log], IdentOptions(**options, search_samples=600))
     whole = identify_mimo([log], IdentOptions(**options))
     assert len(searched.residuals[0]) == log.n_samples
