@@ -38,7 +38,7 @@ def test_what_only_large_motions_show_is_unknown(tmp_path):
     assert found.probabilities["unknown"] > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_they_decide_between_causes_that_small_motions_hardly_show(tmp_path):
     found = diagnose(_case(tmp_path, [{"name": "hardening_spring", "cubic_Nm_rad3": 0.02}]))
     assert _estimation_gap(found) == pytest.approx(1.0, abs=_FIT)

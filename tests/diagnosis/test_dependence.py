@@ -86,9 +86,10 @@ class Expected:
 @pytest.mark.parametrize(
     ("missing", "expected"),
     [
-        (
+        pytest.param(
             lambda x, v, k, load: np.array([-8.0 * x[0], 0.0]),
             Expected("cart_N", "position", "cart_m", True, "line", -8.0),
+            marks=pytest.mark.long,
         ),
         (
             lambda x, v, k, load: np.array([-8.0 * x[1], 0.0]),
@@ -98,13 +99,15 @@ class Expected:
             lambda x, v, k, load: np.array([0.0, -0.4 * np.tanh(v[1] / 1e-3)]),
             Expected("table_N", "speed", "table_m", True, "jump", -0.4),
         ),
-        (
+        pytest.param(
             lambda x, v, k, load: np.array([0.0, -0.7 * v[1]]),
             Expected("table_N", "speed", "table_m", True, "line", -0.7),
+            marks=pytest.mark.long,
         ),
-        (
+        pytest.param(
             lambda x, v, k, load: np.array([0.3 * k * DT_S, 0.0]),
             Expected("cart_N", "time", "", False, "line", 0.3),
+            marks=pytest.mark.long,
         ),
         (
             lambda x, v, k, load: np.array([-0.5 * load[k], 0.0]),
@@ -129,6 +132,7 @@ def test_a_curve_is_read_off_where_no_line_is_one():
     assert np.max(np.abs(force - true)) < 0.15 * np.max(np.abs(true))
 
 
+@pytest.mark.slow
 def test_a_second_cause_is_read_off_beside_the_first():
     first, second = found_of(lambda x, v, k, load: np.array([-8.0 * x[0], -0.5 * v[1]]))
     found = {(one.place, one.quantity) for one in (first, second)}
@@ -137,12 +141,14 @@ def test_a_second_cause_is_read_off_beside_the_first():
     assert first.share + second.share <= 1.01
 
 
+@pytest.mark.slow
 def test_of_one_log_blocks_judge():
     first, *_ = found_of(lambda x, v, k, load: np.array([-8.0 * x[0], 0.0]), logs=1)
     assert (first.quantity, first.of, first.judged_on) == ("position", "cart_m", "blocks")
     assert first.slope == pytest.approx(-8.0, rel=0.1)
 
 
+@pytest.mark.slow
 def test_noise_and_a_force_that_follows_nothing_depend_on_nothing():
     """The second is another one in each log, and as large as the forces above."""
     assert found_of(lambda x, v, k, load: np.zeros(2)) == ()
@@ -246,6 +252,7 @@ def test_pushed_at_its_joint_a_mujoco_arm_moves_as_under_its_motor():
         assert np.max(np.abs(by_force)) > 1e-3
 
 
+@pytest.mark.slow
 def test_commands_that_nobody_named_are_no_readings():
     """As many inputs as outputs, without names: the simulation does not read what was measured."""
     case, left = case_of(lambda x, v, k, load: np.array([-8.0 * x[0], 0.0]))

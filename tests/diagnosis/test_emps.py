@@ -10,6 +10,7 @@ from diagnosis import diagnose
 PUBLISHED = emps_axis.PUBLISHED
 
 
+@pytest.mark.slow
 def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flexlink_data):
     found = diagnose(emps_axis.case(flexlink_data, "passes"))
     assert found.verdict == "effect"
@@ -28,7 +29,7 @@ def test_coulomb_friction_and_an_offset_are_named_with_the_published_values(flex
         assert low < PUBLISHED[key] < high
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_with_friction_by_direction_listed_it_explains_more_than_an_offset(flexlink_data):
     # Not in the published model: half the sum of forces at plus and minus one speed grows with the speed.
     found = diagnose(emps_axis.case(flexlink_data, "passes", refined=True))

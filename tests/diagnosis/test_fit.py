@@ -87,8 +87,10 @@ def test_few_of_many_frequencies_have_the_best_among_them(tmp_path, monkeypatch,
 
 # On seed 6 a thousandth of the gap changes a record by 0.6 noise deviations: quotients over steps of half a
 # per cent measure how contacts happen to fall, and the descent ends with an amplitude 6 % off.
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [0, 1, 3, 6])
+@pytest.mark.parametrize(
+    "seed",
+    [*(pytest.param(k, marks=pytest.mark.long) for k in (0, 1, 3)), pytest.param(6, marks=pytest.mark.slow)],
+)
 def test_a_disturbance_beside_backlash_is_found_from_a_fifth_off(tmp_path, seed):
     """Where contacts switch, coarse difference quotients lead to the amplitude."""
     table = draw_rig(np.random.default_rng(seed))

@@ -107,7 +107,14 @@ def test_in_the_force_that_a_measured_motion_takes(name):
     np.testing.assert_allclose(taken[moving], force(*motion[moving].T), rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", FORCES)
+# One that MJCF has a word for, one that it has not; the laws themselves are those of the other routes.
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks={"spring": (), "cogging": pytest.mark.slow}.get(name, pytest.mark.long))
+        for name in FORCES
+    ],
+)
 def test_on_a_joint_of_a_mujoco_model(name):
     """Held over steps of a fifth of a sample. Measured up to 1.3e-3 of what it changes."""
     mujoco = pytest.importorskip("mujoco")

@@ -246,6 +246,7 @@ def test_what_the_held_out_records_contradict_is_no_answer():
     assert all(closed > 0 for _, closed in shares.closes)
 
 
+@pytest.mark.slow
 def test_a_stated_value_far_off_is_named_though_the_others_could_imitate_it():
     # Hub inertia half as large again, known to 5 %: the motor's values may give way, at a price.
     rng = np.random.default_rng(7)
@@ -564,8 +565,10 @@ def test_every_likely_set_of_an_effect_and_the_effect_alone_are_also_fitted_with
         assert tuple(sorted({"ground_spring", *names} - {"gravity"})) in fitted
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [3, 5, 7])
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(3, marks=pytest.mark.slow), *(pytest.param(k, marks=pytest.mark.long) for k in (5, 7))],
+)
 def test_a_record_that_begins_in_free_play_is_followed_from_there(seed):
     # Cut out of a run: until the hub touches, it goes on as it went, which no linear arm does.
     rng = np.random.default_rng(seed)

@@ -278,7 +278,9 @@ def test_friction_one_way_in_the_direction_of_the_force():
     ("name", "values", "more"),
     [
         ("viscous_asymmetry", {"coefficient": 0.6}, lambda x, v: 0.6 * abs(v)),
-        ("quadratic_drag", {"coefficient": 1.5}, lambda x, v: 1.5 * v * abs(v)),
+        pytest.param(
+            "quadratic_drag", {"coefficient": 1.5}, lambda x, v: 1.5 * v * abs(v), marks=pytest.mark.slow
+        ),
         ("wind", {"c": 1.5}, lambda x, v: 1.5 * v * abs(v)),
     ],
 )

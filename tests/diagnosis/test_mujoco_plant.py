@@ -318,10 +318,15 @@ def in_motion(xml: str, noise: float, seed: int, servo: bool = False) -> PlantEx
 @pytest.mark.parametrize(
     ("integrator", "kind", "tracking_rad_s"),
     [
-        ("Euler", "motor", 9.0), ("Euler", "cart", 20.0), ("RK4", "servo", 20.0), ("RK4", "cart", 9.0),
-        ("implicit", "motor", 20.0), ("implicitfast", "servo", 9.0),
+        ("Euler", "cart", 20.0),
+        ("RK4", "servo", 20.0),
+        ("implicit", "motor", 20.0),
+        # The same machines with the other integrators.
+        pytest.param("Euler", "motor", 9.0, marks=pytest.mark.long),
+        pytest.param("RK4", "cart", 9.0, marks=pytest.mark.long),
+        pytest.param("implicitfast", "servo", 9.0, marks=pytest.mark.long),
     ],
-)  # fmt: skip
+)
 def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrator, kind, tracking_rad_s):
     noise, xml = 2e-4, two_links(integrator, 0.005, kind)
     logs = [in_motion(xml, noise, seed, kind == "servo") for seed in range(2)]
@@ -337,8 +342,8 @@ def test_the_true_model_leaves_the_noise_of_a_log_that_begins_in_motion(integrat
 @pytest.mark.parametrize(
     ("integrator", "name", "stated", "factor"),
     [
-        ("RK4", "one.armature", 'armature="0.02"', 4.0),
-        ("implicitfast", "one.damping", 'damping="0.3"', 4.0),
+        pytest.param("RK4", "one.armature", 'armature="0.02"', 4.0, marks=pytest.mark.slow),
+        pytest.param("implicitfast", "one.damping", 'damping="0.3"', 4.0, marks=pytest.mark.long),
         ("implicitfast", "body1.mass", 'mass="1.2" diaginertia="0.01 0.01 0.01"', 1.5),
     ],
 )
@@ -358,7 +363,12 @@ def test_a_start_in_motion_is_fitted_with_the_values_that_are_tried(integrator, 
 
 @pytest.mark.parametrize(
     ("integrator", "kind"),
-    [("Euler", "lag"), ("implicitfast", "lag"), ("implicitfast", "delay"), ("Euler", "servo delay")],
+    [
+        ("Euler", "lag"),
+        pytest.param("implicitfast", "lag", marks=pytest.mark.long),
+        ("implicitfast", "delay"),
+        pytest.param("Euler", "servo delay", marks=pytest.mark.long),
+    ],
 )
 def test_commands_before_a_record_are_fitted(integrator, kind):
     """What a lag or delay that the model lacks still feels of them, where the log begins in motion."""
@@ -380,7 +390,7 @@ def test_commands_before_a_record_are_fitted(integrator, kind):
     assert np.max(np.sqrt(np.mean(without**2, axis=0))) > 20 * noise
 
 
-@pytest.mark.parametrize("load_kg", [0.0, 1.0])
+@pytest.mark.parametrize("load_kg", [pytest.param(0.0, marks=pytest.mark.long), 1.0])
 def test_a_stiff_servo_that_saturates_under_steps_is_followed(load_kg):
     """An arm with the gains of a public model and a force limit that every step meets."""
     servo = 'kp="4500" kv="450" forcerange="-87 87"'
@@ -418,7 +428,9 @@ def test_a_stiff_servo_that_saturates_under_steps_is_followed(load_kg):
     assert not load_kg or np.any(left() > interests)
 
 
-@pytest.mark.parametrize("kind", ["cart", "lag"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("cart", marks=pytest.mark.slow), pytest.param("lag", marks=pytest.mark.long)]
+)
 def test_steps_that_are_coarser_than_the_machine_leave_little_of_it(kind):
     """The machine at a twentieth of the model's steps: classical Runge-Kutta leaves nothing."""
     logs = [in_motion(two_links("RK4", 0.00025, kind), 0.0, seed) for seed in range(2)]
@@ -522,7 +534,15 @@ REPAIRS = {
 }
 
 
-@pytest.mark.parametrize("first", REPAIRS)
+# `make test`: one that adds a joint. CI: one that adds a body.
+@pytest.mark.parametrize(
+    "first",
+    [
+        "backlash",
+        pytest.param("payload", marks=pytest.mark.slow),
+        *(pytest.param(name, marks=pytest.mark.long) for name in ("spring", "lag", "offset")),
+    ],
+)
 def test_a_repaired_file_can_be_diagnosed_and_repaired_again_with_the_same_logs(first):
     torque = steps()
     angle = turned(torque)
@@ -806,7 +826,9 @@ def test_only_the_direction_of_gravity_is_open(gravity, free, tilted):
         np.testing.assert_allclose(edited(arm, "gravity.z", -9.0)[0].opt.gravity, (0, 0, -9.0))
 
 
-@pytest.mark.parametrize("kp", [50.0, 500.0, 5000.0])
+@pytest.mark.parametrize(
+    "kp", [50.0, pytest.param(500.0, marks=pytest.mark.long), pytest.param(5000.0, marks=pytest.mark.slow)]
+)
 def test_a_servo_is_judged_by_what_it_strays_from_its_command(kp):
     """Behind a stiff servo with damping kv the joint lags the command by about kv/kp: the share of the motion
     that its forces make falls as that does. Of a motor it is what its commands make."""
@@ -860,7 +882,8 @@ BOX = '<mesh name="box" file="box.obj" scale=".1 .1 .1"/>'
 @pytest.mark.parametrize(
     ("compiler", "include", "asset", "density", "hit"),
     [
-        ('meshdir="parts"', "", BOX, "", ""),
+        # The last one has this directory, too.
+        pytest.param('meshdir="parts"', "", BOX, "", "", marks=pytest.mark.long),
         ('assetdir="parts"', "", BOX, 'mass="0"', '<geom type="mesh" mesh="box"/>'),
         ("", '<include file="parts/inc.xml"/>', "", "", ""),
         (
@@ -918,6 +941,7 @@ def test_a_joint_on_a_base_that_flies_is_refused_in_one_line(base, refused):
         arm_of(text, ("hip",))
 
 
+@pytest.mark.slow
 def test_the_equations_of_the_benchmark_are_those_of_mujoco():
     """Both truths of the same two-joint arm under the same torques; they share no line."""
     masses, damping, armature = np.array([1.2, 0.8]), np.array([0.25, 0.12]), np.array([0.03, 0.015])

@@ -1,6 +1,7 @@
 """A plant of one's own whose records start anywhere: truth by scipy's integrator."""
 
 import numpy as np
+import pytest
 from numba import njit
 from scipy.integrate import solve_ivp
 
@@ -55,6 +56,7 @@ def _record(name, role, angle_rad, speed_rad_s, seed):
     return PlantExperiment(name, role, torque[:, None], output)
 
 
+@pytest.mark.slow
 def test_starts_of_records_are_fitted_and_the_spring_is_found():
     starts = ((0.5, 2.0), (-0.4, 0.0), (0.3, -3.0))
     roles = ("estimation", "estimation", "held_out")

@@ -139,10 +139,13 @@ def test_effects_that_change_the_motion_most_are_no_fault():
         refuse_implausible(case)
 
 
-@pytest.mark.slow
-def test_no_recorded_case_is_refused_and_its_faults_are(gap_cases):
-    """The workshop's cases are loaded one by one in tests/workflow/test_diagnose_case_files.py."""
-    for folder in sorted((gap_cases / "labelled").iterdir()):
+@pytest.mark.parametrize(
+    "every", [pytest.param(4, marks=pytest.mark.slow), pytest.param(1, marks=pytest.mark.long)]
+)
+def test_no_recorded_case_is_refused_and_its_faults_are(gap_cases, every):
+    """In CI in every fourth one; the workshop's cases are loaded one by one in
+    tests/workflow/test_diagnose_case_files.py."""
+    for folder in sorted((gap_cases / "labelled").iterdir())[::every]:
         case = load_case(folder).case
         for change in (scaled(1, DEGREES), scaled(0, 1e-3), scaled(2, -1.0), swapped(0, 1)):
             with pytest.raises(ValueError, match="columns"):

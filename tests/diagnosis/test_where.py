@@ -71,6 +71,7 @@ def test_a_band_is_found_in_the_sensor_it_was_put_in():
     assert tip.interval[0] <= 2.0 <= tip.interval[1]
 
 
+@pytest.mark.slow
 def test_intervals_of_energy_and_share_cover():
     """The gap's energy and its share are known; 95 % intervals hold them in 95 of 100 noises."""
     rng = np.random.default_rng(17)
@@ -137,6 +138,7 @@ def test_a_gap_near_reversals_is_found_there():
     assert not any(r.found for r in found.regimes if r.sensor == "tip")
 
 
+@pytest.mark.slow
 def test_a_drift_is_found_with_its_rate():
     rate = 0.5 * 8e-4  # m/s: half a noise deviation per second, 2 to 3.5 at the end of a record
 
@@ -198,6 +200,7 @@ def test_a_coarse_tip_sensor_is_found_there_and_at_all_frequencies():
     assert top.share > 0.5
 
 
+@pytest.mark.slow
 def test_a_wrong_sensor_gain_is_an_error_over_the_tip_position():
     ratio = 1.05
     found = _of_effect(SensorGain(ratio=ratio))
@@ -211,6 +214,7 @@ def test_a_wrong_sensor_gain_is_an_error_over_the_tip_position():
     assert found.linear.share > 0.9
 
 
+@pytest.mark.slow
 def test_a_disturbance_is_the_same_whatever_the_input():
     frequency = 3.1
     found = _of_effect(PeriodicDisturbance(amplitude_Nm=0.01, frequency_Hz=frequency, phase_rad=0.4))
@@ -244,6 +248,7 @@ def test_linear_and_nonlinear_causes_are_told_apart():
     assert friction.amplitude.exponent < 0.5
 
 
+@pytest.mark.slow
 def test_a_periodic_record_shows_the_response_and_the_distortion():
     found = _of_effect(LinkStiffness(ratio=0.9))
     (periodic,) = found.periodic
@@ -309,6 +314,7 @@ def _recorded(gap_cases, name):
     return where(case, ResidualModel(case).by_experiment(np.zeros(0), ()))
 
 
+@pytest.mark.long
 def test_recorded_sensor_drift_is_a_drift_of_the_tip_sensor(gap_cases):
     found = _recorded(gap_cases, "sensor_drift")
     (tip,) = (d for d in found.drift if d.found)
@@ -324,6 +330,7 @@ def test_recorded_saturation_shows_in_the_one_experiment_that_saturates(gap_case
     assert [x.experiment for x in found.experiments if x.gap.found] == ["experiments/03_multisine.csv"]
 
 
+@pytest.mark.long
 def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
     found = _recorded(gap_cases, "coulomb_friction")
     first = found.dependences[0]
@@ -335,7 +342,13 @@ def test_recorded_dry_friction_turns_round_with_the_speed(gap_cases):
 
 @pytest.mark.parametrize(
     ("name", "linear"),
-    [("tip_payload", True), ("input_delay", True), ("link_stiffness", True), ("backlash", False)],
+    [
+        ("backlash", False),
+        *(
+            pytest.param(name, True, marks=pytest.mark.long)
+            for name in ("tip_payload", "input_delay", "link_stiffness")
+        ),
+    ],
 )
 def test_recorded_linear_causes_are_called_linear(gap_cases, name, linear):
     found = _recorded(gap_cases, name)
@@ -343,6 +356,7 @@ def test_recorded_linear_causes_are_called_linear(gap_cases, name, linear):
     assert (found.linear.share < 0.6) == (not linear)
 
 
+@pytest.mark.slow
 def test_beside_a_model_error_sizes_are_over_what_a_model_may_miss():
     """Three times as much missed as allowed, wherever a record starts and with the hub angle alone."""
     error, case = 0.05, made(white(np.random.default_rng(3)))
@@ -394,8 +408,22 @@ def _same_everywhere(name, T):
     return np.column_stack([2.0 * np.sin(0.1 * np.arange(T)), 0.01 * np.arange(T)])
 
 
-@pytest.mark.parametrize("shape", [_less_noise_than_stated, _only_in_one_record, _same_everywhere])
-@pytest.mark.parametrize("model_error", [0.0, 0.02])
+@pytest.mark.parametrize(
+    ("shape", "model_error"),
+    [
+        (_less_noise_than_stated, 0.0),
+        pytest.param(_only_in_one_record, 0.02, marks=pytest.mark.slow),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)
+            for one in (
+                (_less_noise_than_stated, 0.02),
+                (_only_in_one_record, 0.0),
+                (_same_everywhere, 0.0),
+                (_same_everywhere, 0.02),
+            )
+        ),
+    ],
+)
 def test_shares_lie_between_none_and_all(shape, model_error):
     residuals = _gap(shape)
     shares = _shares_of(where(replace(made(residuals), model_error=model_error), residuals))
@@ -445,12 +473,19 @@ def test_of_records_shorter_than_a_second_no_growth_with_the_input_is_said(sampl
     ("added", "said"),
     [
         (lambda y, v, u, t, noise: 2 * (v > 0) * noise, "direction of a: where a "),
-        (
+        pytest.param(
             lambda y, v, u, t, noise: 3.0 * (np.abs(u) > 0.8),
             "size of input 1: where input 1 has a size of 0.",
+            marks=pytest.mark.long,
         ),
-        (lambda y, v, u, t, noise: 3.0 * (y > 0.3), "value of a: where a is 0."),
-        (lambda y, v, u, t, noise: 3.0 * (t > 6), "time: 6.7 to 8 s after the start"),
+        pytest.param(
+            lambda y, v, u, t, noise: 3.0 * (y > 0.3), "value of a: where a is 0.", marks=pytest.mark.long
+        ),
+        pytest.param(
+            lambda y, v, u, t, noise: 3.0 * (t > 6),
+            "time: 6.7 to 8 s after the start",
+            marks=pytest.mark.slow,
+        ),
         (lambda y, v, u, t, noise: 0 * y, ""),
     ],
 )
@@ -461,7 +496,7 @@ def test_of_any_machine_it_is_said_when_it_errs(added, said):
         return lfilter([0.1], [1.0, -0.9], inputs, axis=0)
 
     rng, records, left, t = np.random.default_rng(1), [], {}, 0.01 * np.arange(800)
-    for name in "nopqrstuvw":
+    for name in "nopqrw":
         u = rng.uniform(-1, 1, (100, 2)).repeat(8, axis=0)
         y, e = simulate_lag({}, {}, u), rng.standard_normal((800, 2))
         e[:, 0] += added(y[:, 0], np.gradient(y[:, 0]), u[:, 0], t, rng.standard_normal(800))

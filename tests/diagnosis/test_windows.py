@@ -76,9 +76,9 @@ def _late_tank(u, rng):
             "y",
             "coulomb_friction",
             0.4,
-            marks=pytest.mark.slow,
+            marks=pytest.mark.long,
         ),
-        (_tank, {"area": 2.04}, _late_tank, None, "input_delay", 0.045),
+        pytest.param(_tank, {"area": 2.04}, _late_tank, None, "input_delay", 0.045, marks=pytest.mark.slow),
     ],
 )
 def test_an_effect_is_sized_in_windows_beside_a_drift_nobody_lists(
