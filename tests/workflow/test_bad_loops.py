@@ -149,7 +149,7 @@ def assert_right(results, *, share=0.02, friction=0.02):
     assert np.median(np.abs(error)) < share
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_controllers_are_taken(taken, tmp_path):
     made = [log(1), log(2, law=pid(1.5, 0.08)), log(4, 0.12)]
     # Measured: .03 % of the response.
@@ -164,7 +164,12 @@ def faster(one):
 
 # Of the encoder; a turned sign of the command: tests/workflow/test_init.py.
 @pytest.mark.parametrize(
-    ("change", "side"), [(lambda one: {**one, "y": -one["y"]}, -1), (faster, 1)], ids=["turned", "faster"]
+    ("change", "side"),
+    [
+        pytest.param(lambda one: {**one, "y": -one["y"]}, -1, marks=pytest.mark.long),
+        pytest.param(faster, 1, marks=pytest.mark.slow),
+    ],
+    ids=["turned", "faster"],
 )
 def test_what_a_log_is_otherwise_is_taken_back(records, tmp_path, change, side):
     """A model of the same signals is the same: the records are those of the logs as they are, or command and
@@ -178,7 +183,7 @@ def test_what_a_log_is_otherwise_is_taken_back(records, tmp_path, change, side):
         np.testing.assert_allclose(side * own.record.input, other.record.input, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("column", ["u", "applied"])
+@pytest.mark.parametrize("column", ["u", pytest.param("applied", marks=pytest.mark.slow)])
 def test_a_limit_of_the_amplifier_is_seen_before_and_after_it(records, tmp_path, column):
     made = logs(levels=(0.2, 0.2), machine=plant(limit=0.5))
     found, config = records(written(tmp_path, made, COLUMNS | {"i_cmd_A": column}))
@@ -264,11 +269,12 @@ def other_load(one, k):
 TWO, THREE = (0.2, 0.15), (0.2, 0.1, 0.15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("change", "said", "levels"),
     [
-        pytest.param(lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", TWO, marks=pytest.mark.slow),
-        pytest.param(other_load, "explains these logs", THREE, marks=pytest.mark.long),
+        (lambda one, k: {"u": log(10 + k)["u"]}, "'enc_rad'", TWO),
+        (other_load, "explains these logs", THREE),
     ],
     ids=["command of another axis", "another load"],
 )

@@ -244,8 +244,13 @@ def test_calibration_is_designed_for(monkeypatch):
     assert asked == ["plain", "jointly", "plain", "plain"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("open_", [{}, {"bandwidth_rad_s": 4.0, "lowest_bandwidth_rad_s": 2.0}])
+@pytest.mark.parametrize(
+    "open_",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"bandwidth_rad_s": 4.0, "lowest_bandwidth_rad_s": 2.0}, marks=pytest.mark.long),
+    ],
+)
 def test_a_missed_specification_says_what_would_meet_it(open_):
     """A modulus margin near one leaves no bandwidth: the reason names a smaller one, and typed it is met."""
     asked = {"effort_limit": 1.5, "modulus_margin": 0.95, "controller_order": 3, "bandwidth_rad_s": 2.0}

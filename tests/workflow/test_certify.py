@@ -35,6 +35,7 @@ def test_the_job_holds_the_margins_and_fails_where_the_controller_is_changed(fle
         assert (told.code, words in told.err) == (1, True), told.err
 
 
+@pytest.mark.slow
 def test_every_form_of_a_controller_has_one_certificate(flexlink, example):
     law = Controller.from_json(Path("controller.json").read_text())
     above, below = scipy.signal.ss2tf(law.A, law.B, law.C, law.D)
@@ -112,6 +113,7 @@ def test_what_is_no_controller_is_bad_input(refused, example, fast_run):
     assert "give --controller" in refused(*example[:-1])
 
 
+@pytest.mark.slow
 def test_one_sweep_of_two_lags_is_judged_by_its_points_and_says_what_is_assumed_beyond(flexlink, tmp_path):
     """An exact sweep of 1.2 / ((s/6 + 1) (s/150 + 1)); the loop's distances are those of its own points."""
     dt_s = 0.002

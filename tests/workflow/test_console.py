@@ -157,7 +157,17 @@ def test_a_narrow_terminal_has_whole_numbers_and_long_lines(width, capsys, monke
 
 @pytest.mark.parametrize(
     ("kind", "more"),
-    [(kind, "--json") for kind in ("ascii", "C locale", "reader leaves")] + [(kind, "") for kind in STREAMS],
+    [
+        *((kind, "") for kind in ("C locale", "both closed", "reader leaves")),
+        ("ascii", "--json"),
+        *(
+            pytest.param(*further, marks=pytest.mark.long)
+            for further in (
+                *((kind, "--json") for kind in ("C locale", "reader leaves")),
+                *((kind, "") for kind in ("ascii", "latin-1", "stdout closed", "all closed")),
+            )
+        ),
+    ],
 )
 def test_any_kind_of_output_will_do(kind, more, tmp_path):
     (tmp_path / "l°g.csv").write_text(PRINTS_A_TABLE)

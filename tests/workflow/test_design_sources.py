@@ -148,7 +148,7 @@ def test_model_without_uncertainty_says_what_its_certificate_holds_for(flexlink,
     assert found["certificate"]["plants"][0]["stated"] is False
 
 
-@pytest.mark.parametrize("ending", ["json", "mat"])
+@pytest.mark.parametrize("ending", ["json", pytest.param("mat", marks=pytest.mark.long)])
 def test_exported_model_brings_its_ellipses(flexlink, wish, tmp_path, ending):
     path = tmp_path / f"model.{ending}"
     path.write_bytes(model_file().to_json().encode() if ending == "json" else model_file().to_mat())
@@ -158,6 +158,7 @@ def test_exported_model_brings_its_ellipses(flexlink, wish, tmp_path, ending):
     assert verdict["own_grid_rad_s"] == pytest.approx([0.05, 60.0])
 
 
+@pytest.mark.slow
 def test_measured_response_on_its_own_grid_and_fitted(flexlink, wish, tmp_path):
     """With a model given for the poles and with a fitted one."""
     write_response(tmp_path / "frf.csv")
@@ -200,6 +201,7 @@ def test_integrating_plant_when_told(flexlink, wish, tmp_path):
     assert numbers(flexlink("design", tmp_path / "hub.json", "--spec", spec, "--json"))["certified"] is True
 
 
+@pytest.mark.slow
 def test_order_too_low_is_said_with_what_a_higher_one_reaches(flexlink, wish, tmp_path):
     """Exit code 3: there is a best point, its certificate says no, and the file says so too."""
     wishes = WISH.replace("0.7", "3.0").replace("controller_order = 3", "controller_order = 1")

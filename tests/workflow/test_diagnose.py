@@ -119,6 +119,7 @@ def test_the_proposed_experiment_can_be_run(files, document, folder):
     assert np.max(np.abs(voltage)) <= max(np.max(np.abs(e.voltage_V)) for e in case.experiments) * (1 + 1e-9)
 
 
+@pytest.mark.slow
 def test_the_page_answers_in_order(files, tmp_path, faults_seen):
     html = files["arm.html"].decode()
     (tmp_path / "arm.html").write_text(html)
@@ -145,16 +146,23 @@ def test_the_first_screen_of_a_diagnosis(files, tmp_path, browser):
     ("engine", "words"),
     [
         (KnownAnswer((), "none", "none"), "No model error beyond sensor noise"),
-        (KnownAnswer((), "none", "parametric"), "outside their tolerances"),
+        pytest.param(
+            KnownAnswer((), "none", "parametric"), "outside their tolerances", marks=pytest.mark.slow
+        ),
         (KnownAnswer((), "unknown", "unknown"), "None of the candidate effects explains the model error"),
-        (KnownAnswer((FRICTION,), "effect", "not_converged"), "the fit did not converge"),
+        pytest.param(
+            KnownAnswer((FRICTION,), "effect", "not_converged"),
+            "the fit did not converge",
+            marks=pytest.mark.slow,
+        ),
         (
             KnownAnswer((FRICTION,), "effect", "ambiguous", ambiguous=("viscous_friction",)),
             "; or instead additional viscous friction (10 %)",
         ),
-        (
+        pytest.param(
             KnownAnswer((FRICTION, {"name": "tip_payload", "mass_kg": 0.01})),
             "N m) and an additional mass at the tip (96 %, ",
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["none", "parametric", "unknown", "not_converged", "ambiguous", "two"],
@@ -323,6 +331,7 @@ def test_several_cases_make_an_overview(cases, tmp_path, here, faults_seen):
     assert found.summary.report_path == str(out / "index.html")
 
 
+@pytest.mark.slow
 def test_a_failing_case_does_not_lose_the_others(cases, tmp_path, here):
     out = tmp_path / "out"
     engine = KnownAnswer((FRICTION,), fails=("one",))
@@ -370,6 +379,7 @@ def test_a_fit_that_did_not_converge_is_exit_code_3(cases, tmp_path, here):
     assert "did not converge" in found.complaints()[0]
 
 
+@pytest.mark.slow
 def test_resuming_does_only_what_is_missing(cases, tmp_path, here):
     out, seen = tmp_path / "out", tmp_path / "seen"
     engine = KnownAnswer((FRICTION,), seen=seen)
@@ -397,6 +407,7 @@ def test_resuming_does_only_what_is_missing(cases, tmp_path, here):
     assert everything(out) == first
 
 
+@pytest.mark.long
 def test_another_code_version_is_done_again(cases, tmp_path, here, monkeypatch):
     out, seen = tmp_path / "out", tmp_path / "seen"
     engine = KnownAnswer((FRICTION,), seen=seen)
@@ -407,6 +418,7 @@ def test_another_code_version_is_done_again(cases, tmp_path, here, monkeypatch):
     assert found.documents[0]["made_from"]["code_sha256"] == "another"
 
 
+@pytest.mark.slow
 def test_other_inputs_are_refused_unless_replaced(cases, tmp_path, here):
     out, engine = tmp_path / "out", KnownAnswer((FRICTION,))
     diagnose_cases(cases, out, controller=False, engine=engine)
@@ -460,7 +472,7 @@ def test_no_name_of_the_standard_library_in_the_current_folder_is_taken_for_it(t
     assert version.stdout.startswith("flexlink "), version.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_process_that_dies_is_that_cases_failure(cases, tmp_path):
     out = tmp_path / "out"
     engine = KnownAnswer((FRICTION,), dies=("one",))

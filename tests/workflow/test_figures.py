@@ -123,7 +123,13 @@ def test_pictures_of_a_planned_experiment():
 
 
 @pytest.mark.parametrize(
-    "names", [pytest.param((), marks=pytest.mark.slow), (HOSTILE, HOSTILE)], ids=["plain", "hostile"]
+    "names",
+    [
+        pytest.param((), marks=pytest.mark.long),
+        # Longer names and units need more room than plain ones.
+        pytest.param((HOSTILE, HOSTILE), marks=pytest.mark.slow),
+    ],
+    ids=["plain", "hostile"],
 )
 def test_titles_units_and_a_legend_nothing_cut_off_and_nothing_overlapping(names):
     for figure in pictures(*names).values():
@@ -167,7 +173,7 @@ def is_whole(figure: Figure) -> None:
         assert not legend.overlaps(axes.get_window_extent(renderer)), "the legend hides a panel"
 
 
-@pytest.mark.parametrize("draw", [bode_picture, poles_picture])
+@pytest.mark.parametrize("draw", [pytest.param(bode_picture, marks=pytest.mark.long), poles_picture])
 def test_same_bytes_twice_and_no_date(draw):
     first, second = saved(draw(), ("pdf", "png")), saved(draw(), ("pdf", "png"))
     assert first == second
@@ -360,10 +366,13 @@ def test_the_step_is_shown_until_it_has_settled():
     assert ends[3] == pytest.approx(step_s + 1.15 * 8.0)
 
 
+@pytest.mark.slow
 def test_margins_in_the_picture_are_those_of_the_loop():
     known = example.plant().nominal * example.controller().to_control(include_delay=True)
     gain, phase, *_ = control.stability_margins(control.frd(known, np.geomspace(0.3, 300, 2000)))
-    words = " ".join(text.get_text() for text in pictures()["bode-loop"].legends[0].get_texts())
+    words = " ".join(
+        text.get_text() for text in pictures(HOSTILE, HOSTILE)["bode-loop"].legends[0].get_texts()
+    )
     said = [float(re.search(f"{name} margin ([-.0-9]+)", words)[1]) for name in ("phase", "gain")]
     assert said == pytest.approx([phase, 20 * np.log10(gain)], rel=0.02)
 

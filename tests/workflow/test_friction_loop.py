@@ -275,7 +275,9 @@ def belt():
     )
 
 
-@pytest.mark.parametrize("jump", [0.0, -0.4])
+@pytest.mark.parametrize(
+    "jump", [pytest.param(0.0, marks=pytest.mark.long), pytest.param(-0.4, marks=pytest.mark.slow)]
+)
 def test_friction_at_the_load_acts_in_the_loop(belt, jump):
     """A step with integral action, against the two masses; also where the fit has the speed jump a little
     against the force, which on a shaft that sticks would grow."""
@@ -312,7 +314,9 @@ def hunting(integral: float) -> tuple[Controller, Law]:
     return law, Law(law.A, np.hstack([law.B, -law.B]), law.C[0], np.append(law.D, -law.D), np.zeros(2))
 
 
-@pytest.mark.parametrize("integral", [0.5, 1.0])
+@pytest.mark.parametrize(
+    "integral", [pytest.param(0.5, marks=pytest.mark.long), pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_the_range_over_sizes_holds_the_time_of_another_integration(belt, integral):
     """One step's settling time jumps from 0.15 s to many with its size, and differs by seconds from that of a
     simulator with other steps; the range covers both."""

@@ -203,6 +203,7 @@ def closed_loop_log(path: Path, seed: int) -> Path:
     return write_log(path, u, y, r_V=r)
 
 
+@pytest.mark.slow
 def test_logs_of_a_closed_loop_in_two_stages(flexlink, undrawn, tmp_path):
     log = closed_loop_log(tmp_path / "loop.csv", 1)
     answer = flexlink(

@@ -103,16 +103,22 @@ def drafted(flexlink, logs, *options):
 @pytest.mark.parametrize(
     ("names", "units", "columns"),
     [
-        (("t_ms", "ref_rad", "i_cmd_A", "enc_rad"), (1e3, 1, 1, 1), ("ref_rad", "i_cmd_A", "enc_rad")),
+        pytest.param(
+            ("t_ms", "ref_rad", "i_cmd_A", "enc_rad"),
+            (1e3, 1, 1, 1),
+            ("ref_rad", "i_cmd_A", "enc_rad"),
+            marks=pytest.mark.long,
+        ),
         (
             ("Zeit [s]", "Sollwert [°]", "Strom [A]", "Winkel [°]"),
             (1, 180 / np.pi, 1, 180 / np.pi),
             ("Sollwert [°]", "Strom [A]", "Winkel [°]"),
         ),
-        (
+        pytest.param(
             ("time_us", "target_counts", "pwm", "position_counts"),
             (1e6, 65536 / (2 * np.pi), 100, 65536 / (2 * np.pi)),
             ("target_counts", "pwm", "position_counts"),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -144,7 +150,7 @@ def test_columns_units_and_structure(flexlink, tmp_path, signals, names, units, 
         (("t_s", "ref_rad", "u_A", "y_rad"), (1, 1, 180 / np.pi), "'y_rad' follows the reference 'ref_rad'",
          "--scale y_rad=0.01745329252 --unit y_rad=rad"),
         pytest.param(("t_s", "ref_deg", "u_A", "y_deg"), (1, 1, 180 / np.pi),
-         "'y_deg' follows the reference 'ref_deg'", "--scale ref_deg=57.29577951", marks=pytest.mark.slow),
+         "'y_deg' follows the reference 'ref_deg'", "--scale ref_deg=57.29577951", marks=pytest.mark.long),
         pytest.param(("t_s", "ref_mm", "u_A", "y_m"), (1, 1e3, 1),
          "'ref_mm' looks like the reference of 'y_m'", "--reference ref_mm --scale ref_mm=0.001",
          marks=pytest.mark.slow),
@@ -203,6 +209,7 @@ def test_the_sign_is_turned_where_the_output_falls(flexlink, tmp_path, signals):
     assert "the controller's files have the sign of the logs" in text
 
 
+@pytest.mark.slow
 def test_open_loop_without_friction(flexlink, tmp_path):
     logs = [recorded(seed, rms=rms, closed=False, coulomb=0.0) for seed, rms in ((1, 0.1), (2, 0.2))]
     document, text, config = drafted(flexlink, write(tmp_path, logs, ("t_s", "", "u_V", "y_rad")))
@@ -214,20 +221,21 @@ def test_open_loop_without_friction(flexlink, tmp_path):
     assert document["numbers"]["seen"]["first_mode"][0] == pytest.approx(MODE_RAD_S, rel=0.01)
 
 
-@pytest.mark.slow
-def test_a_weight_that_holds_and_one_that_throws_over(flexlink, tmp_path):
-    for name, gravity in (("holds", 0.8), ("throws", -0.3)):
-        folder = tmp_path / name
-        folder.mkdir()
-        logs = [recorded(seed, rms=rms, gravity=gravity) for seed, rms in ((1, 0.1), (2, 0.2), (3, 0.15))]
-        document, _, config = drafted(flexlink, write(folder, logs, ("t_s", "ref_rad", "u_A", "y_rad")))
-        assert config.channels[0].identification.integrators == 0
-        found = document["numbers"]["seen"]["unstable_per_s"]
-        if gravity > 0:  # the first mode is the swing
-            low, high = config.specification.mode_band_rad_s
-            assert low < np.sqrt(gravity / (MOTOR + LOAD)) < high
-        roots = np.roots([MOTOR + LOAD, VISCOUS, gravity])
-        assert found == pytest.approx(max(0.0, roots.real.max()), rel=0.1)
+@pytest.mark.parametrize(
+    "gravity",
+    [pytest.param(0.8, marks=pytest.mark.long), pytest.param(-0.3, marks=pytest.mark.slow)],
+    ids=["holds", "throws"],
+)
+def test_a_weight_that_holds_and_one_that_throws_over(flexlink, tmp_path, gravity):
+    logs = [recorded(seed, rms=rms, gravity=gravity) for seed, rms in ((1, 0.1), (2, 0.2), (3, 0.15))]
+    document, _, config = drafted(flexlink, write(tmp_path, logs, ("t_s", "ref_rad", "u_A", "y_rad")))
+    assert config.channels[0].identification.integrators == 0
+    found = document["numbers"]["seen"]["unstable_per_s"]
+    if gravity > 0:  # the first mode is the swing
+        low, high = config.specification.mode_band_rad_s
+        assert low < np.sqrt(gravity / (MOTOR + LOAD)) < high
+    roots = np.roots([MOTOR + LOAD, VISCOUS, gravity])
+    assert found == pytest.approx(max(0.0, roots.real.max()), rel=0.1)
 
 
 @pytest.mark.usefixtures("unidentified")
@@ -325,6 +333,7 @@ def test_the_axis_of_emps_becomes_a_controller(refused, flexlink, tmp_path, flex
     assert np.abs(model.frequency_response(s.imag)) == pytest.approx(published, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_reference_planned_for_the_loop_keeps_its_limits_on_the_machine(flexlink, tmp_path, signals):
     """Played on the machine that made the logs: within 15 % of what is expected, as friction bends it."""
     logs = write(tmp_path, signals, ("t_s", "ref_rad", "u_A", "y_rad"))
@@ -377,6 +386,7 @@ def test_what_to_type_is_whole_however_long_the_path(refused, flexlink, tmp_path
     assert not any(word.endswith("...") for word in words[2:])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unidentified")
 def test_the_period_of_the_controller_is_read_off_stated_or_asked_for(flexlink, tmp_path, signals):
     """Every row of a loop tells its period, and that a command is made of its own row's position; every

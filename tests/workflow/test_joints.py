@@ -182,7 +182,7 @@ def test_logs_give_the_same_model_as_the_arm(logs, run_of_the_arm, tmp_path, cap
     assert found["closed_loop"]["machine"] == "identified"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_inputs_that_are_one_signal_in_a_band_are_named_with_the_band(logs, tmp_path, capfd):
     table = pd.read_csv(logs)
@@ -349,6 +349,7 @@ def test_each_input_may_have_its_own_dead_time(logs, run_of_the_arm, tmp_path):
         assert np.max(np.linalg.norm(one - other, axis=(1, 2)) / size) < off
 
 
+@pytest.mark.slow
 def test_one_joint_at_two_operating_points_gets_one_controller(tmp_path):
     """Its margin is that of each model, closed by hand; the second log is of an arm half as lively."""
     assert main(["simulate", "--config", str(FAST_ARM), "--out", str(tmp_path / "csv")]) == 0

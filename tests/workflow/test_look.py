@@ -155,7 +155,7 @@ def test_sentences_of_the_page_end_with_their_words(flexlink, tmp_path):
     assert "numbers from line 2.</li>" in page
 
 
-@pytest.mark.parametrize("sweeps", [1, 4])
+@pytest.mark.parametrize("sweeps", [1, pytest.param(4, marks=pytest.mark.long)])
 def test_a_bode_table_is_said_to_be_one_and_goes_on(sweeps, flexlink, refused, tmp_path):
     rng, hz = np.random.default_rng(3), np.geomspace(0.5, 40.0, 40)
     # 30 / (s + 10), sampled at 100 Hz and held; 0.5 % of noise.

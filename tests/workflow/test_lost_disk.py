@@ -112,7 +112,9 @@ def test_a_diagnosis_goes_on(tmp_path, monkeypatch, continued):
 
 
 @pytest.mark.usefixtures("undrawn")
-@pytest.mark.parametrize("name", ["page.html", "model.json"])  # the first and the last
+@pytest.mark.parametrize(
+    "name", [pytest.param("page.html", marks=pytest.mark.long), "model.json"]
+)  # the last
 def test_files_of_an_identification_are_all_there_or_none(name, tmp_path, monkeypatch, refused):
     log = p2_log(tmp_path / "log.csv", 1)
     out = tmp_path / "out"
@@ -133,6 +135,7 @@ def test_simulated_experiments_are_all_there_or_none(tmp_path, monkeypatch, refu
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_files_of_a_design_are_all_there_or_none(tmp_path, monkeypatch, refused):
     (tmp_path / "wish.toml").write_text(WISH + QUICK)
     (tmp_path / "arm.json").write_text(json.dumps(document(arm())))
@@ -243,7 +246,7 @@ def test_files_are_found_again_from_another_folder(tmp_path, monkeypatch):
     assert load_config(Path("../a") / own.name)[0].to_document() == here.to_document()
 
 
-@pytest.mark.parametrize("how", [(), ("--json",)])
+@pytest.mark.parametrize("how", [pytest.param((), marks=pytest.mark.long), ("--json",)])
 def test_an_output_that_takes_nothing_is_one_line(how, tmp_path):
     (tmp_path / "log.csv").write_text("t_s,u,y\n" + "".join(f"{k},{k % 3},{k % 5}\n" for k in range(40)))
     with open("/dev/full", "wb") as full:

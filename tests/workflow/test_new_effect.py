@@ -31,7 +31,10 @@ class WindDrag(Effect):
     coefficient_Nms2: NotNegative = Field(description="coefficient c")
 
 
-@pytest.fixture(params=["take the sail off and run again", None], ids=["check", "no check"])
+@pytest.fixture(
+    params=["take the sail off and run again", pytest.param(None, marks=pytest.mark.long)],
+    ids=["check", "no check"],
+)
 def check(request, monkeypatch):
     monkeypatch.setattr(WindDrag, "check", request.param)
     register(WindDrag)
@@ -48,8 +51,10 @@ def _page(folder, engine):
     ("engine", "model_error"),
     [
         (KnownAnswer((WIND,), ambiguous=("coulomb_friction",)), 0.05),
-        (KnownAnswer((FRICTION,), ambiguous=("wind_drag", "unknown")), 0.0),
-        (KnownAnswer((WIND,), "unknown", "unknown"), 0.05),
+        pytest.param(
+            KnownAnswer((FRICTION,), ambiguous=("wind_drag", "unknown")), 0.0, marks=pytest.mark.long
+        ),
+        pytest.param(KnownAnswer((WIND,), "unknown", "unknown"), 0.05, marks=pytest.mark.slow),
     ],
     ids=["named", "possible", "in part"],
 )

@@ -208,19 +208,19 @@ def test_one_wide_panel_is_laid_out_anew_on_a_narrow_screen(opened):
     assert set(opened.ask(hidden)) == {"none"}
 
 
-def test_report_of_a_run(browser, faults_seen, tmp_path):
-    settings = example.config()
-    run = example.build_run(tmp_path / "run", settings)
-    path = write_report(RunResults(run), settings)
+@pytest.mark.parametrize(
+    "channels", [pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.long)]
+)
+def test_report_of_a_run(browser, faults_seen, tmp_path, channels):
+    settings = example.config(channels=channels)
+    path = write_report(RunResults(example.build_run(tmp_path / "run", settings)), settings)
     assert faults_seen(path) == []
     assert path.stat().st_size < 500_000
-    # Two channels of one made-up model say the same of themselves.
-    settings = example.config(channels=1)
-    path = write_report(RunResults(example.build_run(tmp_path / "one", settings)), settings)
-    assert shape_faults(browser, path, screens=2.5, words=450) == []
+    if channels == 1:  # two channels of one made-up model say the same of themselves
+        assert shape_faults(browser, path, screens=2.5, words=450) == []
 
 
-@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("width", [pytest.param(1280, marks=pytest.mark.slow), 400])
 def test_a_page_without_its_script_shows_numbers_tables_and_the_first_picture(browser, tmp_path, width):
     """Where a browser runs no script: on the first screen at once, in folded parts once they are opened."""
     settings = example.config(channels=1)
@@ -263,6 +263,7 @@ def test_the_shape_of_a_page_is_measured(browser, tmp_path):
     assert "html-has-lang" in str(barriers(browser)) or AXE is None
 
 
+@pytest.mark.slow
 def test_page_of_a_planned_experiment(faults_seen, tmp_path):
     limits = ExperimentLimits(
         band_Hz=(0.5, 90.0), dt_s=0.005, duration_s=40.0, peak_V=24.0, rig=paper_link(), noise_std_rad=1e-3

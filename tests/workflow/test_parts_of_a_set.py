@@ -67,6 +67,7 @@ def test_a_design_for_a_run_takes_every_part(run: RunDirectory) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_ellipses_of_a_file_enclose_those_of_every_part(run: RunDirectory) -> None:
     channel = RunResults(run).uncertainty.channels[0]
     omega = channel.frequency.omega_rad_s

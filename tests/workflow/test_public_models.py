@@ -141,7 +141,12 @@ def record(folder, model, joints, dt_s: float):
     return columns | {f"joint {name}" if name in both else name: f"q_{name}" for name in joints}
 
 
-@pytest.mark.parametrize("name", MODELS)
+# The gripper has a tendon and an equality, the Panda classes, an inertia and actuators of its own.
+MARKS = {"cartpole": pytest.mark.long, "inverted pendulum": pytest.mark.long, "panda": pytest.mark.slow}
+MARKS["so arm"] = pytest.mark.long
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in MODELS])
 def test_a_model_like_a_public_one_loads_and_leaves_little_of_its_own_logs(tmp_path, name):
     text, joints, dt_s = MODELS[name]
     (tmp_path / "model.xml").write_text(text)

@@ -254,7 +254,14 @@ def units_below(t, u, y) -> bytes:
 
 
 @pytest.mark.parametrize(
-    ("name", "written"), [("german.csv", german), ("clocked.csv", clocked), ("units.txt", units_below)]
+    ("name", "written"),
+    [
+        ("german.csv", german),
+        *(
+            pytest.param(*one, marks=pytest.mark.long)  # readers: tests/ident/test_forty_logs.py
+            for one in (("clocked.csv", clocked), ("units.txt", units_below))
+        ),
+    ],
 )
 def test_one_command_from_ones_own_table_to_ones_own_model(name, written, tmp_path, monkeypatch, flexlink):
     monkeypatch.chdir(tmp_path)

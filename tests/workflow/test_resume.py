@@ -46,6 +46,7 @@ def assert_same_run(left: Path, right: Path) -> None:
 
 
 # SIGTERM comes while a command loads, SIGALRM at its time limit.
+@pytest.mark.slow
 def test_interrupted_run_ends_at_once_and_says_how_to_go_on(tmp_path):
     out = tmp_path / "run"
     process = start_flexlink("run", "--config", FAST_ARM, "--out", out)

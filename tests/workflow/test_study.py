@@ -194,6 +194,7 @@ values = [1, 2]
     assert codec.plain(RunResults(own).design) == codec.plain(RunResults(RunDirectory(fast_run[0])).design)
 
 
+@pytest.mark.long
 def test_contradictions_between_axes_are_points_without_a_run(tmp_path):
     text = (
         PLAIN
@@ -221,6 +222,7 @@ values = ["biquads", "pid"]
     assert "leave controller_order out" in summary.numbers["points"][1]["why"]
 
 
+@pytest.mark.slow
 def test_points_that_fail_are_named_and_the_others_stand(flexlink, tmp_path):
     text = (
         PLAIN
@@ -243,6 +245,7 @@ values = [40, 690]
     assert "fir_length" in rows[1]["why"]
 
 
+@pytest.mark.long
 def test_a_base_that_cannot_be_identified_is_refused(refused, tmp_path):
     study = write_study(
         tmp_path, SMALL_STUDY.replace("[changes]", '[changes]\n"channels[0].uncertainty.fir_length" = 690')
@@ -410,6 +413,7 @@ def test_jobs_and_scheduler_are_checked(refused, tmp_path):
     assert "contradict" in line
 
 
+@pytest.mark.slow
 def test_nothing_certified_is_exit_code_3(flexlink, tmp_path):
     path = write_study(tmp_path, SMALL_STUDY.replace("1.0, 1.5, 1e5", "1e5"))
     answer = flexlink("study", "--config", path, "--out", tmp_path / "out", "--jobs", 1, "--json")

@@ -277,6 +277,7 @@ class Deadly:
         return os._exit, (1,)
 
 
+@pytest.mark.slow
 def test_a_task_that_kills_its_process_fails_alone():
     harmless = Imported(("workflow",))
     deadly = Imported((Deadly(),))
@@ -290,6 +291,7 @@ def test_a_task_that_kills_its_process_fails_alone():
     assert found[0] == found[2] == found[3] == harmless.run(None)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked off another one on Linux only")
 def test_the_process_that_others_are_forked_off_may_die_too(monkeypatch):
     """A task, another one when that process has just been killed, and one whose start meets a dead one."""
@@ -333,6 +335,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="processes are forked off another one on Linux only")
 def test_an_interrupt_while_a_process_begins_is_no_traceback(tmp_path):
     script = tmp_path / "interrupted.py"

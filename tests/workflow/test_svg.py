@@ -340,6 +340,7 @@ def test_bars_begin_where_they_are_said_to():
     assert panel.axis(Y) is panel.y
 
 
+@pytest.mark.long
 def test_one_module_needs_matplotlib():
     """Pages are drawn without it, and it takes half a second to load."""
     needing = set()

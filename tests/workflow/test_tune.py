@@ -90,6 +90,7 @@ def ask(server: TuneServer, path: str, content: Any = None, **headers: str) -> t
 # -- designs -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_is_saved_is_what_flexlink_design_writes(session, folder, flexlink):
     values = {"bandwidth_rad_s": 0.6, "effort_limit": 15.0}
     shown = session.design(values)
@@ -108,6 +109,7 @@ def test_what_is_saved_is_what_flexlink_design_writes(session, folder, flexlink)
     assert np.array_equal(law["C"], session._last.C)
 
 
+@pytest.mark.long
 def test_settings_change_the_design(session):
     tight, wide = (session.design({"effort_limit": limit}) for limit in (2.0, 40.0))
     session.design({})
@@ -144,6 +146,7 @@ def test_a_newer_design_ends_the_one_that_runs(session, monkeypatch):
     assert len(raised) == 1
 
 
+@pytest.mark.slow
 def test_near_designs_are_soon_there_and_hardly_worse(session):
     session.design({})
     wanted = {"effort_limit": 12.0, "bandwidth_rad_s": 0.8}
@@ -170,6 +173,7 @@ def test_the_scaled_design_is_the_last_one_times_a_gain(session):
     assert found["gain"] < session.scaled({"effort_limit": 50.0})["gain"]
 
 
+@pytest.mark.slow
 def test_confidence_is_kept_with_the_design(posterior_session, tmp_path):
     session = posterior_session
     names = {one["name"] for one in session.settings()}
@@ -189,6 +193,7 @@ def test_confidence_is_kept_with_the_design(posterior_session, tmp_path):
     assert np.array_equal(law["A"], session._last.A)
 
 
+@pytest.mark.long
 def test_several_plants_share_a_design(folder):
     paths = [folder / "arm.json", folder / "stiff.json"]
     session = TuningSession(paths, read_design_file(folder / "spec.toml"), folder / "two", 3)
@@ -197,6 +202,7 @@ def test_several_plants_share_a_design(folder):
     assert found["plants"][0]["nyquist"] != found["plants"][1]["nyquist"]
 
 
+@pytest.mark.slow
 def test_a_design_says_what_is_said_of_its_limits(session):
     free = dict(session.design({})["numbers"])
     assert "no input_limit" in free["at the limits"]
@@ -376,6 +382,7 @@ def test_it_needs_one_source(refused, folder):
     assert "--spec" in refused("tune", folder / "arm.json", "--quiet", "--no-browser")
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it(folder):
     spec = ["--spec", folder / "spec.toml", "--no-browser", "--quiet"]
     process = start_flexlink("tune", folder / "arm.json", *spec)
@@ -421,6 +428,7 @@ def designed(browser: Browser, number: int) -> None:
     wait_until(browser, lambda: browser.ask("document.body?.dataset.designed") == str(number))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="chromium is not installed")
 def test_the_page_by_keyboard(server, browser):
     browser.go(server.url)
@@ -470,6 +478,7 @@ def test_every_gain_of_the_page_has_its_unit_and_none_is_cut_off(server, browser
         assert high - low > 0.5 * (frame[1] - frame[0])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(PROGRAM is None, reason="chromium is not installed")
 def test_the_page_saves_and_says_what_is_wrong(server, browser, session):
     browser.go(server.url)
@@ -485,6 +494,7 @@ def test_the_page_saves_and_says_what_is_wrong(server, browser, session):
     wait_until(browser, lambda: "less than 1" in text(browser, "state"))
 
 
+@pytest.mark.slow
 def test_controls_are_made_of_the_specification(session):
     known = {one["name"]: one for one in session.settings()}
     assert known["modulus_margin"]["lt"] == 1

@@ -54,24 +54,28 @@ def test_a_log_that_is_refused_waits_for_no_numerical_library(tmp_path):
     assert not loaded(COMMAND, "run", str(path), "--out", str(tmp_path / "run")) & NEVER_FOR_A_LOG
 
 
+@pytest.mark.long
 def test_a_look_at_a_log_loads_no_design(log, tmp_path):
     modules = loaded(COMMAND, "look", log, "--out", str(tmp_path / "look.html"))
     assert (tmp_path / "look.html").exists()
     assert not modules & NEVER_FOR_A_MODEL
 
 
-@pytest.mark.parametrize("page", [[], ["--report", "page.html"]], ids=["alone", "with its page"])
-def test_a_model_is_identified_without_what_designs_and_draws(log, page, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.slow
+def test_a_model_is_identified_without_what_designs_and_draws(log, tmp_path):
+    """With its page, which needs all that the command alone needs."""
+    page = ("--report", str(tmp_path / "page.html"))
     modules = loaded(COMMAND, "identify", log, "--real", "1", "--pairs", "0", "--integrators", "0", *page)
     assert "ident.one_input" in modules
     assert not modules & NEVER_FOR_A_MODEL
 
 
+@pytest.mark.long
 def test_nor_from_python():
     assert not loaded(IDENTIFY + SHOW) & NEVER_FOR_A_MODEL
 
 
+@pytest.mark.slow
 def test_a_diagnosis_begins_without_what_checks_controllers_and_draws():
     assert not loaded(f"import workflow.diagnose.command\n{SHOW}") & NEVER_FOR_A_MODEL
 
