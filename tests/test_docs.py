@@ -34,6 +34,8 @@ ELSEWHERE = {
     "simulators.md": "workflow/test_simulators.py",
 }
 CONSOLE = ["c_code.md", "controllers.md", "margins_in_ci.md", "which_data.md"]
+# A compiler runs; and a job of CI, which tests/workflow/test_certify.py runs as well.
+MARKS = {"c_code.md": pytest.mark.slow, "margins_in_ci.md": pytest.mark.long}
 # Run as notebooks: what their pages must say, in this order.
 NOTEBOOKS = {
     "closed_loop": r"reference_rad|first mode *│ 4|without friction|0.18\d*|certified: e|!\[|controller_step",
@@ -82,7 +84,7 @@ def run_command(command: str, flexlink: Callable[..., Answer]) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("name", CONSOLE)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=MARKS.get(name, ())) for name in CONSOLE])
 @pytest.mark.usefixtures("examples_alone")
 def test_commands_of_a_page_print_what_it_says(name, flexlink):
     if name == "c_code.md" and shutil.which("gcc") is None:
@@ -173,11 +175,11 @@ def test_every_key_of_a_configuration_has_a_meaning():
     assert "| **`amplitude_V`** | V |  | largest voltage |" in text
 
 
-# In CI two of four readers: the others run the same commands on more logs.
+# In CI one of four readers, who needs no program of his own: the others run commands of the README.
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=pytest.mark.slow if name in ("student", "lecturer") else pytest.mark.long)
+        pytest.param(name, marks=pytest.mark.slow if name == "student" else pytest.mark.long)
         for name in NOTEBOOKS
     ],
 )

@@ -122,7 +122,8 @@ GIVEN = {
         "comparison",
         "pictures",
         "tables",
-        pytest.param("causes", marks=pytest.mark.slow),
+        # A whole diagnosis, as the tutorial of the student is in CI.
+        pytest.param("causes", marks=pytest.mark.long),
     ],
 )
 def test_examples_run(module, monkeypatch):
