@@ -14,7 +14,7 @@ from workflow.tasks.records import make_records
 from workflow.tasks.stage import StageInput
 
 
-@pytest.mark.long
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_margins_of_a_measured_arm_stay(tmp_path, monkeypatch, flexlink_data):
     """In CI those of the default arm: `tests/workflow/test_readme.py`. Of all examples: `make frozen`."""
