@@ -190,8 +190,9 @@ Cases = Annotated[
         "beside logs of your own, or one that names a simulator's model; several give an overview as well."
     ),
 ]
+# A list, so that logs typed without --log are told so.
 SimulatorCaseFile = Annotated[
-    Path | None,
+    list[Path] | None,
     typer.Argument(help="TOML file that names a simulator's model and logs, in place of the options below."),
 ]
 # Any number: it is fixed so that results repeat.
@@ -661,13 +662,14 @@ def check(
 ) -> None:
     """What logs of a MuJoCo, FMU or Python model tell: their quality, smallest sizes that show, candidates
     that act alike, what a next record needs."""
-    cases = [] if case is None else [case]
-    stated = _of_simulator("check", cases, of_fields)
-    need(*cases)
+    stated = _of_simulator("check", case or [], of_fields)
+    need(*case or [])
+    if case and len(case) > 1:
+        raise InputError("check: expected one case file")
     from workflow.diagnose.check import check as look_at_case
     from workflow.diagnose.simulator_settings import settings_of
 
-    _show(look_at_case(case or settings_of(stated, "--log")), as_json)
+    _show(look_at_case(case[0] if case else settings_of(stated, "--log")), as_json)
 
 
 @app.command(short_help="Cause and size of a model error; how much of it is explained.")
