@@ -84,7 +84,7 @@ def test_a_run_for_which_there_is_no_room_at_all_leaves_nothing(tmp_path, monkey
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.usefixtures("undrawn")
 def test_a_study_goes_on(tmp_path, monkeypatch, continued):
     study = write_study(tmp_path, ONE_POINT)

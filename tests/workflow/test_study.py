@@ -289,7 +289,7 @@ def test_killed_study_resumes_with_identical_numbers_and_leaves_no_process(small
     assert_same_study(small_study[0], out)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_killed_worker_is_replaced(small_study, tmp_path):
     out = tmp_path / "out"
     process = start_flexlink("study", "--config", write_study(tmp_path), "--out", out, "--jobs", 2)

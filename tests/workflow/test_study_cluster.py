@@ -86,7 +86,7 @@ def finished_points(out: Path) -> int:
     return sum(1 for point in folders for _ in point.glob("stages/closed_loop.*"))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_lost_scheduler_is_one_line_and_the_study_goes_on_elsewhere(cluster, small_study, tmp_path):
     cluster.add_worker()
     study, call = far_study(tmp_path, cluster.address)
