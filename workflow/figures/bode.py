@@ -86,10 +86,15 @@ def draw_response(channel: ChannelView) -> Picture:
             if band.omega_rad_s[0] < mode.omega_rad_s < band.omega_rad_s[-1]:
                 style.tag_below(panel, mode.omega_rad_s, f"mode {number}")
     unit = style.plain(style.ratio_unit(channel.units[1], channel.units[0]), 24)
-    gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(_gain_floor(band.gain), 3 * band.gain.max()))
+    lowest_gain = _gain_floor(band.gain)
+    gain.set(yscale="log", ylabel=f"gain [{unit}]", ylim=(lowest_gain, 3 * band.gain.max()))
     phase.set(ylabel="phase [deg]")
-    phase.set(ylim=pad_limits(float(band.phase_deg.min()), float(band.phase_deg.max()), 0.15))
-    gain.set_title(f"{style.plain(identified.input, 26)} to {style.plain(identified.output, 26)}")
+    lowest_deg = float(band.phase_deg.min())
+    highest_deg = float(band.phase_deg.max())
+    phase.set(ylim=pad_limits(lowest_deg, highest_deg, 0.15))
+    input_name = style.plain(identified.input, 26)
+    output_name = style.plain(identified.output, 26)
+    gain.set_title(f"{input_name} to {output_name}")
     return picture
 
 
@@ -116,7 +121,9 @@ def draw_enlarged(panel: Panel, response: FrequencyUncertainty, quantity: str = 
     # Where the ellipse holds the origin the lower end of its gain is 0, which a log axis cannot show.
     if quantity == "gain{}":
         low = np.maximum(low, 1e-3 * centre)
-    label = f"{share(response.level)} band" + (f", enlarged {factor} times" if factor > 1 else "")
+    label = f"{share(response.level)} band"
+    if factor > 1:
+        label += f", enlarged {factor} times"
     panel.fill_between(band.omega_rad_s, low, high, **style.BAND, label=label)
     panel.plot(band.omega_rad_s, centre, **style.MODEL_LINE, label="identified response (centre)")
     panel.set(xscale="log", xlabel="frequency [rad/s]", xlim=(band.omega_rad_s[0], band.omega_rad_s[-1]))
@@ -167,12 +174,16 @@ def draw_bode(
         response = empirical.centre[shown]
         # It may have been taken at other frequencies altogether.
         if at.size:
-            index = extremes(at, np.abs(response), np.geomspace(omega[0], omega[-1], _PARTS))
+            parts = np.geomspace(omega[0], omega[-1], _PARTS)
+            index = extremes(at, np.abs(response), parts)
             at = at[index]
             response = response[index]
-        seen = y(np.maximum(np.abs(response), _gain_floor(band.gain, measured)))
+        lowest_gain = _gain_floor(band.gain, measured)
+        seen = y(np.maximum(np.abs(response), lowest_gain))
         gain.plot(x(at), seen, **_DOTS, label="records, no model", zorder=1)
-        phase.plot(x(at), degrees_near(response, np.interp(at, omega, band.phase_deg)), **_DOTS, zorder=1)
+        # A measured phase is known but for whole turns.
+        phase_deg = degrees_near(response, np.interp(at, omega, band.phase_deg))
+        phase.plot(x(at), phase_deg, **_DOTS, zorder=1)
     if model is not None:
         response = model.frequency_response(omega)
         gain.plot(x(omega), y(np.abs(response)), **_NOMINAL, label="nominal model")
@@ -192,7 +203,8 @@ def draw_bode(
     finite = relative[can_be_drawn]
     if finite.size:
         highest = max(_LEAST_TOP, 2 * float(finite.max()))
-        size.set(ylim=(10 ** np.floor(np.log10(finite.min())), highest))
+        lowest_decade = np.floor(np.log10(finite.min()))
+        size.set(ylim=(10**lowest_decade, highest))
     size.set(xlabel=phase.labels[X], ylabel="ellipse / gain [%]")
     phase.set(xlabel="")
     return picture
@@ -306,7 +318,8 @@ def _draw(
     at = x(band.omega_rad_s)
     floor = _gain_floor(band.gain, measured)
     if np.any(response.covariance):
-        gain.fill_between(at, y(np.maximum(band.gain_low, floor)), y(band.gain_high), **filled)
+        low = np.maximum(band.gain_low, floor)
+        gain.fill_between(at, y(low), y(band.gain_high), **filled)
         phase.fill_between(at, band.phase_low_deg, band.phase_high_deg, **filled)
     gain.plot(at, y(band.gain), **look)
     phase.plot(at, band.phase_deg, **look)
@@ -325,12 +338,16 @@ def _frame(
     """Scales and labels of gain and phase: absolute and rad/s, dB and Hz on the far sides, or one alone."""
     x, y = _units(dB, Hz)
     phases = np.concatenate([band.phase_deg for band in bands])
-    ends = [float(x(end)) for band in bands for end in (band.omega_rad_s[0], band.omega_rad_s[-1])]
-    gain.set(xscale="log", yscale="lin" if dB else "log", ylabel=f"gain [{'dB' if dB else unit}]")
-    phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{'Hz' if Hz else 'rad/s'}]")
+    lowest = float(x(min(band.omega_rad_s[0] for band in bands)))
+    highest = float(x(max(band.omega_rad_s[-1] for band in bands)))
+    gain_unit = "dB" if dB else unit
+    frequency_unit = "Hz" if Hz else "rad/s"
+    gain.set(xscale="log", yscale="lin" if dB else "log", ylabel=f"gain [{gain_unit}]")
+    phase.set(xscale="log", ylabel="phase [deg]", xlabel=f"frequency [{frequency_unit}]")
     for panel in (gain, phase):
-        panel.set(xlim=(min(ends), max(ends)))
-    gain.set(ylim=(float(y(min(_gain_floor(band.gain, measured) for band in bands))), None))
+        panel.set(xlim=(lowest, highest))
+    lowest_gain = min(_gain_floor(band.gain, measured) for band in bands)
+    gain.set(ylim=(float(y(lowest_gain)), None))
 
     # A number of the phase axis every quarter, half or whole turn, as many as fit.
     span = np.ptp(phases)
@@ -398,7 +415,9 @@ def draw_distortion(found: Sequence[Distortion], units: tuple[str, str]) -> Pict
                 dots: dict[str, Any] = {"ls": "none", "marker": marker, "ms": 3.5, "mew": 0.7}
                 panel.plot(lines.omega_rad_s, np.sqrt(lines.power), color=colour, label=label, **dots)
         panel.set(xscale="log", yscale="log")
-        panel.set_title(f"{levels.rms:.3g} {style.plain(units[0], 10)} rms".replace("  ", " "))
+        input_unit = style.plain(units[0], 10)
+        # Without a unit there are two blanks.
+        panel.set_title(f"{levels.rms:.3g} {input_unit} rms".replace("  ", " "))
         panel.hertz = True
         panel.set(xlabel="frequency [rad/s]")
     places[0].set(ylabel=f"level [{style.ratio_unit(units[1], units[0])}]")

@@ -39,7 +39,9 @@ def stroke(look: Look) -> str:
     dashes = look.get("ls", "-")
     pattern = dashes[1] if isinstance(dashes, tuple) else _DASHES.get(str(dashes), ())
     if pattern:
-        declarations.append("stroke-dasharray:" + " ".join(f"{width * part:.3g}" for part in pattern))
+        # Patterns are in widths of the line.
+        lengths = [f"{width * part:.3g}" for part in pattern]
+        declarations.append("stroke-dasharray:" + " ".join(lengths))
     elif look.get("solid_capstyle") != "butt":
         declarations.append("stroke-linecap:square")
     return ";".join(declarations + _opacity(look))
@@ -93,8 +95,11 @@ def _outline(kind: str, radius: float) -> str:
         radius = radius if kind == "o" else radius / 2
         return f"M{radius:g} 0A{radius:g} {radius:g} 0 1 1 {radius:g} -.001z"
     if kind == "*":
-        turn = -np.pi / 2 + np.pi / 5 * np.arange(10)
-        corners = np.where(np.arange(10) % 2, _STAR, 1.0) * np.exp(1j * turn)
+        # Ten corners from the top, every second one nearer to the middle.
+        number = np.arange(10)
+        turn = -np.pi / 2 + np.pi / 5 * number
+        radii = np.where(number % 2, _STAR, 1.0)
+        corners = radii * np.exp(1j * turn)
     elif kind == "P":
         # A cross of five squares: an arm's three outer edges, turned to all four sides.
         arm = np.array([-1 / 3 - 1j, 1 / 3 - 1j, 1 / 3 - 1j / 3])
@@ -112,4 +117,5 @@ def _outline(kind: str, radius: float) -> str:
     points = [f"{radius * corner.real:.3g} {radius * corner.imag:.3g}" for corner in corners]
     if kind == "x":
         return f"M{points[0]}L{points[1]}M{points[2]}L{points[3]}"
-    return "M" + "L".join(points) + ("" if kind in _OPEN else "z")
+    end = "" if kind in _OPEN else "z"
+    return "M" + "L".join(points) + end

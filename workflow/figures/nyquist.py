@@ -70,24 +70,29 @@ def draw_nyquist(
     ellipse = loop.ellipse()
     edges = centre[:, None] + ellipse.boundary(40)
     size = np.abs(centre)
-    distance = nearest_distance(
-        (-1.0 - centre) * np.conj(ellipse.direction), ellipse.semi_major, ellipse.semi_minor
-    )
+    # -1 as it lies in the axes of each ellipse.
+    critical_point = (-1.0 - centre) * np.conj(ellipse.direction)
+    distance = nearest_distance(critical_point, ellipse.semi_major, ellipse.semi_minor)
     nearest = int(np.argmin(distance))
 
     # The whole view holds all that the loop does after it first falls below 1, but no integrator.
     below = np.flatnonzero(size < 1)
-    reach = float(np.clip(1.25 * (size[below[0] :] if below.size else size).max(), 1.8, 6.0))
+    shown_size = size[below[0] :] if below.size else size
+    reach = float(np.clip(1.25 * shown_size.max(), 1.8, 6.0))
     real = imag = (-reach, reach)
     if near:
-        side = float(np.clip(1.35 * max(distance[nearest], modulus_margin, 0.35), 0.5, 1.3))
+        # What comes nearest to -1 fills most of the view, whichever of the three is largest.
+        widest = max(distance[nearest], modulus_margin, 0.35)
+        side = float(np.clip(1.35 * widest, 0.5, 1.3))
         real = (-1 - side, -1 + 1.25 * side)
         imag = (-1.12 * side, 1.12 * side)
 
     # Ellipses that are in view at least in part.
     low, high = np.array([real, imag]).T
     corners = np.stack([edges.real, edges.imag], axis=-1)
-    inside = np.all((corners.max(axis=1) > low) & (corners.min(axis=1) < high), axis=1)
+    begins_before_end = corners.min(axis=1) < high
+    ends_after_begin = corners.max(axis=1) > low
+    inside = np.all(ends_after_begin & begins_before_end, axis=1)
     panel.set(xlim=real, ylim=imag, equal=True)
     panel.set(xlabel="real part of K G [1]", ylabel="imaginary part of K G [1]")
     # The one nearest to -1 is always drawn, on top.
@@ -100,7 +105,8 @@ def draw_nyquist(
     if modulus_margin:
         label = "specification: keep out of here"
         panel.circle((-1.0, 0.0), modulus_margin, **style.LIMIT_LINE, label=label)
-        touch = edges[nearest, np.argmin(np.abs(edges[nearest] + 1))]
+        touching = np.argmin(np.abs(edges[nearest] + 1))
+        touch = edges[nearest, touching]
         label = f"nearest: {at_least(distance[nearest])} at {loop.omega_rad_s[nearest]:.4g} rad/s"
         panel.plot([-1, touch.real], [0, touch.imag], color=style.ACHIEVED, lw=1.2)
         panel.plot([touch.real], [touch.imag], marker="o", ms=6, color=style.ACHIEVED, ls="none", label=label)
@@ -114,15 +120,18 @@ def draw_nichols(panel: Panel, loop: FrequencyUncertainty) -> None:
     level = style.decibels(np.abs(loop.centre))
     edges = loop.centre[:, None] + loop.ellipse().boundary(40)
     shown = level > _LOWEST_DB
-    turned = phase[:, None] + np.degrees(
-        np.angle(edges / np.where(loop.centre == 0, 1.0, loop.centre)[:, None])
-    )
+    # The edge's phase is taken from its centre's: that one is unwrapped.
+    centre = np.where(loop.centre == 0, 1.0, loop.centre)
+    beside_centre = np.angle(edges / centre[:, None])
+    turned = phase[:, None] + np.degrees(beside_centre)
     panel.plot(phase, level, **style.PREDICTED_LINE, label="loop at the centres")
     panel.plot([-180], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
     ends = np.append(phase[shown], [-360.0, 0.0])
-    view: Any = {"xlim": (ends.min(), ends.max()), "ylim": (_LOWEST_DB, max(float(level.max()), 12.0))}
+    highest = max(float(level.max()), 12.0)
+    view: Any = {"xlim": (ends.min(), ends.max()), "ylim": (_LOWEST_DB, highest)}
     panel.set(**view)
-    _fill(panel, np.stack([turned, style.decibels(np.abs(edges))], axis=-1)[shown], loop.level)
+    outlines = np.stack([turned, style.decibels(np.abs(edges))], axis=-1)
+    _fill(panel, outlines[shown], loop.level)
     _closed_loop_grid(panel)
     panel.grid_lines = [False, False]
     panel.set(**view, xlabel="phase of K G [deg]", ylabel="gain of K G [dB]")
@@ -139,13 +148,17 @@ def _closed_loop_grid(panel: Panel) -> None:
     low, high = panel.y.limits()
     look: dict[str, Any] = {"color": "#d3d3d3", "ls": ":", "lw": 1.5, "zorder": 0}
     turn = np.radians(np.linspace(_GRID_PHASES_DEG[0], _GRID_PHASES_DEG[-1], 361))
-    gains = 10 ** (np.linspace(_GRID_GAINS_DB[0], _GRID_GAINS_DB[-1], 361) / 20)
+    gains_dB = np.linspace(_GRID_GAINS_DB[0], _GRID_GAINS_DB[-1], 361)
+    gains = 10 ** (gains_dB / 20)
     lines = [(f"{gain:g} dB", 10 ** (gain / 20) * np.exp(1j * turn), -1) for gain in _GRID_GAINS_DB]
     lines += [
         (f"{round(phase)}\N{DEGREE SIGN}", gains * np.exp(1j * np.radians(phase)), 0)
         for phase in _GRID_PHASES_DEG
     ]
-    for shift in 360.0 * np.arange(np.floor(left / 360) + 1, np.ceil(right / 360) + 1):
+    # The pattern repeats with every turn of the phase.
+    first_turn = np.floor(left / 360) + 1
+    last_turn = np.ceil(right / 360)
+    for shift in 360.0 * np.arange(first_turn, last_turn + 1):
         for words, closed, named in lines:
             open_loop = closed / (1 - closed)
             phase = -np.mod(-np.degrees(np.angle(open_loop)), 360.0) + shift
@@ -163,13 +176,16 @@ def _fill(panel: Panel, polygons: Real, level: float) -> None:
     """
     if not len(polygons):
         return
-    polygons = polygons[
-        np.linspace(0, len(polygons) - 1, min(len(polygons), _MOST_ELLIPSES)).round().astype(int)
-    ]
+    # More would cover each other, and make the page large.
+    count = min(len(polygons), _MOST_ELLIPSES)
+    chosen = np.linspace(0, len(polygons) - 1, count).round().astype(int)
+    polygons = polygons[chosen]
     look: Any = {"facecolor": style.UNCERTAIN, "edgecolor": style.MODEL, "lw": 0.4, "alpha": 0.2}
     # Two pixels are a hundredth of a panel's width.
-    wide = np.median(np.ptp(polygons, axis=1)[:, 0]) > 0.01 * np.ptp(panel.x.limits())
-    panel.fill(polygons, **look, label=f"{share(level)} ellipses" if wide else None)
+    widths = np.ptp(polygons, axis=1)[:, 0]
+    wide = np.median(widths) > 0.01 * np.ptp(panel.x.limits())
+    label = f"{share(level)} ellipses" if wide else None
+    panel.fill(polygons, **look, label=label)
 
 
 def _arrow(panel: Panel, centre: Complex, real: tuple[float, float], imag: tuple[float, float]) -> None:
@@ -179,7 +195,13 @@ def _arrow(panel: Panel, centre: Complex, real: tuple[float, float], imag: tuple
     in_width = (x > real[0]) & (x < real[1])
     in_height = (y > imag[0]) & (y < imag[1])
     seen = in_width & in_height
-    length = np.cumsum(np.where(seen[:-1] & seen[1:], np.abs(np.diff(centre)), 0.0))
+    # Length of the curve so far, as far as it is in view: the arrow stands a third along what is seen.
+    both_ends_seen = seen[:-1] & seen[1:]
+    steps = np.where(both_ends_seen, np.abs(np.diff(centre)), 0.0)
+    length = np.cumsum(steps)
     if length.size and length[-1] > 0:
-        k = min(int(np.searchsorted(length, 0.35 * length[-1])), centre.size - 2)
-        panel.arrow((float(x[k]), float(y[k])), (float(x[k + 1]), float(y[k + 1])), style.PREDICTED)
+        third_along = int(np.searchsorted(length, 0.35 * length[-1]))
+        k = min(third_along, centre.size - 2)
+        start = float(x[k]), float(y[k])
+        tip = float(x[k + 1]), float(y[k + 1])
+        panel.arrow(start, tip, style.PREDICTED)

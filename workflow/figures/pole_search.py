@@ -86,9 +86,12 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
             left.plot(seen[:, 0], seen[:, 1], **_DOTS, label=f"{seen.shape[0]} points the search tried")
     further_minima = []
     for i, j in surface.local_minima():
-        is_inside_grid = 0 < i < surface.first.size - 1 and 0 < j < surface.second.size - 1
+        is_inside_first = 0 < i < surface.first.size - 1
+        is_inside_second = 0 < j < surface.second.size - 1
+        is_inside_grid = is_inside_first and is_inside_second
         # The pair's own minimum is no grid point.
-        is_another = abs(np.log(surface.first[i] / surface.pole[0])) > 0.2
+        ratio = surface.first[i] / surface.pole[0]
+        is_another = abs(np.log(ratio)) > 0.2
         if is_inside_grid and is_another:
             further_minima.append((i, j))
     if further_minima:
@@ -146,7 +149,8 @@ def colour_bar(panel: Panel, levels: Real) -> None:
 def _shade(share: float) -> str:
     """The colour of a share of the surface's height: 0 its floor, 1 its top."""
     place = share * (len(_CIVIDIS) - 1)
-    channels = [round(float(np.interp(place, np.arange(len(_CIVIDIS)), column))) for column in _CIVIDIS.T]
+    steps = np.arange(len(_CIVIDIS))
+    channels = [round(float(np.interp(place, steps, column))) for column in _CIVIDIS.T]
     return "#" + "".join(f"{value:02x}" for value in channels)
 
 
@@ -160,19 +164,26 @@ def _surface(channel: ChannelView, pair: int) -> ErrorSurface:
     dt_s = identification.model.dt_s
     omega = float(poles.omega_rad_s(dt_s)[pair])
     zeta = float(poles.zeta()[pair])
-    low = min(max(omega / 8, 2 * np.pi / channel.found.longest_s), 0.8 * omega)
-    high = max(min(8 * omega, 0.95 * np.pi / dt_s), 1.02 * omega)
+    # Three octaves to each side, as far as records and sampling tell a frequency; the pair stays inside.
+    slowest_told = 2 * np.pi / channel.found.longest_s
+    fastest_told = 0.95 * np.pi / dt_s
+    low = min(max(omega / 8, slowest_told), 0.8 * omega)
+    high = max(min(8 * omega, fastest_told), 1.02 * omega)
     wide = np.geomspace(low, high, 30)
     # The valley of a lightly damped pair is as narrow as its damping: even steps would jump over it.
-    near = omega * np.exp(zeta * np.sinh(np.linspace(-3.0, 3.0, 21)))
+    dampings_away = np.sinh(np.linspace(-3.0, 3.0, 21))
+    near = omega * np.exp(zeta * dampings_away)
     is_between = (near > low) & (near < high)
+    frequencies = np.concatenate([wide, near[is_between]])
+    least_zeta = min(1e-3, zeta / 3)
+    largest_zeta = max(0.7, min(0.97, 1.1 * zeta))
     return error_surface(
         channel.found.used,
         identification.model,
         identification.structure,
         pair=pair,
-        first=np.unique(np.concatenate([wide, near[is_between]])),
-        second=np.geomspace(min(1e-3, zeta / 3), max(0.7, min(0.97, 1.1 * zeta)), 24),
+        first=np.unique(frequencies),
+        second=np.geomspace(least_zeta, largest_zeta, 24),
     )
 
 
@@ -186,7 +197,8 @@ def searched_pairs(stages: Sequence[SearchStage], omega_rad_s: float) -> Real:
         for column, name in enumerate(stage.coordinate_names):
             if name.startswith("log10(omega"):
                 points = 10.0 ** stage.points[:, [column, column + 1]]
-                away = abs(float(np.log(points[int(np.argmin(stage.log_cost)), 0] / omega_rad_s)))
+                best = int(np.argmin(stage.log_cost))
+                away = abs(float(np.log(points[best, 0] / omega_rad_s)))
                 nearest = min(nearest, (away, points), key=lambda entry: entry[0])
     return nearest[1]
 
@@ -231,9 +243,12 @@ def _criterion(panel: Panel, steps: Sequence[OrderStep], chosen: tuple[int, int]
     mine = [k for k, step in enumerate(steps) if (step.n_real, step.n_pairs) == chosen]
     if mine:
         label = f"the model: {chosen[0]} real, {chosen[1]} pairs"
-        panel.plot(order[mine], above[mine], **style.STAR | {"ms": 14, "mew": 0.7}, label=label)
+        star = style.STAR | {"ms": 14, "mew": 0.7}
+        panel.plot(order[mine], above[mine], **star, label=label)
     panel.set(yscale=_LINEAR)
-    panel.set(ylim=(-0.15 * _LINEAR, max(2.5 * above.max(), 1.5 * _LINEAR)))
+    # The scale is linear up to `_LINEAR`: as much again is shown where all orders lie below.
+    highest = max(2.5 * above.max(), 1.5 * _LINEAR)
+    panel.set(ylim=(-0.15 * _LINEAR, highest))
     panel.set(xlim=(order.min() - 0.6, order.max() + 0.6))
     panel.x.whole = True
     panel.set(xlabel="searched poles [1]", ylabel="criterion above the best [1]")
@@ -254,9 +269,10 @@ def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncerta
         log = np.log(gain[is_positive])
         low = np.percentile(log, 1)
         high = log.max()
+        height = np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0)
         panel.plot(
             seen,
-            0.03 + 0.94 * np.clip((log - low) / max(high - low, 1e-12), 0.0, 1.0),
+            0.03 + 0.94 * height,
             across=True,
             color=style.MEASURED,
             lw=0.8,
@@ -279,7 +295,8 @@ def _stabilisation(panel: Panel, plot: Stabilisation, response: FrequencyUncerta
                 omega[here], count[here], ls="none", marker=marker, ms=size, mfc=face, mec=edge, label=label
             )
     panel.axhline(plot.chosen, color=style.HIGHLIGHT, lw=5, alpha=0.35, label="number of pairs in the model")
-    panel.set(ylim=(-0.4, max(plot.rss.size - 1, 1) + 0.6))
+    most_pairs = max(plot.rss.size - 1, 1)
+    panel.set(ylim=(-0.4, most_pairs + 0.6))
     panel.y.whole = True
     if response is None and omega.size:
         panel.set(xlim=(omega.min() / 1.5, omega.max() * 1.5))

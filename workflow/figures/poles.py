@@ -51,7 +51,9 @@ def draw_poles(
     whole, near = panels
     corner = _near_corner(poles)
     whole.set(xlim=(-1.1, 1.1), ylim=(-1.1, 1.1))
-    near.set(xlim=(1 - corner, 1 + 0.12 * corner), ylim=(-0.12 * corner, corner))
+    # The axes pass through z = 1, near the edge of the enlarged view.
+    margin = 0.12 * corner
+    near.set(xlim=(1 - corner, 1 + margin), ylim=(-margin, corner))
     turn = np.exp(1j * np.linspace(0, 2 * np.pi, 361))
     for panel in panels:
         panel.set(equal=True, xlabel="real part of z [1]", ylabel="imaginary part of z [1]")
@@ -88,12 +90,19 @@ def _areas(intervals: Intervals, dt_s: float) -> list[Complex]:
             (w0, w1) = mode.omega_rad_s
             (d0, d1) = mode.damping
             # Round the rectangle of frequency and damping, side by side.
-            omega = np.concatenate([w0 + along * (w1 - w0), w1 * ones, w1 - along * (w1 - w0), w0 * ones])
-            zeta = np.concatenate([d0 * ones, d0 + along * (d1 - d0), d1 * ones, d1 - along * (d1 - d0)])
-            upper = np.exp((-zeta + 1j * np.sqrt(np.maximum(1 - zeta**2, 0.0))) * omega * dt_s)
+            omega_up = w0 + along * (w1 - w0)
+            omega_down = w1 - along * (w1 - w0)
+            zeta_up = d0 + along * (d1 - d0)
+            zeta_down = d1 - along * (d1 - d0)
+            omega = np.concatenate([omega_up, w1 * ones, omega_down, w0 * ones])
+            zeta = np.concatenate([d0 * ones, zeta_up, d1 * ones, zeta_down])
+            # An interval of the damping may reach beyond 1, where a pair is two real poles.
+            turned = np.sqrt(np.maximum(1 - zeta**2, 0.0))
+            upper = np.exp((-zeta + 1j * turned) * omega * dt_s)
             outlines += [upper, upper.conj()]
     real = [np.exp(-np.array(ends) * dt_s) for ends in intervals.real_poles_per_s]
-    return outlines + [ends.astype(np.complex128) for ends in real if np.all(np.isfinite(ends))]
+    finite = [ends for ends in real if np.all(np.isfinite(ends))]
+    return outlines + [ends.astype(np.complex128) for ends in finite]
 
 
 def _near_corner(poles: Complex) -> float:
@@ -122,9 +131,15 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
     left, right = panel.x.limits()
     low, high = panel.y.limits()
     # The largest frequency in view decides which frequencies are round ones here.
-    corner = np.array([complex(x, y) for x in (left, (left + right) / 2) for y in (low, high) if x or y])
-    inside = np.where(np.abs(corner) < 1, corner, corner / np.maximum(np.abs(corner), 1e-12))
-    reach = min(fastest, float(np.max(np.abs(np.log(inside + 1e-12)))) / dt_s)
+    middle = (left + right) / 2
+    corners = [complex(x, y) for x in (left, middle) for y in (low, high) if x or y]
+    corner = np.array(corners)
+    # Poles outside the circle have no such lines: the corner is taken back to the circle.
+    distance = np.abs(corner)
+    inside = np.where(distance < 1, corner, corner / np.maximum(distance, 1e-12))
+    # Of a pole z, |log z| / dt is its frequency; the offset keeps z = 0 finite.
+    fastest_seen = np.max(np.abs(np.log(inside + 1e-12))) / dt_s
+    reach = min(fastest, float(fastest_seen))
     rounds = linear_ticks(0.0, reach, 5, (1.0, 2.0, 5.0, 10.0)).places[1:4]
     look: dict[str, Any] = {"color": "#b5b5b5", "lw": 0.7}
 
@@ -134,11 +149,13 @@ def _grid(panel: Panel, dt_s: float, *, named: bool) -> None:
         turned = np.sqrt(1 - damping**2)
         # Up to the negative real axis.
         omega = fastest / turned * along
-        lines.append((np.exp((-damping + 1j * turned) * omega * dt_s), "--", f"{damping:g}"))
+        line = np.exp((-damping + 1j * turned) * omega * dt_s)
+        lines.append((line, "--", f"{damping:g}"))
     for omega in rounds:
         not_decayed = along * omega * dt_s <= _DECAYED
         damping = along[not_decayed]
-        pole = omega * dt_s * (-damping + 1j * np.sqrt(1 - damping**2))
+        turned = np.sqrt(1 - damping**2)
+        pole = omega * dt_s * (-damping + 1j * turned)
         # Beyond the Nyquist frequency a line would come back from below the real axis.
         below_nyquist = pole.imag <= np.pi
         lines.append((np.exp(pole[below_nyquist]), ":", f"{omega:.4g} rad/s"))

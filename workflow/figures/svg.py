@@ -192,8 +192,10 @@ class Drawn:
 
 def text_width(text: str, size: float, *, bold: bool = False) -> float:
     """Length [pt] of the longest line of a text."""
-    longest = max((sum(map(_letter, line)) for line in text.split("\n")), default=0.0)
-    return longest * size * (_BOLD if bold else 1.0)
+    lengths = [sum(map(_letter, line)) for line in text.split("\n")]
+    longest = max(lengths, default=0.0)
+    boldness = _BOLD if bold else 1.0
+    return longest * size * boldness
 
 
 @lru_cache(maxsize=1000)
@@ -259,7 +261,8 @@ class _Frame:
         if self.panel.y.kind != "lin":
             return thinned(points, _UNSEEN_LOG)
         points = thinned(points, _UNSEEN)
-        return np.column_stack([points[:, X], np.round(points[:, Y], 1)])
+        rounded_y = np.round(points[:, Y], 1)
+        return np.column_stack([points[:, X], rounded_y])
 
     def number_room(self, which: int) -> float:
         """Room for the marks and numbers of an axis [pt]."""
@@ -275,7 +278,10 @@ class _Frame:
     def label_room(self) -> float:
         """Room for the label of the y axis, beside the numbers [pt]."""
         label = self.panel.labels[Y]
-        return _TO_LABEL + _lines(label) * self.panel.label_size[Y] * _LINE if label else 0.0
+        if not label:
+            return 0.0
+        height = _lines(label) * self.panel.label_size[Y] * _LINE
+        return _TO_LABEL + height
 
     def above(self) -> float:
         """Height of what stands over the panel, but for its title [pt]."""
@@ -303,31 +309,40 @@ class _Frame:
         # The first and the last number of x reach beyond the panel by half of their width.
         if self.numbered[X] and self.x.words:
             places = self.place(X, self.x.places)
-            half = np.array([text_width(word, panel.tick_size[X]) / 2 for word in self.x.words])
-            right = max(right, float(np.max(places + half - self.box[2])))
-            left = max(left, float(np.max(self.box[0] - places + half)))
+            size = panel.tick_size[X]
+            half = np.array([text_width(word, size) / 2 for word in self.x.words])
+            beyond_right = np.max(places + half - self.box[2])
+            beyond_left = np.max(self.box[0] - places + half)
+            right = max(right, float(beyond_right))
+            left = max(left, float(beyond_left))
         for mark in panel.marks:
             if isinstance(mark, Words) and not mark.clipped:
                 x, y = self.anchor(mark)
                 if not self.box[0] <= x <= self.box[2]:
                     continue
                 if mark.horizontal == "left":
-                    right = max(right, x + text_width(mark.text, mark.size) - self.box[2])
+                    end = x + text_width(mark.text, mark.size)
+                    right = max(right, end - self.box[2])
                 top = max(top, self.box[1] - y + mark.size)
         return np.array([left, top, right, bottom])
 
     def anchor(self, words: Words) -> tuple[float, float]:
         """Where words stand [pt]."""
         x = self.box[0] + words.x * self.width if words.across_x else float(self.place(X, words.x))
+        # A box is measured downwards, words across it upwards.
         y = self.box[3] - words.y * self.height if words.across_y else float(self.place(Y, words.y))
-        return x + words.offset[0], y - words.offset[1]
+        right, up = words.offset
+        return x + right, y - up
 
     def reach(self) -> tuple[float, float]:
         """From where to where its words reach [pt], its title included."""
         left, _, right, _ = self.around()
         panel = self.panel
-        title = self.box[0] + text_width(self.title, panel.title_size, bold=panel.title_bold)
-        return float(self.box[0] - left - self.label_room()), max(float(self.box[2] + right), title)
+        title_width = text_width(self.title, panel.title_size, bold=panel.title_bold)
+        title_end = self.box[0] + title_width
+        outer_left = self.box[0] - left - self.label_room()
+        outer_right = float(self.box[2] + right)
+        return float(outer_left), max(outer_right, title_end)
 
 
 def _lines(text: str) -> int:
@@ -373,11 +388,16 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
     for _ in range(_MOST_LAYOUTS):
         room_x = pad[X, :columns]
         room_y = pad[Y, :rows]
-        x = _edges(before[X, :columns] + room_x, after[X, :columns] + room_x, picture.width_ratios, width)
-        y = _edges(before[Y, :rows] + room_y, after[Y, :rows] + room_y, picture.height_ratios, height)
-        frames = [
-            _framed(picture, panel, x[:, panel.place[1]], y[:, panel.place[0]]) for panel in picture.panels
-        ]
+        first_x = before[X, :columns] + room_x
+        last_x = after[X, :columns] + room_x
+        first_y = before[Y, :rows] + room_y
+        last_y = after[Y, :rows] + room_y
+        x = _edges(first_x, last_x, picture.width_ratios, width)
+        y = _edges(first_y, last_y, picture.height_ratios, height)
+        frames = []
+        for panel in picture.panels:
+            row, column = panel.place
+            frames.append(_framed(picture, panel, x[:, column], y[:, row]))
         known = np.concatenate([before, after])
         before[:] = 0.0
         after[:] = 0.0
@@ -393,15 +413,21 @@ def _laid_out(picture: Picture, height: float) -> list[_Frame]:
             labels[column] = max(labels[column], frame.label_room())
         before[X, :columns] += labels
         # Words that stand at a place in the data need another room at every size of their panel.
-        if np.max(np.abs(np.concatenate([before, after]) - known)) < _SAME_ROOM:
+        change = np.concatenate([before, after]) - known
+        if np.max(np.abs(change)) < _SAME_ROOM:
             break
     return frames
 
 
 def _edges(before: Real, after: Real, ratios: Any, total: float) -> Real:
     """Begin and end (2, N) of each column or row, without the room before and after it."""
-    sizes = np.asarray(ratios) / np.sum(ratios) * max(total - before.sum() - after.sum(), 1.0)
-    starts = np.cumsum(before + np.append(0.0, (sizes + after)[:-1]))
+    # Where the words alone fill the picture, a point is left: a panel of no size has no scale.
+    left_over = max(total - before.sum() - after.sum(), 1.0)
+    shares = np.asarray(ratios) / np.sum(ratios)
+    sizes = shares * left_over
+    # Each column begins where the last one and the room after it end.
+    behind = np.append(0.0, (sizes + after)[:-1])
+    starts = np.cumsum(before + behind)
     return np.array([starts, starts + sizes])
 
 
@@ -411,35 +437,38 @@ def _framed(picture: Picture, panel: Panel, x: Real, y: Real) -> _Frame:
     if panel.equal:
         # A unit is as long in x as in y: the box shrinks around its middle.
         spans = np.abs([np.ptp(panel.x.limits()), np.ptp(panel.y.limits())])
-        scale = min((x[1] - x[0]) / spans[X], (y[1] - y[0]) / spans[Y])
+        width = x[1] - x[0]
+        height = y[1] - y[0]
+        scale = min(width / spans[X], height / spans[Y])
         half = scale * spans / 2
         middle = np.array([x.mean(), y.mean()])
         box = np.concatenate([middle - half, middle + half])
     along = box[2] - box[0]
     up = box[3] - box[1]
     size = panel.tick_size
-    y_ticks = ticks_of(panel.y, int(np.clip(up / (2 * size[Y]), 1, _MOST_NUMBERS)))
+    fitting_y = up / (2 * size[Y])
+    y_ticks = ticks_of(panel.y, int(np.clip(fitting_y, 1, _MOST_NUMBERS)))
+    width_pt = picture.width_in * POINT
     if panel.y.named is not None:
-        longest = _LONGEST_NAME * picture.width_in * POINT
+        longest = _LONGEST_NAME * width_pt
         words = [_wrapped(word, size[Y], longest) for word in y_ticks.words]
         y_ticks = replace(y_ticks, words=words)
+    # A title may run from its panel's left edge to the picture's right one, a label over the whole picture.
+    title_room = width_pt - float(box[0]) - _PAD
+    label_room = width_pt - 2 * _PAD
     frame = _Frame(
         panel,
         box,
         _fitting(panel.x, float(along), size[X]),
         y_ticks,
         numbered=(picture.numbered(panel, X), picture.numbered(panel, Y)),
-        title=_wrapped(
-            panel.title,
-            panel.title_size,
-            picture.width_in * POINT - float(box[0]) - _PAD,
-            bold=panel.title_bold,
-        ),
-        x_label=_wrapped(panel.labels[X], panel.label_size[X], picture.width_in * POINT - 2 * _PAD),
+        title=_wrapped(panel.title, panel.title_size, title_room, bold=panel.title_bold),
+        x_label=_wrapped(panel.labels[X], panel.label_size[X], label_room),
     )
     if panel.hertz:
         low, high = np.array(panel.x.limits()) / (2 * np.pi)
-        frame.hertz = log_ticks(float(low), float(high), int(np.clip(along / _HERTZ_PT, 1, _MOST_NUMBERS)))
+        fitting = int(np.clip(along / _HERTZ_PT, 1, _MOST_NUMBERS))
+        frame.hertz = log_ticks(float(low), float(high), fitting)
     if panel.decibel:
         low, high = 20 * np.log10(panel.y.limits())
         frame.decibel = linear_ticks(float(low), float(high), MOST_DECIBELS, DECIBEL_STEPS)
@@ -478,7 +507,8 @@ def _joined(hundredths: list[int]) -> str:
 
 
 def _hundredths(points: Real) -> Any:
-    places = np.rint(points * np.array([10.0, 100.0])).astype(np.int64)
+    steps_per_pt = np.array([10.0, 100.0])
+    places = np.rint(points * steps_per_pt).astype(np.int64)
     places[:, 0] *= 10
     return places
 
@@ -498,13 +528,17 @@ def _lines_of(points: Real, box: Real) -> Iterator[Real]:
     """Parts of a line (N, 2) that are seen in a box (left, top, right, bottom), between points that are no
     numbers."""
     with np.errstate(invalid="ignore"):
-        past_side: Any = np.concatenate([points < box[:2] - _EDGE, points > box[2:] + _EDGE], axis=1)
+        before_box = points < box[:2] - _EDGE
+        after_box = points > box[2:] + _EDGE
+    past_side: Any = np.concatenate([before_box, after_box], axis=1)
     # A step whose ends lie beyond the same side is not in the box.
     outside: Any = np.any(past_side[1:] & past_side[:-1], axis=1)
     drawn_steps = ~outside
     finite: Any = np.isfinite(points).all(axis=1)
     drawn_steps &= finite[1:] & finite[:-1]
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], drawn_steps, [False]]).astype(int)))
+    # Begin and end of each run of steps that are drawn: where the flag changes.
+    flags = np.concatenate([[False], drawn_steps, [False]]).astype(int)
+    edges = np.flatnonzero(np.diff(flags))
     for first, last in edges.reshape(-1, 2):
         yield points[first : last + 1]
 
@@ -526,7 +560,8 @@ def thinned(points: Real, unseen: float = _UNSEEN) -> Real:
         length = np.hypot(*way.T)
         off = points[middle] - before
         with np.errstate(divide="ignore", invalid="ignore"):
-            beside = np.abs(way[:, 0] * off[:, 1] - way[:, 1] * off[:, 0]) / length
+            cross = way[:, 0] * off[:, 1] - way[:, 1] * off[:, 0]
+            beside = np.abs(cross) / length
             along = np.sum(way * off, axis=1) / length**2
         straight = (beside < unseen) & (along >= 0) & (along <= 1)
         if not straight.any():
@@ -544,14 +579,19 @@ def _four_a_pixel(points: Real) -> Real:
     only go to the right, or has few points, comes back as it is.
     """
     x, y = points.T
-    if x.size < 5 or np.any(np.diff(x) < 0) or x[-1] - x[0] > x.size / 4 * _PIXEL:
+    goes_back = np.any(np.diff(x) < 0)
+    # Fewer than four points a pixel: there is nothing to leave out.
+    most_pt = x.size / 4 * _PIXEL
+    if x.size < 5 or goes_back or x[-1] - x[0] > most_pt:
         return points
     pixel = np.floor(x / _PIXEL).astype(np.int64)
     firsts = np.flatnonzero(np.diff(pixel, prepend=pixel[0] - 1))
     lasts = np.append(firsts[1:], x.size) - 1
     # Sorted by pixel, then by value.
     order = np.lexsort((y, pixel))
-    chosen = np.unique(np.concatenate([firsts, lasts, order[firsts], order[lasts]]))
+    lowest = order[firsts]
+    highest = order[lasts]
+    chosen = np.unique(np.concatenate([firsts, lasts, lowest, highest]))
     return np.asarray(points[chosen])
 
 
@@ -561,7 +601,9 @@ def _many(parts: list[Real], *, closed: bool = False) -> str:
     end = (0, 0)
     for part in parts:
         texts.append(path_of(part, closed=closed, start=end))
-        last = _hundredths(part[:1] if closed else part[-1:])[0]
+        # A closed path ends where it began.
+        end_point = part[:1] if closed else part[-1:]
+        last = _hundredths(end_point)[0]
         end = int(last[0]), int(last[1])
     return "".join(texts)
 
@@ -569,7 +611,9 @@ def _many(parts: list[Real], *, closed: bool = False) -> str:
 def _held(points: Real) -> Real:
     """Points (N, 2) of a signal that holds each value until the next."""
     held = np.repeat(points, 2, axis=0)
-    return np.column_stack([held[1:, 0], held[:-1, 1]])
+    next_x = held[1:, 0]
+    value_until_then = held[:-1, 1]
+    return np.column_stack([next_x, value_until_then])
 
 
 # -- groups
@@ -617,9 +661,10 @@ class _Writer:
         self.classes = classes
         self.markers: dict[tuple[str, str], str] = {}
         self.entries = entries
-        self.entry_of_look = {
-            looks.key(mark): k for k, mark in reversed(list(enumerate(self.entries.values())))
-        }
+        # Of two entries with one look the first one stands for it.
+        self.entry_of_look: dict[Any, int] = {}
+        for number_of_entry, mark in enumerate(self.entries.values()):
+            self.entry_of_look.setdefault(looks.key(mark), number_of_entry)
         self.entry_of_label = {label: k for k, label in enumerate(self.entries)}
 
     def named(self, look: str) -> str:
@@ -630,9 +675,11 @@ class _Writer:
         """The group of a panel, its second axes not included."""
         clip = f"f{self.number}-c{place}"
         self.written[id(frame.panel)] = _Place(clip, frame.box)
+        # Left and top, right and top, right and bottom, left and bottom.
         corners = frame.box[[0, 1, 2, 1, 2, 3, 0, 3]].reshape(4, 2)
+        outline = path_of(corners, closed=True)
         parts = [
-            f'<clipPath id="{clip}"><path d="{path_of(corners, closed=True)}"/></clipPath>',
+            f'<clipPath id="{clip}"><path d="{outline}"/></clipPath>',
             self.axis(frame, X),
             self.axis(frame, Y),
         ]
@@ -673,19 +720,25 @@ class _Writer:
         moving = "".join(stretched)
         whole = self.whole.get(id(frame.panel))
         if moving and whole is not None:
-            moving = f'<use href="#{whole.name}-{k}" transform="{_stretch(whole.box, frame.box)}"/>'
+            stretch = _stretch(whole.box, frame.box)
+            moving = f'<use href="#{whole.name}-{k}" transform="{stretch}"/>'
         elif moving and self.shows_again:
             moving = f'<g id="{clip}-{k}" class="v">{moving}</g>'
         if moving:
             moving = f'<g class="m">{moving}</g>'
-        return f'<g class="{name}" clip-path="url(#{clip})">{moving}{"".join(dots)}</g>'
+        still = "".join(dots)
+        return f'<g class="{name}" clip-path="url(#{clip})">{moving}{still}</g>'
 
     def area(self, mark: Area, frame: _Frame) -> list[str]:
         """Paths of the outlines that are large enough to be seen."""
         shapes = []
         for outline in mark.outlines:
-            points = np.column_stack([frame.place(X, outline[:, X]), frame.place(Y, outline[:, Y])])
-            if len(points) and np.isfinite(points).all() and np.ptp(points, axis=0).max() > _SPECK:
+            x = frame.place(X, outline[:, X])
+            y = frame.place(Y, outline[:, Y])
+            points = np.column_stack([x, y])
+            is_finite = np.isfinite(points).all()
+            # A speck that nobody can see costs as many bytes as a large shape.
+            if len(points) and is_finite and np.ptp(points, axis=0).max() > _SPECK:
                 shapes.append(frame.written(points))
         if not shapes:
             return []
@@ -696,14 +749,17 @@ class _Writer:
 
     def curve(self, mark: Curve, frame: _Frame) -> tuple[list[str], list[str]]:
         """Paths of the line, and of the markers."""
+        x = frame.place(X, mark.x)
         y = frame.box[3] - mark.y * frame.height if mark.across else frame.place(Y, mark.y)
-        points = np.column_stack([frame.place(X, mark.x), y])
+        points = np.column_stack([x, y])
         lines: list[str] = []
         if looks.is_line(mark.look):
             seen = _held(points) if mark.look.get("drawstyle") == "steps-post" else points
-            path = _many([frame.written(part) for part in _lines_of(seen, frame.box)])
+            parts = [frame.written(part) for part in _lines_of(seen, frame.box)]
+            path = _many(parts)
             if path:
-                lines = [f'<path class="{self.named(looks.stroke(mark.look))}" d="{path}"/>']
+                look = self.named(looks.stroke(mark.look))
+                lines = [f'<path class="{look}" d="{path}"/>']
         dots = []
         if mark.look.get("marker"):
             places = points[np.isfinite(points).all(axis=1)]
@@ -719,7 +775,9 @@ class _Writer:
     def marker(self, look: Mapping[str, Any]) -> str:
         """The id of a marker."""
         style, outline = looks.marker(look)
-        return self.markers.setdefault((self.named(style), outline), f"f{self.number}-m{len(self.markers)}")
+        kind = (self.named(style), outline)
+        new_id = f"f{self.number}-m{len(self.markers)}"
+        return self.markers.setdefault(kind, new_id)
 
     def definitions(self) -> str:
         """Markers of the picture."""
@@ -732,14 +790,22 @@ class _Writer:
 
     def across(self, mark: Rule | Span, frame: _Frame) -> str:
         """A line or a strip from edge to edge."""
-        ends = np.array([mark.at] if isinstance(mark, Rule) else [mark.low, mark.high])
+        ends = np.array([mark.at]) if isinstance(mark, Rule) else np.array([mark.low, mark.high])
         places = frame.place(mark.axis, ends)
-        along = frame.box[[0, 2]] if mark.axis == Y else frame.box[[1, 3]]
-        corners = [(a, b) for b, sides in zip(places, (along, along[::-1]), strict=False) for a in sides]
-        points = np.array([(b, a) if mark.axis == X else (a, b) for a, b in corners])
+        left, top, right, bottom = frame.box
+        along = (left, right) if mark.axis == Y else (top, bottom)
+        # The second edge of a strip runs backwards, so that its outline goes round.
+        corners = []
+        for place, sides in zip(places, (along, along[::-1]), strict=False):
+            for side in sides:
+                corner = (place, side) if mark.axis == X else (side, place)
+                corners.append(corner)
+        points = np.array(corners)
         if isinstance(mark, Rule):
-            return f'<path class="{self.named(looks.stroke(mark.look))}" d="{path_of(points)}"/>'
-        return f'<path class="{self.named(looks.filling(mark.look))}" d="{path_of(points, closed=True)}"/>'
+            look = self.named(looks.stroke(mark.look))
+            return f'<path class="{look}" d="{path_of(points)}"/>'
+        look = self.named(looks.filling(mark.look))
+        return f'<path class="{look}" d="{path_of(points, closed=True)}"/>'
 
     def words(self, mark: Words, frame: _Frame) -> str:
         """Words at their place; "" where that is out of view and they are not to be drawn there."""
@@ -750,7 +816,8 @@ class _Writer:
         if mark.clipped and not (left <= x <= right and top <= y <= bottom):
             return ""
         side = mark.horizontal
-        if mark.clipped and side == "left" and x + text_width(mark.text, mark.size) > right:
+        end = x + text_width(mark.text, mark.size)
+        if mark.clipped and side == "left" and end > right:
             # Where there is no room to the right of a line, to its left.
             x -= 2 * mark.offset[0]
             side = "right"
@@ -776,7 +843,8 @@ class _Writer:
             return ""
         ahead = way / length
         beside = np.array([-ahead[1], ahead[0]])
-        corners = np.array([tip, tip - 8 * ahead + 3.4 * beside, tip - 8 * ahead - 3.4 * beside])
+        foot = tip - 8 * ahead
+        corners = np.array([tip, foot + 3.4 * beside, foot - 3.4 * beside])
         look = self.named(f"fill:{mark.color}")
         path = path_of(corners, closed=True)
         return f'<g class="d" clip-path="url(#{clip})"><g class="m"><path class="{look}" d="{path}"/></g></g>'
@@ -802,17 +870,19 @@ class _Writer:
         beside = edge + outwards * _TO_NUMBERS
         for values, long, name in ((places, _MARK, "tk"), (minor, _SMALL_MARK, "tn")):
             if values.size:
-                parts.append(
-                    f'<path class="{name}" d="{_strokes(values, which, edge, edge + outwards * long)}"/>'
-                )
+                strokes = _strokes(values, which, edge, edge + outwards * long)
+                parts.append(f'<path class="{name}" d="{strokes}"/>')
         size = panel.tick_size[which]
         look = "" if size == 9 else self.named(f"font-size:{size:g}px;fill:#333")
         if frame.numbered[which]:
+            below = bottom + _TO_NUMBERS + _ASCENT * size
             for place, word in zip(places, ticks.words, strict=True):
                 if which == X:
-                    parts.append(_text(word, place, bottom + _TO_NUMBERS + _ASCENT * size, look, size=size))
+                    parts.append(_text(word, place, below, look, size=size))
                 else:
-                    foot = place + (0.36 - (_lines(word) - 1) * _LINE / 2) * size
+                    # Digits are .72 of their size high. Further lines move the first up by half their room.
+                    further_lines = _lines(word) - 1
+                    foot = place + (0.36 - further_lines * _LINE / 2) * size
                     parts.append(_text(word, beside, foot, look, size=size))
         group = f'<g class="{"xy"[which]} {side}">{"".join(parts)}</g>'
         if ticks.power and frame.numbered[which]:
@@ -834,29 +904,38 @@ class _Writer:
             return group + _text(frame.x_label, middle, foot, look, "center", letters)
         # Labels of a column stand under each other: beside the widest numbers of all its panels.
         outer = left - self.number_rooms[panel.place[1]] - _TO_LABEL
-        foot = outer - 0.24 * letters - (_lines(label) - 1) * letters * _LINE
-        return group + _turned(label, foot, (top + bottom) / 2, look, letters)
+        further_lines = _lines(label) - 1
+        foot = outer - 0.24 * letters - further_lines * letters * _LINE
+        middle = (top + bottom) / 2
+        return group + _turned(label, foot, middle, look, letters)
 
     def second(self, frame: _Frame, which: int, place: int) -> str:
         """A second axis: Hz above, dB on the right."""
         ticks = frame.decibel if which else frame.hertz
         assert ticks is not None
         left, top, right, bottom = frame.box
-        values = 10 ** (ticks.places / 20) if which else ticks.places * 2 * np.pi
+        # Marks stand at round values of the other unit: Hz where the axis has rad/s, dB for a gain.
+        if which:
+            values = 10 ** (ticks.places / 20)
+            minor_values = 10 ** (ticks.minor / 20)
+            edge, outwards = right, 1
+        else:
+            values = ticks.places * 2 * np.pi
+            minor_values = ticks.minor * 2 * np.pi
+            edge, outwards = top, -1
         places = frame.place(which, values)
-        minor = frame.place(which, 10 ** (ticks.minor / 20) if which else ticks.minor * 2 * np.pi)
-        edge, outwards = (right, 1) if which else (top, -1)
+        minor = frame.place(which, minor_values)
         parts = []
         for ends, long, name in ((places, _MARK, "tk"), (minor, _SMALL_MARK, "tn")):
             if ends.size:
-                parts.append(
-                    f'<path class="{name}" d="{_strokes(ends, which, edge, edge + outwards * long)}"/>'
-                )
+                strokes = _strokes(ends, which, edge, edge + outwards * long)
+                parts.append(f'<path class="{name}" d="{strokes}"/>')
         for at, word in zip(places, ticks.words, strict=True):
             if which == X:
                 parts.append(_text(word, at, top - _TO_NUMBERS, "se"))
             else:
-                parts.append(_text(word, right + _TO_NUMBERS, at + 0.36 * _SECOND_SIZE, "se"))
+                foot = at + 0.36 * _SECOND_SIZE
+                parts.append(_text(word, right + _TO_NUMBERS, foot, "se"))
         widest = max((text_width(word, _SECOND_SIZE) for word in ticks.words), default=0.0)
         if which == X:
             foot = top - _TO_NUMBERS - _SECOND_SIZE - _TO_LABEL
@@ -880,8 +959,10 @@ class _Writer:
             weight = "bold" if panel.title_bold else "normal"
             look = self.named(f"font-weight:{weight};font-size:{panel.title_size:g}px;fill:#000")
         raised = max(panel.title_raised, frame.above() + _TO_TITLE)
-        lines = (_lines(frame.title) - 1) * panel.title_size * _LINE
-        return _text(frame.title, frame.box[0], frame.box[1] - raised - lines, look, "left", panel.title_size)
+        further_lines = _lines(frame.title) - 1
+        lines = further_lines * panel.title_size * _LINE
+        foot = frame.box[1] - raised - lines
+        return _text(frame.title, frame.box[0], foot, look, "left", panel.title_size)
 
     def sample(self, mark: Mark) -> str:
         """What stands before a word of the legend: a line, an area or a marker around the middle of a box
@@ -941,10 +1022,12 @@ def _read_second(frame: _Frame, which: int, shared: list[int]) -> dict[str, Any]
     y = _scale(frame.panel.y)
     names = ["", ""]
     if which == X:
-        x = [float(f"{end / (2 * np.pi):.7g}") for end in x[:2]] + x[2:]
+        ends_Hz = [end / (2 * np.pi) for end in x[:2]]
+        x = [float(f"{end:.7g}") for end in ends_Hz] + x[2:]
         names[X] = "frequency [Hz]"
     else:
-        y = [float(f"{20 * np.log10(end):.7g}") for end in y[:2]] + ["lin"]
+        ends_dB = [20 * np.log10(end) for end in y[:2]]
+        y = [float(f"{end:.7g}") for end in ends_dB] + ["lin"]
         names[Y] = "[dB]"
     box = [round(float(value), 2) for value in frame.box]
     return {"box": box, "near": False, "x": x, "y": y, "second": True, "names": names, "with": shared}
@@ -952,7 +1035,8 @@ def _read_second(frame: _Frame, which: int, shared: list[int]) -> dict[str, Any]
 
 def _scale(axis: Axis) -> list[Any]:
     """Ends and kind of a scale."""
-    return [*(float(f"{end:.7g}") for end in axis.limits()), axis.kind]
+    ends = [float(f"{end:.7g}") for end in axis.limits()]
+    return [*ends, axis.kind]
 
 
 def _stretch(before: Real, after: Real) -> str:
@@ -970,10 +1054,15 @@ def _strokes(places: Real, which: int, first: float, last: float) -> str:
     at = np.zeros(2, dtype=np.int64)
     for number, place in enumerate(places):
         begin, end = ends[::-1] if number % 2 else ends
-        corners = np.array([[begin, place], [end, place]] if which else [[place, begin], [place, end]])
+        if which:
+            corners = np.array([[begin, place], [end, place]])
+        else:
+            corners = np.array([[place, begin], [place, end]])
         start, stop = _hundredths(corners)
         step = _joined((start - at).tolist())
-        path.append(f"m{step}{'h' if which else 'v'}{_short(int((stop - start)[1 - which]))}")
+        letter = "h" if which else "v"
+        length = int((stop - start)[1 - which])
+        path.append(f"m{step}{letter}{_short(length)}")
         at = stop
     return "".join(path)
 
@@ -986,9 +1075,9 @@ def _text(words: str, x: float, y: float, look: str, side: str = "left", size: f
     first, *further_lines = words.split("\n")
     if not further_lines:
         return f"<text{name} {place}>{escape(first)}</text>"
-    spans = "".join(
-        f'<tspan x="{_tenth(x)}" dy="{size * _LINE:.1f}">{escape(line)}</tspan>' for line in further_lines
-    )
+    spans = ""
+    for line in further_lines:
+        spans += f'<tspan x="{_tenth(x)}" dy="{size * _LINE:.1f}">{escape(line)}</tspan>'
     return f"<text{name} {place}>{escape(first)}{spans}</text>"
 
 
@@ -1002,18 +1091,18 @@ def _turned(words: str, x: float, y: float, look: str, size: float) -> str:
     lines = []
     for k, line in enumerate(words.split("\n")):
         foot = x + k * size * _LINE
-        lines.append(
-            f'<text class="{look} mi" transform="translate({foot:.1f} {y:.1f})rotate(-90)">'
-            f"{escape(line)}</text>"
-        )
+        turned = f"translate({foot:.1f} {y:.1f})rotate(-90)"
+        lines.append(f'<text class="{look} mi" transform="{turned}">{escape(line)}</text>')
     return "".join(lines)
 
 
 def _cuts(frames: list[_Frame]) -> list[float]:
     """Where columns of panels may be parted; a colour bar stays with what is left of it."""
-    columns = sorted(
-        (0.0 if frame.panel.colour_bar else frame.reach()[0], frame.reach()[1]) for frame in frames
-    )
+    columns = []
+    for frame in frames:
+        left, right = frame.reach()
+        columns.append((0.0 if frame.panel.colour_bar else left, right))
+    columns.sort()
     cuts = []
     reach = columns[0][1] if columns else 0.0
     for low, high in columns[1:]:
@@ -1095,7 +1184,8 @@ def _narrow_parts(picture: Picture, frames: list[_Frame], height: float) -> list
         return []
     parts = []
     for left, right in pairwise(edges):
-        columns = {frame.panel.place[1] for frame in frames if left <= frame.box[0] < right}
+        inside = [frame for frame in frames if left <= frame.box[0] < right]
+        columns = {frame.panel.place[1] for frame in inside}
         parts.append(picture.of_columns(columns, width_in=NARROW_WIDTH_IN, height_in=height / POINT))
     return parts
 
@@ -1114,10 +1204,12 @@ def svg_file(made: Drawn, classes: Mapping[str, str]) -> bytes:
         for label in labels:
             words = _text(label, _SAMPLE + _AFTER_SAMPLE, 0.36 * _LEGEND_SIZE, "")
             legend.append(f'<g transform="translate({left:.1f} {middle:.1f})">{samples[label]}{words}</g>')
-            left += _SAMPLE + _AFTER_SAMPLE + text_width(label, _LEGEND_SIZE) + _AFTER_ENTRY
+            sample_width = _SAMPLE + _AFTER_SAMPLE
+            left += sample_width + text_width(label, _LEGEND_SIZE) + _AFTER_ENTRY
     drawing = made.body + "".join(legend)
     used = set(re.findall(r'class="(s\d+)', drawing))
-    style = COMMON_STYLE + style_of({look: name for look, name in classes.items() if name in used})
+    used_classes = {look: name for look, name in classes.items() if name in used}
+    style = COMMON_STYLE + style_of(used_classes)
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:g}pt" height="{height:g}pt" '
         f'viewBox="0 0 {width:g} {height:g}"><style>{style}</style>'

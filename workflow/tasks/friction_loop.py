@@ -134,9 +134,11 @@ class FrictionLoop:
         weights = arm.weights @ self.coefficients
         # An arm has inertia. Where the fit has the speed jump against the force, a shaft at rest would creep.
         # It is taken off the fastest real pole: off an integrator it would change the gain at standstill.
-        size = np.where(arm.chain | (arm.rates.imag != 0), 0.0, np.abs(arm.rates))
+        is_real_decay = ~(arm.chain | (arm.rates.imag != 0))
+        size = np.where(is_real_decay, np.abs(arm.rates), 0.0)
         if np.any(size):
-            weights[np.argmax(size)] -= min(float(weights[~arm.chain].real.sum()), 0.0)
+            jump = float(weights[~arm.chain].real.sum())
+            weights[np.argmax(size)] -= min(jump, 0.0)
         measurement_noise = np.zeros(n) if noise is None else self.fit.noise_std * noise.standard_normal(n)
         feedforward = np.zeros(n)
         if law.feedforward is not None:
@@ -167,7 +169,9 @@ class FrictionLoop:
         filtered (T,): what a reference filter makes of the step; None: there is no filter.
         """
         held = watched_samples(step.size) - step.size
-        run = self.run(np.pad(step if filtered is None else filtered, (0, held), mode="edge"))
+        reference = step if filtered is None else filtered
+        run = self.run(np.pad(reference, (0, held), mode="edge"))
+        # Errors are counted from the step that was wanted, not from its filtered form.
         return replace(run, reference=np.pad(step, (0, held), mode="edge"))
 
     def settling(
@@ -211,7 +215,8 @@ class FrictionLoop:
             jumps = np.abs(np.diff(np.log(seconds)))
             if np.max(jumps) <= np.log(_JUMP):
                 break
-            gap = int(np.argmax(jumps * np.sqrt(np.diff(np.log(shares)))))
+            spacing = np.diff(np.log(shares))
+            gap = int(np.argmax(jumps * np.sqrt(spacing)))
             between = float(np.sqrt(shares[gap] * shares[gap + 1]))
             shares.insert(gap + 1, between)
             times_s.insert(gap + 1, settling_time_s(between))
@@ -232,7 +237,9 @@ class FrictionLoop:
         noise, for so many samples (in which the controller's command settles). 0 where none was found."""
 
         def sticks(size: float) -> bool:
-            return bool(np.max(np.abs(self.run(np.full(samples, size)).measured)) <= self.friction.presliding)
+            run = self.run(np.full(samples, size))
+            largest = np.max(np.abs(run.measured))
+            return bool(largest <= self.friction.presliding)
 
         # While the shaft stands, the command is the controller's answer to a constant error.
         law = self.controller
@@ -328,8 +335,11 @@ def friction_feedforward(controller: Controller, fit: FrictionFit) -> FrictionFe
     follows its reference with that delay.
     """
     omega = np.array([1e-5 * np.pi / controller.dt_s])
-    loop = controller.response(omega) * fit.model.frequency_response(omega) * fit.drive_response(omega)
-    delay_s = float(-np.angle(loop / (1 + loop))[0] / omega[0])
+    # The loop's phase at a frequency far below all of its own is its delay.
+    arm = fit.model.frequency_response(omega) * fit.drive_response(omega)
+    loop = controller.response(omega) * arm
+    closed = loop / (1 + loop)
+    delay_s = float(-np.angle(closed)[0] / omega[0])
     law = fit.law
     load_factor = fit.level / law.level if law.level > 0 else 1.0
     return FrictionFeedforward(
@@ -410,8 +420,13 @@ def check_friction(
 
     # The reference step on the arm as fitted.
     run = fitted_loop.answer(reference, filtered)
-    error = np.abs(run.reference - run.measured)[int(np.flatnonzero(run.reference)[0]) :]
+    first_moved = int(np.flatnonzero(run.reference)[0])
+    error = np.abs(run.reference - run.measured)[first_moved:]
     tolerance = TOLERANCE_PERCENT / 100
+    middle = np.sqrt(low * high)
+    sine_amplitude = _SINE_SHARE * float(reference[-1])
+    # A step that does not stick in one of the fits has no interval of logarithms: it begins at 0.
+    sticking_interval = interval_of(sticking[1:]) if min(sticking) > 0 else (0.0, max(sticking))
     return FrictionCheck(
         level=breakaway,
         level_interval=_around(breakaway, fit),
@@ -424,9 +439,9 @@ def check_friction(
         certified_peak=certified,
         tolerance_percent=TOLERANCE_PERCENT,
         certified_from=holds_from(sizes, high / certified - 1 - tolerance),
-        linear_from=holds_from(sizes, np.abs(np.sqrt(low * high) / plan.nominal_peak - 1) - tolerance),
+        linear_from=holds_from(sizes, np.abs(middle / plan.nominal_peak - 1) - tolerance),
         sticking_step=sticking[0],
-        sticking_interval=interval_of(sticking[1:]) if min(sticking) > 0 else (0.0, max(sticking)),
+        sticking_interval=sticking_interval,
         error_at_rest=error_at_rest,
         error_interval=_around(error_at_rest, fit),
         step=step_metrics(run),
@@ -434,9 +449,7 @@ def check_friction(
         watched_s=error.size * controller.dt_s,
         left=float(np.max(error[error.size // 2 :])),
         output=run.measured[: _shown_samples(run, reference.size)],
-        tracking=slow_sine(
-            stage, controller, _SINE_SHARE * float(reference[-1]), on_arm=sensitivity is not None
-        ),
+        tracking=slow_sine(stage, controller, sine_amplitude, on_arm=sensitivity is not None),
         **beside_recorded(stage, fitted_loop, reference),
     )
 
@@ -467,10 +480,12 @@ def beside_recorded(stage: StageInput, loop: FrictionLoop, step: RealArray) -> d
     if recorded is None or record.reference is None:
         return {}
     reference = record.reference[:, 0] - record.reference[0, 0]
+    recorded_run = recorded.run(reference)
+    new_run = loop.run(reference)
     errors = (
         float(np.std(record.reference - record.output)),
-        float(np.std(reference - recorded.run(reference).measured)),
-        float(np.std(reference - loop.run(reference).measured)),
+        float(np.std(reference - recorded_run.measured)),
+        float(np.std(reference - new_run.measured)),
     )
     answer = recorded.answer(step)
     return {
@@ -527,8 +542,9 @@ def soonest(
     # The step of the closed-loop stage, for as long as the slowest pole of the linear loop needs.
     records = stage.results.records.fitted(config.control_channel)
     size = config.closed_loop.reference_step or 0.5 * rms_of([record.output for record in records])
-    radius = max(float(np.max(np.abs(closed_loop_poles(law, plant)))) for plant in stage.plants)
-    step = np.append(0.0, np.full(settling_samples(radius, 200, 60_000) // 2, size))
+    radii = [np.max(np.abs(closed_loop_poles(law, plant))) for plant in stage.plants]
+    samples = settling_samples(max(map(float, radii)), 200, 60_000) // 2
+    step = np.append(0.0, np.full(samples, size))
 
     # What is soon enough.
     loop = FrictionLoop.of(law, friction, **converter_steps(config.closed_loop))
@@ -587,7 +603,11 @@ def holds_from(sizes: Sequence[float] | RealArray, excess: RealArray) -> float |
     k = int(over[0])
     if k == 0:
         return None
-    return float(sizes[k - 1] * (sizes[k] / sizes[k - 1]) ** (excess[k - 1] / (excess[k - 1] - excess[k])))
+    # The excess is taken as linear over the logarithm of the size.
+    before, after = excess[k - 1], excess[k]
+    share = before / (before - after)
+    ratio = sizes[k] / sizes[k - 1]
+    return float(sizes[k - 1] * ratio**share)
 
 
 def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on_arm: bool) -> SlowSine:
@@ -613,7 +633,9 @@ def slow_sine(stage: StageInput, controller: Controller, amplitude: float, *, on
     forward = friction_feedforward(controller, fit)
     period = int(min(_PERIOD_OVER_DELAY * forward.lag_s / controller.dt_s, _LONGEST_PERIOD))
     omega = 2 * np.pi / (period * controller.dt_s)
-    reference = amplitude * np.sin(2 * np.pi * np.arange(round(1.25 * period)) / period)
+    # The first quarter of a period lets the arm start.
+    samples = np.arange(round(1.25 * period))
+    reference = amplitude * np.sin(2 * np.pi * samples / period)
     reference_filter = stage.results.reference_filter.filter
     if reference_filter is not None:
         reference = reference_filter.filtered(reference)
