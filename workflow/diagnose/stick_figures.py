@@ -59,7 +59,8 @@ def moving_figures(diagnosis: Diagnosis) -> Markup | None:
 
     worst = max(case.held_out, key=lambda e: pooled_rms(diagnosis.residuals_before[e.name]))
     n_samples = len(worst.output)
-    rows = np.unique(np.linspace(0, n_samples - 1, min(n_samples, _FRAMES)).astype(int))
+    n_frames = min(n_samples, _FRAMES)
+    rows = np.unique(np.linspace(0, n_samples - 1, n_frames).astype(int))
     figures = {"measured": figure(worst.output[rows])}
     for model, run in runs.items():
         figures[model] = figure(run[worst.name][rows])
@@ -72,11 +73,13 @@ def moving_figures(diagnosis: Diagnosis) -> Markup | None:
     # The measured figure comes first and so lies beneath the models.
     paths = [_path(flat["measured"], gap_style.PALE, _MEASURED_PX, shown_s)]
     for model in runs:
-        paths.append(_path(flat[model], str(gap_style.MODELS[model]["color"]), _MODEL_PX, shown_s))
+        colour = str(gap_style.MODELS[model]["color"])
+        paths.append(_path(flat[model], colour, _MODEL_PX, shown_s))
+    drawn = "".join(paths)
+    around = _frame(scale_px_m, axes_seen, record_s, shown_s)
     return Markup(
         f'<svg viewBox="0 0 {_WIDTH:.0f} {_HEIGHT:.0f}" role="img" aria-label="Stick figures, measured and '
-        f'simulated, {shown_s:.3g} s of motion">{"".join(paths)}'
-        f"{_frame(scale_px_m, axes_seen, record_s, shown_s)}</svg>"
+        f'simulated, {shown_s:.3g} s of motion">{drawn}{around}</svg>'
     )
 
 
@@ -100,7 +103,9 @@ def _flat(figures: Mapping[str, Real]) -> tuple[dict[str, Real], float, str]:
     points = figures["measured"].reshape(-1, 3)
     reach = np.ptp(points, axis=0)
     # A figure may be long in an axis and stay where it is in it: what moves counts beside what reaches.
-    moved = np.ptp(figures["measured"].reshape(len(figures["measured"]), -1, 3), axis=0).max(axis=0)
+    measured = figures["measured"]
+    measured_points = measured.reshape(len(measured), -1, 3)
+    moved = np.ptp(measured_points, axis=0).max(axis=0)
     seen = sorted(np.argsort(reach + moved)[1:])
 
     # A free run may fall over, far away from what was measured: it is cut at the picture's end.
@@ -109,7 +114,9 @@ def _flat(figures: Mapping[str, Real]) -> tuple[dict[str, Real], float, str]:
     high = points.max(axis=0) + _BEYOND * size
     near = {}
     for model, lines in figures.items():
-        near[model] = np.clip(np.nan_to_num(lines, nan=_FAR_OUTSIDE_M), low, high)[..., seen]
+        # A simulation that ran away is drawn at the edge.
+        finite = np.nan_to_num(lines, nan=_FAR_OUTSIDE_M)
+        near[model] = np.clip(finite, low, high)[..., seen]
 
     every = np.concatenate([lines.reshape(-1, 2) for lines in near.values()])
     corner = every.min(axis=0)
@@ -119,8 +126,12 @@ def _flat(figures: Mapping[str, Real]) -> tuple[dict[str, Real], float, str]:
     middle = np.array([_WIDTH, _HEIGHT]) / 2
     # An SVG counts downwards.
     up = np.array([1.0, -1.0])
-    flat = {model: middle + up * scale * (lines - corner - extent / 2) for model, lines in near.items()}
-    return flat, scale, "".join("xyz"[k] for k in seen)
+    flat = {}
+    for model, lines in near.items():
+        about_middle = lines - corner - extent / 2
+        flat[model] = middle + up * scale * about_middle
+    names_seen = "".join("xyz"[k] for k in seen)
+    return flat, scale, names_seen
 
 
 def _frame(scale: float, axes_seen: str, record_s: float, shown_s: float) -> str:
@@ -165,9 +176,10 @@ def _path(lines: Real, colour: str, width_px: float, shown_s: float) -> str:
     for frame in lines:
         segments = [f"M{a:.1f} {b:.1f}L{c:.1f} {d:.1f}" for (a, b), (c, d) in frame]
         frames.append("".join(segments))
+    values = ";".join(frames)
     return (
         f'<path d="{frames[0]}" fill="none" stroke="{colour}" stroke-width="{width_px:g}" '
         f'stroke-linecap="round">'
         f'<animate attributeName="d" dur="{shown_s:.4g}s" repeatCount="indefinite" '
-        f'values="{";".join(frames)}"/></path>'
+        f'values="{values}"/></path>'
     )

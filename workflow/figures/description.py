@@ -151,7 +151,8 @@ class Axis:
         """Both ends: as stated, else a margin beside the data that are drawn."""
         if self.low is not None and self.high is not None:
             return self.low, self.high
-        values = np.concatenate([panel.data(self.which) for panel in self.panels] or [np.zeros(0)])
+        drawn = [panel.data(self.which) for panel in self.panels]
+        values = np.concatenate(drawn or [np.zeros(0)])
         values = values[np.isfinite(values)]
         if self.kind == "log":
             is_positive = values > 0
@@ -159,15 +160,17 @@ class Axis:
             if not values.size:
                 ends = _EMPTY_LOG
             else:
-                low, high = pad_limits(
-                    float(np.log10(values.min())), float(np.log10(values.max())), self.margin
-                )
+                lowest = float(np.log10(values.min()))
+                highest = float(np.log10(values.max()))
+                low, high = pad_limits(lowest, highest, self.margin)
                 ends = 10.0**low, 10.0**high
         elif values.size:
             ends = pad_limits(float(values.min()), float(values.max()), self.margin)
         else:
             ends = (0.0, 1.0)
-        return (ends[0] if self.low is None else self.low), (ends[1] if self.high is None else self.high)
+        low_end = ends[0] if self.low is None else self.low
+        high_end = ends[1] if self.high is None else self.high
+        return low_end, high_end
 
     def even(self, values: Any) -> Real:
         """Values as lengths in which the axis is even; on a log axis what is not positive lies far below."""
@@ -178,9 +181,10 @@ class Axis:
             return np.asarray(np.log10(np.maximum(numbers, 1e-300)))
         size = np.abs(numbers)
         # The linear part is as long as 10/9 of a decade, so that the slope has no jump where it ends.
-        logarithmic = 10 / 9 + np.log10(np.maximum(size, self.kind) / self.kind)
+        decades = np.log10(np.maximum(size, self.kind) / self.kind)
+        logarithmic = np.sign(numbers) * (10 / 9 + decades)
         linear = numbers / self.kind * 10 / 9
-        return np.asarray(np.where(size <= self.kind, linear, np.sign(numbers) * logarithmic))
+        return np.asarray(np.where(size <= self.kind, linear, logarithmic))
 
     def shares(self, values: Any) -> Real:
         """How far along the axis values lie: 0 at its beginning, 1 at its end."""
@@ -230,9 +234,12 @@ class Panel:
     def fill_between(self, x: Any, low: Any, high: Any, *, label: str | None = None, **look: Any) -> None:
         """The band between two curves (N,), parted where one of them is no number."""
         at = np.asarray(x, dtype=np.float64)
-        lower, upper = (np.broadcast_to(np.asarray(end, dtype=np.float64), at.shape) for end in (low, high))
+        lower = np.broadcast_to(np.asarray(low, dtype=np.float64), at.shape)
+        upper = np.broadcast_to(np.asarray(high, dtype=np.float64), at.shape)
         finite = np.isfinite(at) & np.isfinite(lower) & np.isfinite(upper)
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], finite, [False]]).astype(int)))
+        # Begin and end of each run of numbers: where the flag changes.
+        flags = np.concatenate([[False], finite, [False]]).astype(int)
+        edges = np.flatnonzero(np.diff(flags))
         outlines = []
         for first, last in edges.reshape(-1, 2):
             part = slice(first, last)
@@ -252,14 +259,20 @@ class Panel:
     def uprights(self, x: Any, low: Any, high: Any, **look: Any) -> None:
         """Vertical strokes at places (N,) between two values (N,) each."""
         at = np.asarray(x, dtype=np.float64).ravel()
+        # A gap after each stroke parts it from the next.
         gap = np.full(at.size, np.nan)
-        ends = np.column_stack([np.broadcast_to(low, at.shape), np.broadcast_to(high, at.shape), gap])
-        self.plot(np.column_stack([at, at, gap]).ravel(), ends.ravel(), **look)
+        lower = np.broadcast_to(low, at.shape)
+        upper = np.broadcast_to(high, at.shape)
+        ends = np.column_stack([lower, upper, gap])
+        places = np.column_stack([at, at, gap])
+        self.plot(places.ravel(), ends.ravel(), **look)
 
     def circle(self, centre: tuple[float, float], radius: float, *, label: str = "", **look: Any) -> None:
         """A circle in units of the data, drawn as a line."""
         turn = np.linspace(0, 2 * np.pi, _CIRCLE_POINTS)
-        self.plot(centre[0] + radius * np.cos(turn), centre[1] + radius * np.sin(turn), label=label, **look)
+        x = centre[0] + radius * np.cos(turn)
+        y = centre[1] + radius * np.sin(turn)
+        self.plot(x, y, label=label, **look)
 
     def bars(
         self,
@@ -277,7 +290,9 @@ class Panel:
         ends = np.atleast_1d(ends)
         corners = []
         for place, begin, end in zip(at, np.broadcast_to(begins, ends.shape), ends, strict=True):
-            along = np.array([place - thick / 2, place + thick / 2, place + thick / 2, place - thick / 2])
+            left = place - thick / 2
+            right = place + thick / 2
+            along = np.array([left, right, right, left])
             up = np.array([begin, begin, end, end])
             corners.append(np.column_stack([up, along] if lying else [along, up]))
         self.fill(corners, label=label, **({"lw": 0} | look))

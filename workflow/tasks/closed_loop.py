@@ -89,7 +89,8 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
     law = results.reference_filter.law(controller)
     with naming("closed loop"):
         # A nominal loop that is unstable has no settling time to choose the length of the trial by.
-        radius = max(float(np.max(np.abs(closed_loop_poles(controller, plant)))) for plant in stage.plants)
+        radii = [np.max(np.abs(closed_loop_poles(controller, plant))) for plant in stage.plants]
+        radius = max(map(float, radii))
         if not radius < 1:
             return ClosedLoopResult(skipped="the nominal closed loop is unstable")
         reference_filter = results.reference_filter.filter
@@ -118,13 +119,14 @@ def run_closed_loop(stage: StageInput) -> ClosedLoopResult:
                 sensitivity = sensitivity_on_arm(stage, controller, trial.half)
             if options.conditions:
                 stage.progress.update("closed_loop", 0.9, "conditions")
+                source = _simulated(stage)
                 bench = ConditionBench(
                     controller=law,
                     reference_filter=reference_filter,
                     posterior=posterior,
-                    source=_simulated(stage),
+                    source=source,
                     options=options,
-                    rig=rig_of(_simulated(stage)),
+                    rig=rig_of(source),
                     reference=trial.reference[: trial.half],
                     measured=OUTPUT_NAMES.index(config.control_channel.output),
                     rng=stage.rng("closed_loop", "conditions"),
@@ -232,15 +234,18 @@ def make_trial(
     if disturbance is None:
         disturbance = 0.1 * rms_of([record.input for record in used])
     reference = np.where(k >= round(LEAD_IN * samples), step, 0.0)
+    filtered = reference if reference_filter is None else reference_filter.filtered(reference)
+    # A loop that is asked for neither a bandwidth nor a sensitivity only damps: no reference to follow.
+    wanted = config.specification
+    tracking = wanted.bandwidth_rad_s is not None or wanted.sensitivity_weight is not None
     return Trial(
         time_s=np.asarray(k * dt_s, dtype=np.float64),
         reference=reference,
-        filtered_reference=(reference if reference_filter is None else reference_filter.filtered(reference)),
+        filtered_reference=filtered,
         disturbance=np.where(k >= half, disturbance, 0.0),
         step=step,
         half=half,
-        tracking=config.specification.bandwidth_rad_s is not None
-        or config.specification.sensitivity_weight is not None,
+        tracking=tracking,
         resolution=options.measurement_step,
     )
 
@@ -266,7 +271,8 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopR
                 controller, reference=trial.filtered_reference, input_disturbance=trial.disturbance, **arm
             )
         )
-    return _loop_runs(runs, None if tip is None else [run.output[:, tip] for run in runs])
+    tip_outputs = None if tip is None else [run.output[:, tip] for run in runs]
+    return _loop_runs(runs, tip_outputs)
 
 
 def run_on_draws(
@@ -328,23 +334,30 @@ def describe(runs: LoopRuns, trial: Trial) -> tuple[LoopMetrics, ...]:
     rows = []
     for output, command, limited in zip(runs.output, runs.command, runs.limited, strict=True):
         first = slice(0, trial.half)
+        dt_s = float(trial.time_s[1] - trial.time_s[0])
         step = ClosedLoopTrajectory(
             trial.time_s[first],
             trial.reference[first],
             output[first, None],
             command[first],
             limited[first],
-            float(trial.time_s[1] - trial.time_s[0]),
+            dt_s,
         )
         error = trial.reference - output
-        ends = [_tail(error[: trial.half]), _tail(error[trial.half :])]
-        steady = all(np.ptp(end) <= max(SETTLED * abs(trial.step), 2 * trial.resolution) for end in ends)
-        arrived = abs(float(np.mean(ends[0]))) <= max(SETTLED * abs(trial.step), trial.resolution)
+        step_error = error[: trial.half]
+        disturbance_error = error[trial.half :]
+        step_end = _tail(step_error)
+        disturbance_end = _tail(disturbance_error)
+        # Resting means moving by no more than the sensor's steps, one up and one down, make it seem to move.
+        small = SETTLED * abs(trial.step)
+        largest_swing = max(small, 2 * trial.resolution)
+        steady = np.ptp(step_end) <= largest_swing and np.ptp(disturbance_end) <= largest_swing
+        arrived = abs(float(np.mean(step_end))) <= max(small, trial.resolution)
         rows.append(
             LoopMetrics(
                 **vars(step_metrics(step)),
-                disturbance_peak=float(np.max(np.abs(error[trial.half :]))),
-                disturbance_left=float(np.mean(ends[1])),
+                disturbance_peak=float(np.max(np.abs(disturbance_error))),
+                disturbance_left=float(np.mean(disturbance_end)),
                 settled=bool(steady and (arrived or not trial.tracking)),
             )
         )

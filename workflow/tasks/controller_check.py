@@ -91,19 +91,19 @@ class ControllerCheck:
     runs: tuple[Run, Run, Run, Run]
 
     def document(self) -> dict[str, Any]:
+        specification = {
+            "bandwidth_rad_s": self.specification.bandwidth_rad_s,
+            "modulus_margin": self.specification.modulus_margin,
+            "effort_limit_V_rad": self.specification.effort_limit,
+            "controller_order": self.specification.controller_order,
+        }
+        certified_nominal, certified_repaired = self.certified
+        certified = {"nominal parameters": certified_nominal, "repaired": certified_repaired}
         return {
-            "specification": {
-                "bandwidth_rad_s": self.specification.bandwidth_rad_s,
-                "modulus_margin": self.specification.modulus_margin,
-                "effort_limit_V_rad": self.specification.effort_limit,
-                "controller_order": self.specification.controller_order,
-            },
+            "specification": specification,
             "step_rad": self.trial.step_rad,
             "disturbance_V": float(np.max(self.trial.disturbance_V)),
-            "certified_on_own_model": {
-                "nominal parameters": self.certified[0],
-                "repaired": self.certified[1],
-            },
+            "certified_on_own_model": certified,
             "runs": [codec.plain(run, arrays=False) for run in self.runs],
         }
 
@@ -133,7 +133,8 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
         input_rms = rms_of([e.voltage_V for e in case.estimation])
         plan = plan_sensitivity(controller, plant, input_rms, trial.time_s.size // 2)
         seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
-        runs.append(trial.run(controller, arm, plant.name, "repaired machine", 1.0 / seen.peak[0]))
+        margin = 1.0 / seen.peak[0]
+        runs.append(trial.run(controller, arm, plant.name, "repaired machine", margin))
     return ControllerCheck(
         trial=trial,
         specification=specification,
@@ -147,7 +148,8 @@ def _plant(name: str, both: control.StateSpace) -> UncertainPlant:
     # Imported here: it brings a plotting library with it.
     import control
 
-    hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], np.zeros((1, 1)), both.dt) for i in (0, 1))
+    no_feedthrough = np.zeros((1, 1))
+    hub, tip = (control.ss(both.A, both.B, both.C[i : i + 1], no_feedthrough, both.dt) for i in (0, 1))
     try:
         return UncertainPlant(hub, name=name, uncertainty=None, performance=PlantChannel(tip))
     except ValueError as error:
@@ -159,12 +161,14 @@ def _specification(case: Case, plant: UncertainPlant) -> Specification:
     if not modes:
         raise NoControllerError("the nominal rig has no lightly damped mode to set a bandwidth by")
     first = modes[0].omega_rad_s
+    largest_V = _largest_voltage(case)
     return Specification(
         bandwidth_rad_s=_BANDWIDTH_SHARE * first,
         modulus_margin=_MODULUS_MARGIN,
-        effort_limit=_largest_voltage(case) / _step(case),
+        # The step alone may ask for the largest voltage of the records.
+        effort_limit=largest_V / _step(case),
         effort_rolloff_rad_s=2 * first,
-        input_limit=_largest_voltage(case),
+        input_limit=largest_V,
         controller_order=_ORDER,
     )
 
@@ -204,11 +208,14 @@ class ControllerTrial:
         radius = float(np.max(np.abs(closed_loop_poles(controller, plant))))
         k = np.arange(settling_samples(radius, _SHORTEST, _LONGEST))
         half = k.size // 2
-        voltage = float(np.sqrt(np.mean([np.mean(e.voltage_V**2) for e in case.estimation])))
+        mean_squares = [np.mean(experiment.voltage_V**2) for experiment in case.estimation]
+        voltage = float(np.sqrt(np.mean(mean_squares)))
+        is_after_step = k >= round(LEAD_IN * k.size)
+        is_pushed = (k >= half) & (k < half + k.size // _PARTS)
         return cls(
             time_s=np.asarray(k * dt, dtype=np.float64),
-            reference_rad=np.where(k >= round(LEAD_IN * k.size), _step(case), 0.0),
-            disturbance_V=np.where((k >= half) & (k < half + k.size // _PARTS), _PUSH * voltage, 0.0),
+            reference_rad=np.where(is_after_step, _step(case), 0.0),
+            disturbance_V=np.where(is_pushed, _PUSH * voltage, 0.0),
             arm_m=case.rig.hub.radius_m + case.rig.link.length_m,
         )
 
@@ -240,12 +247,13 @@ class ControllerTrial:
         # Before the push and at the end nothing may move any more.
         ends = [loop.measured[stop - n // _PARTS : stop] for stop in (n // 2, n)]
         settles = all(np.ptp(end) <= SETTLED * self.step_rad for end in ends)
+        peak_V = float(np.max(np.abs(loop.command)))
         return Run(
             design=design,
             machine=on,
             cost_s=float(np.sum(error**2)) * controller.dt_s,
             modulus_margin=margin,
-            peak_command_V=float(np.max(np.abs(loop.command))),
+            peak_command_V=peak_V,
             settles=bool(settles),
             tip_m=tip,
             command_V=loop.command,
@@ -290,7 +298,8 @@ def _with_lag(a: Real, b: Real, c: Real, lag_s: float) -> tuple[Real, Real, Real
     wide[n, n] = -1 / lag_s
     column = np.zeros((n + 1, 1))
     column[n] = 1 / lag_s
-    return wide, column, np.hstack([c, np.zeros((c.shape[0], 1))])
+    no_output = np.zeros((c.shape[0], 1))
+    return wide, column, np.hstack([c, no_output])
 
 
 def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> control.StateSpace:
@@ -320,7 +329,10 @@ def _sampled(a: Real, b: Real, c: Real, dt_s: float, path: VoltagePath) -> contr
     # Imported here: it brings a plotting library with it.
     import control
 
-    return control.ss(A, B, np.hstack([c, np.zeros((c.shape[0], past))]), np.zeros((c.shape[0], 1)), dt_s)
+    # The voltages that are still on their way do not show in the outputs.
+    C = np.hstack([c, np.zeros((c.shape[0], past))])
+    D = np.zeros((c.shape[0], 1))
+    return control.ss(A, B, C, D, dt_s)
 
 
 def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
@@ -328,5 +340,8 @@ def _held(a: Real, b: Real, time_s: float) -> tuple[Real, Real]:
     # Imported here: it takes its time to load.
     from scipy.signal import cont2discrete
 
-    step, held, *_ = cont2discrete((a, b, np.zeros((1, len(a))), np.zeros((1, b.shape[1]))), time_s, "zoh")
+    # Outputs are asked for by the function, but not used.
+    c = np.zeros((1, len(a)))
+    d = np.zeros((1, b.shape[1]))
+    step, held, *_ = cont2discrete((a, b, c, d), time_s, "zoh")
     return step, held

@@ -149,7 +149,8 @@ def draft_of(
 
     # The command's limit: as stated, where commands stand, or where the motion shows that they were cut.
     look = first_look(fitted, position=position)
-    highest = max(float(np.max(np.abs(record.input))) for record in records)
+    largest_commands = [np.max(np.abs(record.input)) for record in records]
+    highest = max(map(float, largest_commands))
     at_limit = _limit(records)
     cut_limit = None
     if limit is None and at_limit is None:
@@ -157,7 +158,9 @@ def draft_of(
     if cut_limit is not None:
         # As on a data sheet: with as few digits as the logs allow.
         rounded = [float(f"{cut_limit:.{digits}g}") for digits in (1, 2, 3)]
-        cut_limit = next((value for value in rounded if abs(value / cut_limit - 1) < _SAME_DIGITS), cut_limit)
+        close_enough = [value for value in rounded if abs(value / cut_limit - 1) < _SAME_DIGITS]
+        if close_enough:
+            cut_limit = close_enough[0]
         look = first_look([record.limited(cut_limit) for record in fitted], position=position)
     reached = limit or at_limit or cut_limit or highest
 
@@ -169,6 +172,9 @@ def draft_of(
     reference_step = 0.5 * spread
     if unstable or not spread > 0:
         reference_step = reached / effort
+    # The finest grid of readings is what the sensor counts in; 0 where there is none.
+    step = grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny)
+    held_from_rad_s = [float(held.values["from_rad_s"]) for held in held_readings(fitted)]
     return Draft(
         look=look,
         position=position,
@@ -177,12 +183,12 @@ def draft_of(
         limit=reached,
         clipped=at_limit is not None,
         unseen=cut_limit is not None,
-        step=grid_step([record.output[:, 0] for record in records], np.finfo(np.float64).tiny),
+        step=step,
         specification=_specification(look, timing, effort, reached, unstable),
         reference_step=_rounded(reference_step),
         unstable_per_s=unstable,
         timing=timing,
-        held_rad_s=min((float(held.values["from_rad_s"]) for held in held_readings(fitted)), default=0.0),
+        held_rad_s=min(held_from_rad_s, default=0.0),
     )
 
 
@@ -225,27 +231,25 @@ def informed(draft: Draft, channel: IdentifiedChannel, uncertain: UncertainChann
     known = omega[is_told]
     if look.told_rad_s is None or not known.size:
         return draft
-    band = min(look.told_rad_s[0], float(known[0])), float(known[-1])
+    lowest_told_rad_s = min(look.told_rad_s[0], float(known[0]))
+    band = lowest_told_rad_s, float(known[-1])
     intervals = [None] * len(channel.modes) if uncertain.intervals is None else uncertain.intervals.modes
     modes = []
     for mode, interval in zip(channel.modes, intervals, strict=True):
         damping_is_known = interval is not None and interval.told
         if damping_is_known and channel.is_mode(mode) and mode.damping < LIGHT:
             modes.append((mode.omega_rad_s, mode.damping))
-    notch = next((float(zero) for zero in notches(model) if band[0] < zero < band[1]), None)
+    in_band = [float(zero) for zero in notches(model) if band[0] < zero < band[1]]
+    notch = in_band[0] if in_band else None
     look = replace(look, told_rad_s=band, mode=min(modes, default=None), notch=notch)
     unstable = max((growth for growth, _ in channel.unstable_poles), default=0.0)
+    # The first draft was made without a model: it is not to become stricter by having one.
+    largest_effort = max(draft.specification["effort_limit"], effort)
+    specification = _specification(look, draft.timing, largest_effort, draft.limit, unstable, recorded)
     return replace(
         draft,
         look=look,
-        specification=_specification(
-            look,
-            draft.timing,
-            max(draft.specification["effort_limit"], effort),
-            draft.limit,
-            unstable,
-            recorded,
-        ),
+        specification=specification,
         unstable_per_s=unstable,
         recorded_rad_s=recorded,
     )
@@ -259,8 +263,11 @@ def _moved(records: Sequence[Record], look: FirstLook) -> float:
     signals = [record.output[:, 0] for record in records]
     if look.told_rad_s is None:
         return rms_of(signals)
-    high = butter(2, look.told_rad_s[0] * records[0].dt_s / np.pi, "highpass", output="sos")
-    return rms_of([np.asarray(sosfiltfilt(high, signal - signal.mean())) for signal in signals])
+    # Slower than what the logs tell is drift. Both ways, so that nothing is delayed.
+    corner = look.told_rad_s[0] * records[0].dt_s / np.pi
+    high = butter(2, corner, "highpass", output="sos")
+    moved = [sosfiltfilt(high, signal - signal.mean()) for signal in signals]
+    return rms_of([np.asarray(signal) for signal in moved])
 
 
 def _limit(records: Sequence[Record]) -> float | None:
@@ -278,7 +285,8 @@ def _unstable_per_s(look: FirstLook) -> float:
     motion = look.motion
     if motion is None or not motion.sprung or motion.stiffness is None or motion.stiffness.value >= 0:
         return 0.0
-    return float(max(np.roots([motion.inertia.value, motion.viscous.value, motion.stiffness.value]).real))
+    polynomial = [motion.inertia.value, motion.viscous.value, motion.stiffness.value]
+    return float(max(np.roots(polynomial).real))
 
 
 def _rounded(value: float) -> float:
@@ -304,22 +312,25 @@ def _specification(
     at_once = {"computational_delay_samples": 0} if timing.acts_at_once else {}
     peak_of_mode: dict[str, Any] = {}
     if look.mode:
+        highest_of_band = min(1.5 * base, 0.95 * np.pi / dt_s)
         peak_of_mode = {
             "mode_peak_ratio": 1.0,
             "highest_mode_peak_ratio": _PEAK_GIVES_WAY,
-            "mode_band_rad_s": [_rounded(base / 1.5), _rounded(min(1.5 * base, 0.95 * np.pi / dt_s))],
+            "mode_band_rad_s": [_rounded(base / 1.5), _rounded(highest_of_band)],
         }
+    lowest_bandwidth = min(base / _MODE_OVER_LOWEST_BANDWIDTH, recorded or np.inf)
+    effort_limit = _rounded(effort)
+    # The sampling rate leaves no room above half of the Nyquist frequency.
+    rolloff = min(max(highest, _MODE_OVER_BANDWIDTH * bandwidth), 0.5 * np.pi / dt_s)
     return {
         "bandwidth_rad_s": _rounded(bandwidth),
         # Below an unstable pole, too: the loop has to cross above it, tracking need not reach so far.
-        "lowest_bandwidth_rad_s": _rounded(min(base / _MODE_OVER_LOWEST_BANDWIDTH, recorded or np.inf)),
+        "lowest_bandwidth_rad_s": _rounded(lowest_bandwidth),
         "modulus_margin": 0.5,
-        "effort_limit": _rounded(effort),
-        "highest_effort_limit": _rounded(_EFFORT_GIVES_WAY * _rounded(effort)),
+        "effort_limit": effort_limit,
+        "highest_effort_limit": _rounded(_EFFORT_GIVES_WAY * effort_limit),
         # Above what the logs tell the command falls off.
-        "effort_rolloff_rad_s": _rounded(
-            min(max(highest, _MODE_OVER_BANDWIDTH * bandwidth), 0.5 * np.pi / dt_s)
-        ),
+        "effort_rolloff_rad_s": _rounded(rolloff),
         **peak_of_mode,
         "controller_damping": 0.3,
         "integrator": True,

@@ -50,16 +50,20 @@ def condition_run(
     away = 100 * (achieved.measured - predicted.measured) / size
     tail = error[-max(1, error.size // 10) :]
     moves = bool(np.any(reference != 0))
-    passed = 100 * float(np.max(achieved.measured) - np.max(reference)) / size
+    beyond_target = float(np.max(achieved.measured) - np.max(reference))
+    passed = 100 * beyond_target / size
+    largest_difference = np.max(np.abs(away))
+    rms_difference = np.sqrt(np.mean(away**2))
+    peak_command = np.max(np.abs(achieved.command))
     return ConditionRun(
         name=name,
         words=words,
         size=size,
-        largest_difference_percent=float(np.max(np.abs(away))),
-        rms_difference_percent=float(np.sqrt(np.mean(away**2))),
+        largest_difference_percent=float(largest_difference),
+        rms_difference_percent=float(rms_difference),
         overshoot_percent=max(0.0, passed) if moves else None,
         error_left_percent=float(np.mean(tail)),
-        peak_command=float(np.max(np.abs(achieved.command))),
+        peak_command=float(peak_command),
         limited_fraction=float(np.mean(achieved.limited)),
         settled=bool(np.ptp(tail) <= 100 * SETTLED),
         reference=reference,
@@ -92,7 +96,8 @@ class ConditionBench:
     @property
     def effects(self) -> dict[str, dict[str, Any]]:
         """Effects of the arm the controller meets, by name."""
-        return {str(e["name"]): dict(e) for e in (*self.source.effects, *self.options.effects)}
+        every_effect = (*self.source.effects, *self.options.effects)
+        return {str(effect["name"]): dict(effect) for effect in every_effect}
 
     def predict(
         self,
@@ -124,15 +129,17 @@ class ConditionBench:
         n = self.reference.size
         start = n // 20
         length = max(2, round(0.4 * n))
-        x = np.clip((np.arange(n) - start) / length, 0.0, 1.0)
+        samples_moving = np.arange(n) - start
+        x = np.clip(samples_moving / length, 0.0, 1.0)
         shape = x**3 * (10 - 15 * x + 6 * x**2)
         size = 4 * self.step
         if self.controller.input_limit is not None:
-            peak = float(np.max(np.abs(self.predict(shape, law=self._unlimited).command)))
+            # The loop is linear: its command grows with the move.
+            unit_move = self.predict(shape, law=self._unlimited)
+            peak = float(np.max(np.abs(unit_move.command)))
             size = min(_SLEW_SHARE * self.controller.input_limit / peak, 20 * self.step)
-        return self._run(
-            "slew", conditions.smooth_move(length * self.controller.dt_s), np.asarray(size * shape)
-        )
+        words = conditions.smooth_move(length * self.controller.dt_s)
+        return self._run("slew", words, np.asarray(size * shape))
 
     def push(self) -> ConditionRun:
         """A half-sine force at the tip, set point zero."""
@@ -141,13 +148,17 @@ class ConditionBench:
         start = n // 20
         length = max(2, round(_PUSH_S / dt))
         force = np.zeros(n)
-        force[start : start + length] = np.sin(np.pi * (np.arange(length) + 0.5) / length)[: n - start]
+        phase = np.pi * (np.arange(length) + 0.5) / length
+        # What would last beyond the run is cut off.
+        force[start : start + length] = np.sin(phase)[: n - start]
         effects = parse_effects(self.effects.values())
         linear = [effect for effect in effects if effect.modify(Machine(self.rig)).linear]
         free = simulate_arm(
             self.rig, np.zeros(n), linear, rng=None, tip_force_N=force, n_modes=self.source.modes
         )
-        answer = np.column_stack([free.hub_angle_true_rad, free.tip_true_m])[:, self.measured]
+        hub_and_tip = np.column_stack([free.hub_angle_true_rad, free.tip_true_m])
+        answer = hub_and_tip[:, self.measured]
+        # So strong a push that the free arm swings as far as the reference step goes.
         scale = self.step / float(np.max(np.abs(answer)))
         return self._run(
             "push at the tip",
@@ -168,16 +179,19 @@ class ConditionBench:
         extra = float(self.effects.get("tip_payload", {}).get("mass_kg", 0.0))
         rated = self.rig.payload.mass_kg + extra or tenth
         without = {"tip_payload": {"name": "tip_payload", "mass_kg": 0.0}}
-        return [
-            self._run(
-                f"payload {percent} %",
-                conditions.payload(1e3 * rated * percent / 100),
-                effects=without,
-                # It sets the value.
-                rig=self.rig.perturbed({"payload.mass_kg": rated * percent / 100}),
+        runs = []
+        for percent in (0, 100, 200):
+            mass_kg = rated * percent / 100
+            runs.append(
+                self._run(
+                    f"payload {percent} %",
+                    conditions.payload(1e3 * rated * percent / 100),
+                    effects=without,
+                    # It sets the value.
+                    rig=self.rig.perturbed({"payload.mass_kg": mass_kg}),
+                )
             )
-            for percent in (0, 100, 200)
-        ]
+        return runs
 
     def late(self) -> ConditionRun:
         """One sample of delay more."""
@@ -198,18 +212,22 @@ class ConditionBench:
                 for name, effect in frictions.items()
             }
 
+        names = list(frictions)
         return [
-            self._run("no friction", conditions.other_friction(list(frictions), 0), effects=scaled(0.0)),
-            self._run("double friction", conditions.other_friction(list(frictions), 2), effects=scaled(2.0)),
+            self._run("no friction", conditions.other_friction(names, 0), effects=scaled(0.0)),
+            self._run("double friction", conditions.other_friction(names, 2), effects=scaled(2.0)),
         ]
 
     def coarse(self) -> ConditionRun:
         """Converters of eight bits and an encoder four times as coarse."""
-        limit = self.controller.input_limit or float(np.max(np.abs(self.predict(self.reference).command)))
+        limit = self.controller.input_limit
+        if not limit:
+            command_of_step = self.predict(self.reference).command
+            limit = float(np.max(np.abs(command_of_step)))
+        # Eight bits from limit to limit, and never finer than the converters of the trial.
         command = max(limit / 128, self.options.quantisation)
-        measurement = (
-            4 * max(self.source.encoder_step_rad, self.options.measurement_step) or 0.004 * self.step
-        )
+        finest = max(self.source.encoder_step_rad, self.options.measurement_step)
+        measurement = 4 * finest or 0.004 * self.step
         words = conditions.coarse_steps(command, measurement, UNITS[OUTPUT_NAMES[self.measured]])
         return self._run("coarse", words, steps=(measurement, command))
 
@@ -219,7 +237,8 @@ class ConditionBench:
         if limit is None:
             return []
         free = self._unlimited
-        peak = float(np.max(np.abs(self.predict(self.reference, law=free).command)))
+        command = self.predict(self.reference, law=free).command
+        peak = float(np.max(np.abs(command)))
         reference = self.reference * (_OVERDRIVEN * limit / peak)
         limit_known = conditions.overdriven(_OVERDRIVEN, known=True)
         limit_ignored = conditions.overdriven(_OVERDRIVEN, known=False)
@@ -250,7 +269,8 @@ class ConditionBench:
         exchanged by name; steps: of measurement and command."""
         reference = self.reference if reference is None else reference
         predicted = self.predict(reference, law=law, output_disturbance=output_disturbance, clip=clip)
-        extra = list((self.effects | {k: dict(v) for k, v in (effects or {}).items()}).values())
+        changed = {name: dict(effect) for name, effect in (effects or {}).items()}
+        extra = list((self.effects | changed).values())
         rng = self.rng.spawn(1)[0]
         arm = encoded_arm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)
         measurement, command = steps or (self.options.measurement_step, self.options.quantisation)

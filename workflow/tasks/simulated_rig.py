@@ -68,11 +68,13 @@ def simulate_record(source: SimulatedSource, entry: SimulatedRecord, seed: int) 
         output = quantised(output, source.encoder_step_rad)
     else:
         slope = source.loop.derivative_Vs_per_rad / dt_s
+        # In z: K = proportional + slope (1 - 1/z), whose one state is the last error.
+        proportional = source.loop.proportional_V_per_rad
         law = Controller(
             np.zeros((1, 1)),
             np.ones((1, 1)),
             np.array([[-slope]]),
-            np.array([[source.loop.proportional_V_per_rad + slope]]),
+            np.array([[proportional + slope]]),
             dt_s,
             computational_delay_samples=0,
             input_limit=source.input_limit,
@@ -238,8 +240,10 @@ def truth_of(source: SimulatedSource) -> Truth:
     a = equations_of_motion(machine, source.modes or default_n_modes(rig)).state_matrix()
     poles = np.linalg.eigvals(a)
     omega = np.abs(poles)
-    zeta = -poles.real / np.maximum(np.abs(poles), np.finfo(float).tiny)
-    swings = (poles.imag > 0) & (zeta < LARGEST_DAMPING) & (omega < np.pi / rig.sampling.dt_s)
+    zeta = -poles.real / np.maximum(omega, np.finfo(float).tiny)
+    nyquist_rad_s = np.pi / rig.sampling.dt_s
+    # One of each pair, lightly damped, and slow enough to be sampled.
+    swings = (poles.imag > 0) & (zeta < LARGEST_DAMPING) & (omega < nyquist_rad_s)
     order = np.argsort(omega[swings])
     pairs = zip(omega[swings][order].tolist(), zeta[swings][order].tolist(), strict=True)
     modes = tuple(TrueMode(frequency_Hz=w / (2 * np.pi), damping=z) for w, z in pairs)
@@ -270,8 +274,10 @@ def beside(found: IdentifiedChannel, true: Sequence[TrueMode]) -> tuple[TrueMode
     modes = [mode for mode in found.modes if found.is_mode(mode)]
     if not modes or not true:
         return (None,) * len(found.modes)
-    distance = np.abs(np.log([[mode.frequency_Hz / other.frequency_Hz for other in true] for mode in modes]))
+    ratios = [[mode.frequency_Hz / other.frequency_Hz for other in true] for mode in modes]
+    distance = np.abs(np.log(ratios))
     nearest = distance.argmin(axis=1).tolist()
     back = distance.argmin(axis=0).tolist()
+    # Each is the nearest of the other: two found modes cannot share a true one.
     matched = {modes[i]: true[j] for i, j in enumerate(nearest) if back[j] == i}
     return tuple(matched.get(mode) for mode in found.modes)

@@ -233,10 +233,12 @@ def uncertainty_of(
         refuse_unexplained(result, uncertain.agreement, friction, position=position)
     # In a loop friction biases damping and poles, also where a noise model leaves white residuals.
     rubs = friction is None and remote is None and result.closed_loop is not None and not white
+    # Where friction is looked at elsewhere, or cannot show, the advice is not to look for it again.
+    may_be_friction = friction is None and band is None and not result.increments and not rubs and position
     advice = residual_advice(
         *tests,
         noise_order=uncertain.noise_order,
-        friction=friction is None and band is None and not result.increments and not rubs and position,
+        friction=may_be_friction,
         observer=observer and at_shaft,
     )
     if remote is not None:
@@ -304,17 +306,29 @@ def uncertain_channel(
     refuse_unanswered(linear, omega, result.identification.warnings, why=why)
     frequency = posterior.at(omega, level)
     intervals = intervals_of(linear, linear_poles.without(model.unstable), level)
-    pairs = model.stable_poles.pairs[np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")]
-    untold = [i for i, mode in enumerate(intervals.modes if intervals else ()) if not mode.told]
-    nominal = nominal_of(posterior, poles, omega, pairs[untold])
+    by_frequency = np.argsort(model.stable_poles.omega_rad_s(model.dt_s), kind="stable")
+    pairs = model.stable_poles.pairs[by_frequency]
+    modes = intervals.modes if intervals else ()
+    untold = [i for i, mode in enumerate(modes) if not mode.told]
+    # A pair that the records do not tell may move: the nominal model is fitted with it free.
+    free_pairs = pairs[untold]
+    nominal = nominal_of(posterior, poles, omega, free_pairs)
     further_parts = tuple(
         UncertainMember(
             rate_part(member.from_rad_s, member.to_rad_s),
             member.response,
-            nominal_of(member.response, member.poles, omega, pairs[untold]),
+            nominal_of(member.response, member.poles, omega, free_pairs),
             bands_of(member.response.at(omega, level)),
         )
         for member in members[1:]
+    )
+    # A set of one part needs no name for it.
+    about = rate_part(members[0].from_rad_s, members[0].to_rad_s) if further_parts else ""
+    empirical = empirical_response(
+        result.bounded,
+        integrators=0 if result.increments else model.integrators,
+        level=level,
+        band_rad_s=result.data_band_rad_s,
     )
     return UncertainChannel(
         name=result.name,
@@ -323,17 +337,12 @@ def uncertain_channel(
         posterior=posterior,
         nominal=nominal,
         frequency=frequency,
-        empirical=empirical_response(
-            result.bounded,
-            integrators=0 if result.increments else model.integrators,
-            level=level,
-            band_rad_s=result.data_band_rad_s,
-        ),
+        empirical=empirical,
         bands=bands_of(frequency),
         tests=tests,
         agreement=NominalAgreement.of(frequency, nominal.frequency_response),
         intervals=intervals,
-        about=rate_part(members[0].from_rad_s, members[0].to_rad_s) if further_parts else "",
+        about=about,
         others=further_parts,
     )
 
@@ -341,13 +350,18 @@ def uncertain_channel(
 def bands_of(frequency: FrequencyUncertainty) -> tuple[Band, ...]:
     """Size of ellipses in `N_BANDS` bands of equal ratio over their frequencies, lowest first."""
     omega = frequency.omega_rad_s
-    relative = 100 * frequency.ellipse().semi_major / np.abs(frequency.centre)
-    edges = np.geomspace(omega[0], omega[-1] * (1 + 1e-9), N_BANDS + 1).tolist()
+    semi_major = frequency.ellipse().semi_major
+    relative = 100 * semi_major / np.abs(frequency.centre)
+    # The last band holds its end.
+    end = omega[-1] * (1 + 1e-9)
+    edges = np.geomspace(omega[0], end, N_BANDS + 1).tolist()
     bands = []
     for low, high in pairwise(edges):
         is_in_band = (omega >= low) & (omega < high)
         radii = relative[is_in_band]
-        bands.append(Band(low, high, float(np.median(radii)), float(np.max(radii))))
+        median_percent = float(np.median(radii))
+        largest_percent = float(np.max(radii))
+        bands.append(Band(low, high, median_percent, largest_percent))
     return tuple(bands)
 
 
@@ -440,11 +454,12 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
     """Frequencies (F,) for pictures: from one period per longest record to Nyquist, denser at modes."""
     longest_s = max(record.n_samples for record in records) * model.dt_s
     poles = model.poles
-    modes = [
-        Mode(float(omega), float(zeta))
-        for omega, zeta in zip(poles.omega_rad_s(model.dt_s), poles.zeta(), strict=True)
-        if zeta < 0.4
-    ]
+    frequencies = poles.omega_rad_s(model.dt_s)
+    modes = []
+    for omega, zeta in zip(frequencies, poles.zeta(), strict=True):
+        # The response of a more damped pair is smooth: the plain grid shows it.
+        if zeta < 0.4:
+            modes.append(Mode(float(omega), float(zeta)))
     low = 2 * np.pi / longest_s
     high = np.pi / model.dt_s
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
@@ -460,13 +475,16 @@ def intervals_of(posterior: ResponsePosterior, poles: Poles, level: float) -> In
     except ValueError:
         return None
     by_frequency = np.argsort(poles.omega_rad_s(posterior.dt_s), kind="stable")
+    # A pole at or left of z = 0 has no decay rate.
     slowest_first = [i for i in np.argsort(-poles.real, kind="stable") if poles.real[i] > 0]
+    modes = []
+    for i in by_frequency:
+        omega_ends = _interval(intervals.omega_rad_s[i])
+        zeta_ends = _interval(intervals.zeta[i])
+        modes.append(ModeInterval(omega_ends, zeta_ends))
     return Intervals(
         level,
-        tuple(
-            ModeInterval(_interval(intervals.omega_rad_s[i]), _interval(intervals.zeta[i]))
-            for i in by_frequency
-        ),
+        tuple(modes),
         tuple(_interval(intervals.decay_per_s[i]) for i in slowest_first),
         tuple(_interval(ends) for ends in growth_intervals(posterior, level)),
     )
@@ -556,7 +574,10 @@ def scatter_of(
         return None
     posteriors = repeat_posteriors(repeated, result.identification.model, channel.embedding)
     low, high = result.data_band_rad_s or (bands[0][0], bands[-1][1])
-    edges = np.geomspace(low, high * (1 - 1e-6), max(round(2 * np.log10(high / low)), 1) + 1)
+    # Two bands a decade, one at least; the last edge lies inside the data.
+    decades = np.log10(high / low)
+    n_bands = max(round(2 * decades), 1)
+    edges = np.geomspace(low, high * (1 - 1e-6), n_bands + 1)
     omega = np.geomspace(low, high * (1 - 2e-6), 20 * len(edges))
     estimates = [[each.at(omega, channel.uncertainty.level) for each in group] for group in posteriors]
     return tuple(repeat_scatter(estimates, list(pairwise(edges.tolist()))))

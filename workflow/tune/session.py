@@ -193,9 +193,9 @@ class TuningSession:
         specification, _, level = self._read(values)
         plant = self.file.plant
         if level is not None:
-            plant = PlantSection.model_validate(
-                plant.model_dump(exclude_unset=True) | {"level": level}, context={"base": Path()}
-            )
+            # What the page sets replaces what the file says; all else stands as it was written.
+            sections = plant.model_dump(exclude_unset=True) | {"level": level}
+            plant = PlantSection.model_validate(sections, context={"base": Path()})
         return self.file.model_copy(update={"specification": specification, "plant": plant})
 
     # -- designs ---------------------------------------------------------------------------------------------
@@ -212,22 +212,26 @@ class TuningSession:
         responses = [last.response(data.ellipses.omega_rad_s, with_delay=False) for data in plant_data]
         ranked = []
         for gain in _GAINS.tolist():
-            worst_cases = [
-                WorstCase(
-                    data.ellipses.omega_rad_s,
-                    data.ellipses,
-                    gain * response * data.delay,
-                    data.weighted(gain * response),
+            worst_cases = []
+            for data, response in zip(plant_data, responses, strict=True):
+                law_response = gain * response
+                worst_cases.append(
+                    WorstCase(
+                        data.ellipses.omega_rad_s,
+                        data.ellipses,
+                        law_response * data.delay,
+                        data.weighted(law_response),
+                    )
                 )
-                for data, response in zip(plant_data, responses, strict=True)
-            ]
-            gamma = max(float(np.max(worst_of(worst_case.values))) for worst_case in worst_cases)
+            largest = [np.max(worst_of(worst_case.values)) for worst_case in worst_cases]
+            gamma = max(map(float, largest))
             ranked.append((gamma, abs(math.log(gain)), gain, worst_cases))
 
         # The best one whose loop is stable; of two equal ones the one that changes less.
         for gamma, _, gain, worst_cases in sorted(ranked, key=itemgetter(0, 1)):
             law = replace(last, C=gain * last.C, D=gain * last.D, anti_windup_gain=None)
-            if all(np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants):
+            is_stable = [np.all(np.abs(closed_loop_poles(law, plant)) < 1) for plant in plants]
+            if all(is_stable):
                 margins = [
                     loop_margins(law, plant, worst_case)[1:3]
                     for plant, worst_case in zip(plants, worst_cases, strict=True)
@@ -310,15 +314,20 @@ class TuningSession:
         margins = [(verdict.worst_margins, verdict.bandwidth_rad_s) for verdict in certificate.plants]
         at_limits = limited_loops(certificate)
         seen = self._seen(law, plants, used, certificate.gamma, margins, at_limits)
-        items = [
-            {
-                "requirement": item.requirement + (f" ({item.plant})" if len(plants) > 1 else ""),
-                "required": ("≥ " if item.at_least else "≤ ") + si(item.required, item.unit, 4),
-                "achieved": unit(bound(item.achieved, item.at_least), item.unit),
-                "met": item.met,
-            }
-            for item in certificate.items
-        ]
+        items = []
+        for item in certificate.items:
+            # With one plant there is nothing to tell apart.
+            of_plant = f" ({item.plant})" if len(plants) > 1 else ""
+            direction = "≥ " if item.at_least else "≤ "
+            achieved = bound(item.achieved, item.at_least)
+            items.append(
+                {
+                    "requirement": item.requirement + of_plant,
+                    "required": direction + si(item.required, item.unit, 4),
+                    "achieved": unit(achieved, item.unit),
+                    "met": item.met,
+                }
+            )
         numbers |= {"certified": certificate.certified, "gamma": certificate.gamma, "items": items}
         return {**_finite(numbers), **seen, "reason": certificate_reason(certificate)}
 
@@ -378,9 +387,10 @@ class TuningSession:
         numbers = engineers_numbers(law)
         if numbers is not None:
             numbers = replace(numbers, gain_unit=gain_unit_of(*self._units))
+        worst_margins = reduce(Margins.worse, [worst for worst, _ in margins])
         rows = tune_rows(
             gamma,
-            reduce(Margins.worse, [worst for worst, _ in margins]),
+            worst_margins,
             min(bandwidth for _, bandwidth in margins),
             [step_metrics(nominal) for nominal, *_ in runs],
             input_unit=self._units[0],
@@ -393,7 +403,8 @@ class TuningSession:
         for plant, (nominal, *drawn) in zip(plants, runs, strict=True):
             y = nominal.measured
             # The step until it hardly moves: beyond its settling to 2 %.
-            away = np.flatnonzero(np.abs(y - y[-1]) > 0.01 * self.step_size)
+            distance = np.abs(y - y[-1])
+            away = np.flatnonzero(distance > 0.01 * self.step_size)
             shown = 40
             if away.size:
                 shown = max(shown, int(1.5 * (away[-1] + 1)))
@@ -401,19 +412,21 @@ class TuningSession:
             friction_curves = []
             if self._friction is not None:
                 friction_curves = self._friction.curves(law, shown, self._reference_step(law, plant))
+            step_curves = {
+                "end": float(nominal.time_s[shown - 1]),
+                "nominal": line(nominal, shown),
+                "samples": [line(run, shown) for run in drawn],
+                "friction": friction_curves,
+            }
+            grid = _shown_grid(law, plant, specification)
             curves.append(
                 {
                     "name": plant.name,
                     "gains": _gains(law, plant, specification, self._units, self._performance_unit),
                     "nyquist": _nyquist(law, plant),
-                    "bode": bode(law, plant, _shown_grid(law, plant, specification), self._units),
+                    "bode": bode(law, plant, grid, self._units),
                     "roots": roots(law, plant),
-                    "step": {
-                        "end": float(nominal.time_s[shown - 1]),
-                        "nominal": line(nominal, shown),
-                        "samples": [line(run, shown) for run in drawn],
-                        "friction": friction_curves,
-                    },
+                    "step": step_curves,
                 }
             )
         return {"numbers": [(row.name, row.text) for row in rows], "plants": curves}
@@ -490,18 +503,22 @@ def _gains(
         output_unit=units[1],
         performance_unit=performance_unit,
     )
-    return [
-        {
-            "symbol": curve.symbol,
-            "meaning": curve.meaning,
-            "unit": curve.unit,
-            "x": short(curve.omega_rad_s),
-            "nominal": short(curve.nominal),
-            "worst": short(np.where(curve.worst < _UNBOUNDED, curve.worst, np.nan)),
-            "limit": short(curve.limit),
-        }
-        for curve in curves
-    ]
+    drawn = []
+    for curve in curves:
+        # A gap in the curve where the worst case has no bound.
+        worst = np.where(curve.worst < _UNBOUNDED, curve.worst, np.nan)
+        drawn.append(
+            {
+                "symbol": curve.symbol,
+                "meaning": curve.meaning,
+                "unit": curve.unit,
+                "x": short(curve.omega_rad_s),
+                "nominal": short(curve.nominal),
+                "worst": short(worst),
+                "limit": short(curve.limit),
+            }
+        )
+    return drawn
 
 
 def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
@@ -516,12 +533,14 @@ def _nyquist(law: Controller, plant: UncertainPlant) -> dict[str, Any]:
     # Ellipses at some of the frequencies, evenly spread over the part that is seen.
     at = np.flatnonzero(np.abs(loop) < _NEAR)
     if at.size:
-        at = at[np.unique(np.linspace(0, at.size - 1, _ELLIPSES).astype(int))]
+        evenly = np.linspace(0, at.size - 1, _ELLIPSES).astype(int)
+        at = at[np.unique(evenly)]
     turn = np.exp(2j * np.pi * np.arange(_CORNERS) / _CORNERS)
     part = ellipses.subset(at)
     major = part.semi_major[:, None] * turn.real
     minor = part.semi_minor[:, None] * turn.imag
-    outline = k[at, None] * (part.centre[:, None] + part.direction[:, None] * (major + 1j * minor))
+    about_centre = part.direction[:, None] * (major + 1j * minor)
+    outline = k[at, None] * (part.centre[:, None] + about_centre)
     # The curve goes on a little beyond the picture's end, so that it does not stop in sight.
     line = np.where(np.abs(loop) < 2 * _NEAR, loop, np.nan)
     return {
@@ -557,7 +576,8 @@ def _control(name: str, schema: Mapping[str, Any], value: Any) -> dict[str, Any]
     setting["optional"] = {"type": "null"} in parts
     if "const" in parts[-1]:
         setting |= {"optional": True, "unasked": parts[-1]["const"]}
-    kind = _KINDS.get("enum" if "enum" in parts[0] else parts[0].get("type", ""))
+    type_name = "enum" if "enum" in parts[0] else parts[0].get("type", "")
+    kind = _KINDS.get(type_name)
     if kind is None:
         return None
     if kind == "choice":
