@@ -156,8 +156,10 @@ def _each_margin(place: str, margins: Margins, of: str) -> tuple[Row, ...]:
     """A row for each margin; an infinite one is unlimited."""
     # A gain may rise up to one factor and fall down to another: the margin is the nearer of the two.
     factors = [margins.gain_up] if math.isfinite(margins.gain_up) else []
-    factors += [1.0 / margins.gain_down] if margins.gain_down else []
-    gain_dB = 20 * math.log10(min(factors)) if factors and min(factors) > 0 else None
+    if margins.gain_down:
+        factors.append(1.0 / margins.gain_down)
+    smallest = min(factors, default=0.0)
+    gain_dB = 20 * math.log10(smallest) if smallest > 0 else None
     phase_deg = math.degrees(margins.phase_rad) if math.isfinite(margins.phase_rad) else None
     delay_ms = 1e3 * margins.delay_s if math.isfinite(margins.delay_s) else None
     rows = []
@@ -264,14 +266,12 @@ def margins_page(view: RunView, *, is_design: bool) -> PageSection:
     blocks.append(_requirements_table(certificate, view, several=several))
     modes = [(plant, mode) for plant in certificate.plants for mode in plant.closed_loop_modes]
     if modes:
-        rows = [
-            (
-                (f"{plant.plant}: " if several else "") + number(hertz(mode.omega_rad_s)),
-                number(mode.omega_rad_s),
-                number(mode.zeta),
+        rows = []
+        for plant, mode in modes:
+            of_plant = f"{plant.plant}: " if several else ""
+            rows.append(
+                (of_plant + number(hertz(mode.omega_rad_s)), number(mode.omega_rad_s), number(mode.zeta))
             )
-            for plant, mode in modes
-        ]
         head = ("mode of the nominal closed loop [Hz]", "[rad/s]", "damping ratio [1]")
         blocks.append(Table(head, tuple(rows)))
     blocks += _samples_of(view)
@@ -324,18 +324,18 @@ def _in_python_control(view: RunView) -> Fold:
         '* numpy.pi / G["dt_s"]))[:3])'
     )
     margins_of = view.model_margins()
-    printed = "".join(
-        f"{name} {' '.join(number(value, 4) for value in values)}\n"
-        for name, (values, _) in margins_of.items()
-    )
-    at_ends = [
-        Text(
-            f"{name} has its gain margin, {number(values[0], 4)}, at the end of the frequencies (zero or "
-            "Nyquist). python-control does not look there and prints another."
-        )
-        for name, (values, at_end) in margins_of.items()
-        if at_end
-    ]
+    printed = ""
+    at_ends = []
+    for name, (values, at_end) in margins_of.items():
+        digits = " ".join(number(value, 4) for value in values)
+        printed += f"{name} {digits}\n"
+        if at_end:
+            at_ends.append(
+                Text(
+                    f"{name} has its gain margin, {number(values[0], 4)}, at the end of the frequencies "
+                    "(zero or Nyquist). python-control does not look there and prints another."
+                )
+            )
     blocks: list[Block] = [
         Text(
             "Gain (a factor), phase [deg] and modulus margin of the nominal model (model.json), which "
@@ -362,11 +362,13 @@ def _requirements_table(certificate: Certificate, view: RunView, *, several: boo
         reached = yes_no(item.met)
         if item.met and item.at_least and item.achieved < item.required:
             reached += " (to the solver's accuracy)"
+        concession = gave_way_beside(item.requirement, view.gave_way)
+        achieved = bound(item.achieved, item.at_least)
         rows.append(
             (
-                f"{name} {gave_way_beside(item.requirement, view.gave_way)}".rstrip(),
+                f"{name} {concession}".rstrip(),
                 si(item.required, item.unit),
-                unit(bound(item.achieved, item.at_least), item.unit),
+                unit(achieved, item.unit),
                 both_frequencies(item.omega_rad_s),
                 bound(item.bound, item.at_least),
                 reached,

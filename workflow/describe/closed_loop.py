@@ -103,7 +103,8 @@ def spread(check: LoopCheck, metric: str, unit: str) -> str:
     if not reached:
         return f"predicted {first}, achieved never"
     achieved = f"{extent(reached)} {unit}".rstrip()
-    return f"predicted {first}, achieved {achieved}" + (f" ({never} never)" if never else "")
+    some_never = f" ({never} never)" if never else ""
+    return f"predicted {first}, achieved {achieved}{some_never}"
 
 
 def largest(check: LoopCheck, metric: str, more: Sequence[float | None] = ()) -> float | None:
@@ -168,11 +169,10 @@ def not_the_arm(check: LoopCheck | None, bandwidth_rad_s: float, effects: Sequen
         if measured.beyond_bandwidth(bandwidth_rad_s) is None:
             continue
         of_the_check = index == 2
-        arms.append(
-            f"with {listing(effect['name'] for effect in effects)}"
-            if of_the_check
-            else f"on the {measured.name}"
-        )
+        if of_the_check:
+            arms.append(f"with {listing(effect['name'] for effect in effects)}")
+        else:
+            arms.append(f"on the {measured.name}")
     return f"; measured less {listing(arms)}" if arms else ""
 
 
@@ -292,22 +292,23 @@ def measured_beyond_text(found: MeasuredBeyond, effects: Sequence[Mapping[str, A
         effects: Of the arm of the closed-loop check.
     """
     row = found.measured
-    about = {
+    causes = {
         "effects": f"with {effects_text(effects)}: the records were made without",
         "size": "as identified at small references, where dry friction weighs more",
         "model": "as identified: it has friction, or the model is not right",
-    }[found.cause]
+    }
+    about = causes[found.cause]
     places = []
     if found.line is not None:
-        places.append(
-            f"{number(row.magnitude[found.line])} at {number(row.omega_rad_s[found.line])} rad/s "
-            f"(specification: below {number(found.limit[found.line])})"
-        )
+        magnitude = number(row.magnitude[found.line])
+        omega = number(row.omega_rad_s[found.line])
+        limit = number(found.limit[found.line])
+        places.append(f"{magnitude} at {omega} rad/s (specification: below {limit})")
     if found.bandwidth_line is not None:
+        magnitude = number(row.magnitude[found.bandwidth_line])
+        omega = number(row.omega_rad_s[found.bandwidth_line])
         places.append(
-            f"{number(row.magnitude[found.bandwidth_line])} at "
-            f"{number(row.omega_rad_s[found.bandwidth_line])} rad/s, where every plant in the uncertainty "
-            "set is below -3 dB (0.707)"
+            f"{magnitude} at {omega} rad/s, where every plant in the uncertainty set is below -3 dB (0.707)"
         )
     return f"the certificate does not cover the arm {about}. Measured |S| is {' and '.join(places)}"
 
@@ -388,31 +389,21 @@ def _command_remarks(check: LoopCheck, view: RunView) -> list[Block]:
     seen = view.largest_recorded(view.config.control_channel.input)
     blocks: list[Block] = []
     if peak > _BEYOND_RECORDED * seen:
-        blocks.append(
-            Remarks(
-                (
-                    f"The command reaches {si(peak, input_unit)}, {number(peak / seen, 2)} times the largest "
-                    f"input in the records of the fit ({si(seen, input_unit)}). The records do not show how "
-                    "the arm answers there. Set effort_limit or input_limit in [specification], or a smaller "
-                    "closed_loop.reference_step.",
-                ),
-                "warning",
-            )
+        times = number(peak / seen, 2)
+        beyond = (
+            f"The command reaches {si(peak, input_unit)}, {times} times the largest input in the records of "
+            f"the fit ({si(seen, input_unit)}). The records do not show how the arm answers there. Set "
+            "effort_limit or input_limit in [specification], or a smaller closed_loop.reference_step."
         )
+        blocks.append(Remarks((beyond,), "warning"))
     equivalent = view.results.uncertainty.equivalent
     if equivalent is not None and peak < equivalent.rms:
-        blocks.append(
-            Remarks(
-                (
-                    f"The command peaks at {si(peak, input_unit)}, below the amplitude that the certificate "
-                    f"is about ({si(equivalent.rms, input_unit)} rms). So small a motion meets more "
-                    "friction; see "
-                    '"Dry friction in the loop". Record with smaller inputs, or describe the arm "without '
-                    'friction".',
-                ),
-                "warning",
-            )
+        below = (
+            f"The command peaks at {si(peak, input_unit)}, below the amplitude that the certificate is about "
+            f"({si(equivalent.rms, input_unit)} rms). So small a motion meets more friction; see "
+            '"Dry friction in the loop". Record with smaller inputs, or describe the arm "without friction".'
         )
+        blocks.append(Remarks((below,), "warning"))
     return blocks
 
 
@@ -440,7 +431,8 @@ def _metrics_table(check: LoopCheck, output_unit: str, further_rows: Sequence[Ro
     rows = []
     for row in further_rows:
         name = row.name
-        never = [each for each in check.achieved if getattr(each, row.key.rpartition(".")[2]) is None]
+        metric = row.key.rpartition(".")[2]
+        never = [run for run in check.achieved if getattr(run, metric) is None]
         if never:
             name += f" ({len(never)} of {check.draws} runs never)"
         ends = row.value.plain
@@ -485,22 +477,25 @@ def _sensitivity_blocks(check: LoopCheck, view: RunView) -> list[Block]:
                 "dry friction takes a fixed torque from a smaller motor torque, so the loop gain falls and "
                 "|S| goes towards 1."
             )
+        direction = "lower" if apart < 0 else "higher"
         said_of.append(
-            f"With a tenth of the excitation the peak is {percent(abs(apart), 2)} "
-            f"{'lower' if apart < 0 else 'higher'} than predicted: {why}"
+            f"With a tenth of the excitation the peak is {percent(abs(apart), 2)} {direction} than "
+            f"predicted: {why}"
         )
-    rows = [
-        (
-            row.name,
-            si(row.reference_rms, view.output_unit),
-            f"{number(row.peak, 4)} ± {number(row.peak_std, 2)}",
-            both_frequencies(row.peak_omega_rad_s),
-            signed(row.off_nominal_percent),
-            signed(row.off_certified_percent),
-            number(100 * row.limited_fraction, 2),
+    rows = []
+    for row in sensitivity.measured:
+        peak = f"{number(row.peak, 4)} ± {number(row.peak_std, 2)}"
+        rows.append(
+            (
+                row.name,
+                si(row.reference_rms, view.output_unit),
+                peak,
+                both_frequencies(row.peak_omega_rad_s),
+                signed(row.off_nominal_percent),
+                signed(row.off_certified_percent),
+                number(100 * row.limited_fraction, 2),
+            )
         )
-        for row in sensitivity.measured
-    ]
     head = (
         "measured on",
         "reference, rms",

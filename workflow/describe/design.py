@@ -60,20 +60,22 @@ def any_order(achievable: AchievablePerformance, gamma: float | None, order: int
 
 def gave_way_text(found: Sequence[GaveWay]) -> str:
     """What gave way beside the bandwidth: "effort_limit = 2.31 in place of 2.2"."""
-    return ", ".join(
-        f"{item.key} = {number(item.used)} in place of {number(item.asked)}"
-        for item in found
-        if item.key != "bandwidth_rad_s"
-    )
+    concessions = []
+    for item in found:
+        # The sentence on the bandwidth says its own.
+        if item.key != "bandwidth_rad_s":
+            concessions.append(f"{item.key} = {number(item.used)} in place of {number(item.asked)}")
+    return ", ".join(concessions)
 
 
 def gave_way_beside(caption: str, found: Sequence[GaveWay]) -> str:
     """What of a requirement gave way, behind its caption in a certificate."""
-    return " ".join(
-        f"({item.key} gave way: {number(item.used)} in place of {number(item.asked)})"
-        for item in found
-        if item.caption == caption
-    )
+    concessions = []
+    for item in found:
+        if item.caption == caption:
+            values = f"{number(item.used)} in place of {number(item.asked)}"
+            concessions.append(f"({item.key} gave way: {values})")
+    return " ".join(concessions)
 
 
 def sampled(found: SampledResponses, shares: Mapping[str, Any] | None) -> str:
@@ -218,9 +220,9 @@ def run_verdict(
     elif check is None:
         said_of = f"not simulated in closed loop: {loop.skipped}"
     elif check.settled_draws != check.draws:
+        unsettled = check.draws - check.settled_draws
         said_of = (
-            f"the closed loop did not settle in {check.draws - check.settled_draws} of {check.draws} runs; "
-            f"{watch_longer(check)}"
+            f"the closed loop did not settle in {unsettled} of {check.draws} runs; {watch_longer(check)}"
         )
     else:
         said_of = _met(design, check, asked)
@@ -296,12 +298,14 @@ def design_verdict(
         )
     if certificate.certified:
         concessions = gave_way_text(given_way)
-        parts = [
-            "" if asked is None else sentences.lowered(asked, design.specification, (), 0),
-            f"with {concessions}" if concessions else "",
-            "" if asked is None else sentences.tracking_begins(asked, design.specification),
-        ]
-        said_of = "; ".join([design.reason, *(part for part in parts if part)])
+        parts = [design.reason]
+        if asked is not None:
+            parts.append(sentences.lowered(asked, design.specification, (), 0))
+        if concessions:
+            parts.append(f"with {concessions}")
+        if asked is not None:
+            parts.append(sentences.tracking_begins(asked, design.specification))
+        said_of = "; ".join(part for part in parts if part)
     else:
         unstable = "".join(
             f"{plant.plant}: nominal closed loop unstable; "
@@ -334,12 +338,11 @@ def guard_verdict(
     if not certify.certified:
         return _joined(f"not certified: {certify.reason}", f"{written} is not written" if written else "")
     if worse:
-        numbers = ",".join(
-            f" {plant} {name} {number(value, 4)} ({number(held, 4)})" for plant, name, value, held, _ in worse
-        )
-        return _joined(
-            f"certified, but worse than {baseline}:{numbers}", f"written to {written}" if written else ""
-        )
+        numbers = []
+        for plant, name, value, held, _ in worse:
+            numbers.append(f"{plant} {name} {number(value, 4)} ({number(held, 4)})")
+        is_written = f"written to {written}" if written else ""
+        return _joined(f"certified, but worse than {baseline}: {', '.join(numbers)}", is_written)
     said_of = "certified: every requirement is met"
     if baseline:
         said_of += f", and nothing is worse than in {baseline}"
@@ -361,12 +364,13 @@ def design_page(view: RunView) -> PageSection:
     if isinstance(synthesis, SynthesisResult):
         stable = sum(start.stable for start in synthesis.starts)
         starts = f" from {count(len(synthesis.starts), 'start')} ({stable} stable)"
+    stated_rows = tuple((key, json.dumps(value)) for key, value in stated.items())
     blocks: list[Block] = [
         Text(
             f"A controller of order {asked.controller_order} ({asked.structure}) with {delay} of "
             f"computational delay was {to_be}optimised over the ellipses{starts}."
         ),
-        Table(("specified", "value"), tuple((key, json.dumps(value)) for key, value in stated.items())),
+        Table(("specified", "value"), stated_rows),
     ]
     if synthesis is None:
         blocks.append(Remarks((sentence(design.reason),), "warning", "No controller was designed"))
@@ -376,11 +380,8 @@ def design_page(view: RunView) -> PageSection:
     else:
         blocks += _loop_pictures(view)
         blocks += _any_order_blocks(results.achievable_performance, design.gamma, asked.controller_order)
-        blocks += controller_blocks(
-            view.engineers_numbers,
-            asked.computational_delay_samples,
-            view.signals if "as logged" in view.signals else "",
-        )
+        as_logged = view.signals if "as logged" in view.signals else ""
+        blocks += controller_blocks(view.engineers_numbers, asked.computational_delay_samples, as_logged)
         blocks.append(
             Copy(
                 "Controller K to copy: zeros and poles, transfer function, second-order sections (limits and "

@@ -140,29 +140,26 @@ def rig_page(
         f"measured less simulated.{fitted}",
         (view.found,),
     )
+    bullets = first_bullets(view, in_short(view.place, view.floor), advice)
     first = FirstScreen(
         headline(view),
         "plain",
         numbers(view),
-        first_bullets(view, in_short(view.place, view.floor), advice),
+        bullets,
         picture,
         "findings",
         "Findings",
         below=_files_to_take(view, bool(effects_text)),
     )
     case_name = view.found.case.name
+    unchecked = unchecked_of_rig(view, simulated_loop=check is not None)
+    next_sections = [] if proposed is None else [_next_section(view, proposed)]
+    controller = controller_blocks(check, no_check)
     sections = (
         *common_sections(view, suspected),
-        *([] if proposed is None else [_next_section(view, proposed)]),
-        PageSection(
-            "controller", "What it means for the controller", "Controller", controller_blocks(check, no_check)
-        ),
-        PageSection(
-            "unchecked",
-            "What was not checked",
-            "Not checked",
-            (Remarks(unchecked_of_rig(view, simulated_loop=check is not None), "warning"),),
-        ),
+        *next_sections,
+        PageSection("controller", "What it means for the controller", "Controller", controller),
+        PageSection("unchecked", "What was not checked", "Not checked", (Remarks(unchecked, "warning"),)),
         _reproduce_section(view, provenance, rig_text, effects_text),
     )
     return Page(case_name, first, sections)
@@ -190,24 +187,25 @@ def own_plant_page(
         numbers_text: Parameters and effects of the repaired model, as JSON.
     """
     answer = view.found
-    bullets = first_bullets(
-        view, in_short(view.place, view.floor), advice, _of_repaired_file(view, repaired_file)
-    )
+    repaired_words = _of_repaired_file(view, repaired_file)
+    bullets = first_bullets(view, in_short(view.place, view.floor), advice, repaired_words)
     if is_of_forces(answer.case.model_error, model_error):
         threshold = percentage(answer.case.model_error, 3)
         bullets += (
             f"The threshold of {threshold} of the motion is {percentage(model_error)} (model_error) of what "
             "the forces of the actuators make.",
         )
-    replayed = "replayed by plain simulation from its start under its commands alone, "
-    runs_away = " A replay that runs away leaves the frame."
-    picture = Picture(
-        "gap_measured",
-        "Validation record with the largest model error: measured, and "
-        f"{replayed if answer.replays else 'simulated '}before and after. Below: measured less simulated."
-        f"{runs_away if answer.replays else ''}",
-        (answer,),
+    if answer.replays:
+        how = "replayed by plain simulation from its start under its commands alone, "
+        runs_away = " A replay that runs away leaves the frame."
+    else:
+        how = "simulated "
+        runs_away = ""
+    caption = (
+        f"Validation record with the largest model error: measured, and {how}before and after. Below: "
+        f"measured less simulated.{runs_away}"
     )
+    picture = Picture("gap_measured", caption, (answer,))
     sketches = (Sketch(moving, _moving_caption(answer.models[-1])),) if moving else ()
     sections = [*common_sections(view, ())]
     if can_show:
@@ -215,9 +213,8 @@ def own_plant_page(
             "Whatever the answer is: which candidates these records can show, and which they cannot "
             "distinguish. Whether one is present is the answer above."
         )
-        sections.insert(
-            0, PageSection("check", "What these records can tell", "Check", (Text(whatever), *can_show))
-        )
+        can_tell: tuple[Block, ...] = (Text(whatever), *can_show)
+        sections.insert(0, PageSection("check", "What these records can tell", "Check", can_tell))
     unchecked = (
         _ONLY_CANDIDATES,
         "" if answer.case.plant.settled else "Every record is assumed to start as the simulation does.",
@@ -251,7 +248,8 @@ def _of_repaired_file(view: DiagnosisView, file: str) -> tuple[str, ...]:
 def _moving_caption(last_model: Model) -> str:
     beside = ""
     if last_model != "stated":
-        beside = f" and {MODELS[last_model]} ({'blue' if last_model == 'repaired' else 'brown'})"
+        colour = "blue" if last_model == "repaired" else "brown"
+        beside = f" and {MODELS[last_model]} ({colour})"
     return (
         "The machine in this record, from body to body, seen along the axis in which it moves least: "
         f"measured (broad), replayed with nominal parameters (pink){beside}."
@@ -314,37 +312,29 @@ def _where_section(view: DiagnosisView) -> PageSection:
     on_logs = bool(place.dependences) and place.dependences[0].judged_on == "logs"
     floor = "the threshold" if view.rough else "the sensor noise"
     residuals = "in per cent of the motion" if view.rough else "over noise"
-    return PageSection(
-        "where",
-        "Where it lies",
-        "Where",
-        (
-            *map(Text, at_length(place, view.floor, model)),
-            Picture(
-                "gap_bands",
-                f"Size above {floor}, {model}. Pale: not significant.",
-                (place, model_error),
-            ),
-            Picture(
-                "gap_dependences",
-                "What the model error depends on: the force, or the error of a reading, that is missing, "
-                f"over the variable. Drawn on some {'logs' if on_logs else 'blocks'} and judged on the "
-                "others.",
-                (place,),
-            ),
-            Picture(
-                "gap_regimes",
-                "Residual energy while a variable lies in a range. Grey: what chance gives (residuals "
-                "shifted in time). A dot outside: the model error depends on the variable.",
-                (place, model_error),
-            ),
-            Picture(
-                "gap_traces",
-                f"Residuals {residuals} in every experiment: before, and with the best model.",
-                (view.shown,),
-            ),
+    judged_on = "logs" if on_logs else "blocks"
+    pictures = (
+        Picture("gap_bands", f"Size above {floor}, {model}. Pale: not significant.", (place, model_error)),
+        Picture(
+            "gap_dependences",
+            "What the model error depends on: the force, or the error of a reading, that is missing, over "
+            f"the variable. Drawn on some {judged_on} and judged on the others.",
+            (place,),
+        ),
+        Picture(
+            "gap_regimes",
+            "Residual energy while a variable lies in a range. Grey: what chance gives (residuals shifted in "
+            "time). A dot outside: the model error depends on the variable.",
+            (place, model_error),
+        ),
+        Picture(
+            "gap_traces",
+            f"Residuals {residuals} in every experiment: before, and with the best model.",
+            (view.shown,),
         ),
     )
+    paragraphs = [Text(paragraph) for paragraph in at_length(place, view.floor, model)]
+    return PageSection("where", "Where it lies", "Where", (*paragraphs, *pictures))
 
 
 def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection:
@@ -370,10 +360,10 @@ def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection
         blocks.append(Picture("gap_partial", caption, (view.partial,)))
     if view.of_rig:
         by_probability = sorted(view.place.subsystem.items(), key=lambda item: item[1], reverse=True)
-        lines = [
-            (_SUBSYSTEMS.get(name, name.replace("_", " ")), probability_words(probability))
-            for name, probability in by_probability
-        ]
+        lines = []
+        for part, share_of_it in by_probability:
+            subsystem = _SUBSYSTEMS.get(part, part.replace("_", " "))
+            lines.append((subsystem, probability_words(share_of_it)))
         blocks.append(Table(("subsystem", "probability"), tuple(lines), "The same, added up by subsystem."))
     return PageSection("which", "Which effect, and how sure", "Which", tuple(blocks))
 
@@ -417,7 +407,8 @@ def carried_table(view: DiagnosisView) -> Table:
     lines: list[tuple[str, ...]] = []
     if answer.shares:
         for name, (explained, low, high) in answer.shares.carried.items():
-            cells = (in_words(name), percentage(explained), f"{percentage(low)} to {percentage(high)}")
+            range_words = f"{percentage(low)} to {percentage(high)}"
+            cells = (in_words(name), percentage(explained), range_words)
             significant = ("no" if name in answer.shares.small else "yes",) if answer.combination else ()
             lines.append((*cells, *significant))
     return Table(head, tuple(lines), caption)
@@ -508,7 +499,8 @@ def nominal_table(view: DiagnosisView) -> Table:
     lines = []
     for key, tolerances in view.moved.items():
         nominal = value_words(key, stated.value(key), 5)
-        cells = [key_words(key), nominal, value_words(key, answer.rig.value(key), 5), signed(tolerances)]
+        now = value_words(key, answer.rig.value(key), 5)
+        cells = [key_words(key), nominal, now, signed(tolerances)]
         if answer.added:
             cells.append(signed(without_effects[key]))
         lines.append(tuple(cells))
@@ -567,28 +559,20 @@ def controller_blocks(check: ControllerCheck | None, no_check: str) -> tuple[Blo
     trial = check.trial
     asked = check.specification
     order = count(int(asked.controller_order), "state")
+    outputs_m = [run.tip_m for run in check.runs]
+    commands_V = [run.command_V for run in check.runs]
     picture = Picture(
         "gap_controller",
         "A step of the hub angle, then a short push. Left: designed with nominal parameters. Right: same "
         "specification, repaired rig.",
-        (
-            trial.time_s,
-            trial.reference_m,
-            [run.tip_m for run in check.runs],
-            [run.command_V for run in check.runs],
-        ),
+        (trial.time_s, trial.reference_m, outputs_m, commands_V),
     )
-    lines = [
-        (
-            run.design,
-            run.machine,
-            number(run.cost_s, 4),
-            number(run.modulus_margin, 4),
-            number(run.peak_command_V, 4),
-            yes_no(run.settles),
-        )
-        for run in check.runs
-    ]
+    lines = []
+    for run in check.runs:
+        cost_s = number(run.cost_s, 4)
+        margin = number(run.modulus_margin, 4)
+        peak_V = number(run.peak_command_V, 4)
+        lines.append((run.design, run.machine, cost_s, margin, peak_V, yes_no(run.settles)))
     table = Table(
         ("designed on", "run on", "cost [s]", "modulus margin", "peak voltage [V]", "settles"),
         tuple(lines),
@@ -613,10 +597,8 @@ def _reached(achieved: Run, predicted: Run) -> str:
     """Cost and margin that a loop reaches, the cost beside the predicted one."""
     more_percent = 100 * (achieved.cost_s / predicted.cost_s - 1)
     end = "." if achieved.settles else "; it does not settle."
-    return (
-        f"{number(achieved.cost_s)} s ({signed(more_percent, '%', 1)}) and "
-        f"{number(achieved.modulus_margin)}{end}"
-    )
+    reached_s = f"{number(achieved.cost_s)} s ({signed(more_percent, '%', 1)})"
+    return f"{reached_s} and {number(achieved.modulus_margin)}{end}"
 
 
 def unchecked_of_rig(view: DiagnosisView, *, simulated_loop: bool) -> tuple[str, ...]:
@@ -651,7 +633,9 @@ def _reproduce_section(
     for experiment in view.found.case.experiments:
         loop = "closed loop" if experiment.closed_loop else "open loop"
         # A part of a record, "name (part)", has the words of the record.
-        words = provenance.descriptions.get(experiment.name.split(" (")[0], "")
+        # A part of a record is described by the record's name.
+        record_name = experiment.name.split(" (")[0]
+        words = provenance.descriptions.get(record_name, "")
         samples = str(experiment.voltage_V.size)
         lines.append((experiment.name, role_words(experiment.role), experiment.kind, loop, samples, words))
     experiments = Table(("experiment", "role", "input", "loop", "samples", "description"), tuple(lines))

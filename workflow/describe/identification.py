@@ -94,7 +94,8 @@ def model_rows(
         order += f", delay {count(found.model.input_delay_samples, 'sample')}"
     if found.identification.structure.feedthrough:
         order += ", direct term"
-    dead_times = [item for item in found.identification.verdicts if item.kind is FindingKind.DEAD_TIME]
+    verdicts = found.identification.verdicts
+    dead_times = [verdict for verdict in verdicts if verdict.kind is FindingKind.DEAD_TIME]
     rows = [
         worded("order", order),
         *(worded("dead time", words(item)) for item in dead_times),
@@ -306,7 +307,8 @@ def _channel_blocks(channel: ChannelView, *, is_control: bool) -> list[Block]:
     if identified.fit_percent["validation"]:
         fit += f"; on validation data: {fits(identified.fit_percent['validation'])}"
     closed = channel.closed_loop is not None
-    caption = f"Poles and zeros in the z-plane{', and poles of the closed loop' if closed else ''}."
+    of_loop = ", and poles of the closed loop" if closed else ""
+    caption = f"Poles and zeros in the z-plane{of_loop}."
     blocks: list[Block] = [
         Text(f"{identified.input} to {identified.output}: {structure(identified)}. {fit}."),
         *pole_blocks(channel),
@@ -344,7 +346,19 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
     """What was found in one channel, for programs."""
     model = found.model
     identification = found.identification
+    unstable = []
+    for growth_per_s, omega_rad_s in found.unstable_poles:
+        unstable.append({"growth_per_s": growth_per_s, "omega_rad_s": omega_rad_s})
+    modes = []
+    for mode in found.modes:
+        numbers_of_mode = {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode)}
+        modes.append(numbers_of_mode | {"is_mode": found.is_mode(mode)})
+    fits_by_role = {f"fit_{role}_percent": by_record for role, by_record in found.fit_percent.items()}
+    # How logs made in a loop were used, and why.
     way = found.closed_loop
+    closed_loop = None
+    if way is not None:
+        closed_loop = {"method": way.kind.name.lower(), "reason": words(way)}
     return {
         "name": found.name,
         "input": found.input,
@@ -355,20 +369,14 @@ def model_numbers(found: IdentifiedChannel) -> dict[str, Any]:
         "feedthrough": identification.structure.feedthrough,
         "real_poles_per_s": codec.plain(found.real_poles_per_s),
         "real_poles_z": codec.plain(found.real_poles_z),
-        "unstable_poles": [
-            {"growth_per_s": growth, "omega_rad_s": omega} for growth, omega in found.unstable_poles
-        ],
+        "unstable_poles": unstable,
         "order_table": codec.plain(identification.order_table),
         "band_rad_s": codec.plain(found.band_rad_s),
-        **{f"fit_{role}_percent": by_record for role, by_record in found.fit_percent.items()},
+        **fits_by_role,
         "warnings": [words(item) for item in identification.warnings],
         "verdicts": [words(item) for item in identification.verdicts],
-        # How logs made in a loop were used, and why.
-        "closed_loop": None if way is None else {"method": way.kind.name.lower(), "reason": words(way)},
-        "modes": [
-            {"frequency_Hz": mode.frequency_Hz, **codec.plain(mode), "is_mode": found.is_mode(mode)}
-            for mode in found.modes
-        ],
+        "closed_loop": closed_loop,
+        "modes": modes,
         "noise_std": identification.noise_std,
         "tangent_optimality": identification.tangent_optimality,
         "search_evaluations": identification.search.evaluations,

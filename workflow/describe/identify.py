@@ -69,21 +69,15 @@ def identify_sections(result: LogIdentification) -> list[Section]:
     friction = None
     if result.friction is not None:
         friction = friction_row(result.friction, input_unit, output_unit)
+    uncertainty = [*ellipse_rows(result.spread), friction]
+    if friction is not None:
+        uncertainty.append(amplitude_row(result.equivalent, input_unit))
+    warnings = [worded(str(number), words(item)) for number, item in enumerate(result.careful, 1)]
     sections = [
         logs_section((*result.measured, *result.fresh_records), result.input_limit),
         Section("model", model_rows(result.about, result.spread.intervals, result.true_modes)),
-        Section(
-            "uncertainty",
-            said(
-                *ellipse_rows(result.spread),
-                friction,
-                None if friction is None else amplitude_row(result.equivalent, input_unit),
-            ),
-        ),
-        Section(
-            "warnings",
-            tuple(worded(str(number), words(item)) for number, item in enumerate(result.careful, 1)),
-        ),
+        Section("uncertainty", said(*uncertainty)),
+        Section("warnings", tuple(warnings)),
     ]
     return [section for section in sections if section.rows]
 
@@ -96,9 +90,8 @@ def identify_first_screen(result: LogIdentification, channel: ChannelView) -> Fi
     warned = ""
     if result.careful:
         warned = f"; {count(len(result.careful), 'warning')}"
-    headline = (
-        f"Model of order {identified.model.order} with {count(len(light), 'lightly damped mode')}{warned}"
-    )
+    light_modes = count(len(light), "lightly damped mode")
+    headline = f"Model of order {identified.model.order} with {light_modes}{warned}"
     marked = "; lightly damped modes marked" if light else ""
     picture = Picture(
         "response",
@@ -174,10 +167,8 @@ def _bullets(result: LogIdentification, channel: ChannelView) -> list[str]:
     logs = (*result.measured, *result.fresh_records)
     bullets.append(cut_off(logs, result.input_limit, input_unit))
     real, pairs = channel.searched
-    bullets.append(
-        f"{structure(identified)}: {count(real, 'real pole')} and {count(pairs, 'pole pair')} were found, "
-        f"{_why_this_order(channel)}"
-    )
+    found_poles = f"{count(real, 'real pole')} and {count(pairs, 'pole pair')} were found"
+    bullets.append(f"{structure(identified)}: {found_poles}, {_why_this_order(channel)}")
     about = described(result.described, result.friction, input_unit, output_unit, result.equivalent)
     bullets.append(about.replace("They describe", "The ellipses describe", 1))
     if all(test.passed for test in spread.tests):
@@ -276,11 +267,11 @@ def _pole_place_blocks(channel: ChannelView) -> list[Block]:
     subjects = (channel.found.model, channel.name, None, channel.spread.intervals)
     blocks: list[Block] = [Picture("poles", caption, subjects), Text(text)]
     if channel.zero_pairs:
-        rows = tuple(
-            (number(hertz(omega), 4), number(omega, 4), number(zeta)) for omega, zeta in channel.zero_pairs
-        )
+        rows = []
+        for omega, zeta in channel.zero_pairs:
+            rows.append((number(hertz(omega), 4), number(omega, 4), number(zeta)))
         head = ("zero pair (antiresonance): frequency [Hz]", "[rad/s]", "damping ratio [1]")
-        blocks.append(Table(head, rows))
+        blocks.append(Table(head, tuple(rows)))
     return blocks
 
 
@@ -291,24 +282,26 @@ def _record_blocks(
     identified = channel.found
     first = result.measured[0]
     fit_of = identified.fit_percent
-    rows = tuple(
-        (
-            place,
-            item.name,
-            item.role,
-            item.record.n_samples,
-            number(item.duration_s),
-            time_base(item.record),
-            number(fit_of[item.role].get(item.name), 4),
+    rows = []
+    for place, item in enumerate(records, 1):
+        fit_percent = fit_of[item.role].get(item.name)
+        rows.append(
+            (
+                place,
+                item.name,
+                item.role,
+                item.record.n_samples,
+                number(item.duration_s),
+                time_base(item.record),
+                number(fit_percent, 4),
+            )
         )
-        for place, item in enumerate(records, 1)
-    )
     read_input = signal(first.input_names[0], first.input_units)
     read_output = signal(first.output_names[0], first.output_units)
+    subjects = (records, [identified.input], [identified.output])
+    head = ("no.", "record", "used for", "samples", "length [s]", "time", "fit [%]")
     return [
-        Picture(
-            "records", "All records on one time axis.", (records, [identified.input], [identified.output])
-        ),
+        Picture("records", "All records on one time axis.", subjects),
         Text(f"Input {read_input}, output {read_output}."),
-        Table(("no.", "record", "used for", "samples", "length [s]", "time", "fit [%]"), rows),
+        Table(head, tuple(rows)),
     ]

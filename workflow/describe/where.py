@@ -133,8 +133,12 @@ def in_short(where: Where, floor: Floor) -> str:
     elif where.linear is not None and where.linear.linear is not None:
         parts.append(f"{'linear' if where.linear.linear else 'not linear'} in the voltage")
     place = "; ".join(parts) or "in all sensors and frequencies"
-    depends = [f"; {dependence_short(codec.plain(dependence))}" for dependence in where.dependences[:1]]
-    return f"Where it lies: {place}{''.join(depends)}."
+    # The first one is the strongest; the others stand at length.
+    depends = ""
+    if where.dependences:
+        strongest = codec.plain(where.dependences[0])
+        depends = f"; {dependence_short(strongest)}"
+    return f"Where it lies: {place}{depends}."
 
 
 def at_length(where: Where, floor: Floor, model: str) -> tuple[str, ...]:
@@ -188,10 +192,10 @@ def sensors_words(where: Where, floor: Floor) -> str:
         return f"The model error shows in {name_words(only)}; {names} {little}."
     if not with_error:
         return ""
-    sizes = [
-        f"{_times_words(sensor.gap, floor)} {floor.words} in {name_words(sensor.sensor)}"
-        for sensor in with_error
-    ]
+    sizes = []
+    for sensor in with_error:
+        times = _times_words(sensor.gap, floor)
+        sizes.append(f"{times} {floor.words} in {name_words(sensor.sensor)}")
     return f"The model error is {' and '.join(sizes)}."
 
 
@@ -229,10 +233,10 @@ def experiments_words(where: Where, floor: Floor) -> str:
     all_show = f"All {len(with_error)} experiments show the model error"
     if largest.gap.interval[0] <= CLEARLY_LARGER * smallest.gap.interval[1]:
         return f"{all_show}, about equally."
-    largest_words = (
-        f"{_file_words(largest.experiment)} most ({floor.said(largest.gap.gap_rms)} {floor.units})"
-    )
-    least = f"{_file_words(smallest.experiment)} least ({floor.said(smallest.gap.gap_rms)})"
+    largest_size = f"{floor.said(largest.gap.gap_rms)} {floor.units}"
+    smallest_size = floor.said(smallest.gap.gap_rms)
+    largest_words = f"{_file_words(largest.experiment)} most ({largest_size})"
+    least = f"{_file_words(smallest.experiment)} least ({smallest_size})"
     return f"{all_show}, {largest_words}, {least}."
 
 
@@ -251,15 +255,17 @@ def frequencies_words(where: Where, floor: Floor) -> str:
             bands = [band for band in where.bands if band.sensor == sensor.sensor and band.gap.found]
             for band in bands:
                 place = frequency_range(band.low_Hz, band.high_Hz, where)
+                times = floor.said(band.gap.gap_rms)
                 if floor.is_threshold:
+                    begin = place[:1].upper() + place[1:]
                     sentences.append(
-                        f"{place[:1].upper()}{place[1:]} {name} shows {floor.said(band.gap.gap_rms)} times "
-                        "what it would if the threshold were spread evenly over all frequencies."
+                        f"{begin} {name} shows {times} times what it would if the threshold were spread "
+                        "evenly over all frequencies."
                     )
                 else:
                     sentences.append(
-                        f"In {name} it stands out of {floor.words} {place}, by "
-                        f"{floor.said(band.gap.gap_rms)} times {floor.words} in that band."
+                        f"In {name} it stands out of {floor.words} {place}, by {times} times {floor.words} "
+                        "in that band."
                     )
             continue
         if sensor.gap.share < LEAST_SHARE_OF_SENSOR:
@@ -286,9 +292,9 @@ def regimes_words(where: Where, floor: Floor) -> str:
         assert peak is not None  # of a telling one
         larger = "larger" if peak.gap_rms > peak.usual else "smaller"
         chance = f"below {LEAST_CHANCE:g}" if regime.p_value < LEAST_CHANCE else number(regime.p_value, 2)
+        size = f"{floor.said(peak.gap_rms)} {floor.units} against {floor.said(peak.usual)} expected there"
         sentences.append(
-            f"The model error of {name_words(regime.sensor)} is {larger} {peak.label}: "
-            f"{floor.said(peak.gap_rms)} {floor.units} against {floor.said(peak.usual)} expected there "
+            f"The model error of {name_words(regime.sensor)} is {larger} {peak.label}: {size} "
             f"(chance {chance})."
         )
     return " ".join(sentences)
@@ -297,12 +303,15 @@ def regimes_words(where: Where, floor: Floor) -> str:
 def drift_words(where: Where) -> str:
     """Readings that drift away from the model."""
     count = len(where.experiments)
-    return " ".join(
-        f"The reading of {name_words(drift.sensor)} drifts away from the model by {number(drift.rate)} "
-        f"{drift.unit} (95 % interval {interval(drift.interval, 3)}), alike in all {count} experiments."
-        for drift in where.drift
-        if drift.notable and drift.interval is not None
-    )
+    sentences = []
+    for drift in where.drift:
+        if drift.notable and drift.interval is not None:
+            rate = f"{number(drift.rate)} {drift.unit} (95 % interval {interval(drift.interval, 3)})"
+            sentences.append(
+                f"The reading of {name_words(drift.sensor)} drifts away from the model by {rate}, alike in "
+                f"all {count} experiments."
+            )
+    return " ".join(sentences)
 
 
 def common_words(where: Where) -> str:
@@ -333,10 +342,9 @@ def amplitude_words(amplitude: AmplitudeFinding | None, linear: LinearCorrection
     if amplitude.growth != "linear" and linear is not None and linear.linear:
         return ""
     weaker, stronger = (_file_words(name) for name in amplitude.experiments)
-    return (
-        f"With {number(amplitude.voltage_ratio, 2)} times the voltage ({weaker} to {stronger}) the model "
-        f"error is {number(amplitude.gap_ratio, 2)} times as large; {_GROWTHS[amplitude.growth]}."
-    )
+    voltages = f"{number(amplitude.voltage_ratio, 2)} times the voltage ({weaker} to {stronger})"
+    times = number(amplitude.gap_ratio, 2)
+    return f"With {voltages} the model error is {times} times as large; {_GROWTHS[amplitude.growth]}."
 
 
 def linear_words(linear: LinearCorrection | None) -> str:
@@ -362,17 +370,20 @@ def periodic_words(finding: PeriodicFinding, floor: Floor) -> str:
     sentences = []
     if bands:
         band = max(bands, key=lambda band: band.distance)
+        place = f"{number(band.low_Hz)} and {number(band.high_Hz)} Hz in {name_words(band.sensor)}"
+        off_percent = number(100 * band.relative_error, 2)
+        times = number(band.distance, 2)
         sentences.append(
-            "The measured frequency response differs most from the model's between "
-            f"{number(band.low_Hz)} and {number(band.high_Hz)} Hz in {name_words(band.sensor)}: "
-            f"{number(100 * band.relative_error, 2)} % off, {number(band.distance, 2)} times the 95 % noise "
-            "radius."
+            f"The measured frequency response differs most from the model's between {place}: {off_percent} % "
+            f"off, {times} times the 95 % noise radius."
         )
     if groups:
         group = max(groups, key=lambda group: group.repeated_rms)
+        # A group is named "even lines": its first word tells the kind of distortion.
         kind = f"{group.group.split(' ')[-1]} " if finding.even_odd_separable else ""
+        size = f"{number(group.repeated_rms, 2)} {floor.units}"
         sentences.append(
-            f"The machine responds at frequencies that were not excited ({number(group.repeated_rms, 2)} "
-            f"{floor.units}, the same in every period): {kind}distortion, so it is not linear."
+            f"The machine responds at frequencies that were not excited ({size}, the same in every period): "
+            f"{kind}distortion, so it is not linear."
         )
     return " ".join(sentences)

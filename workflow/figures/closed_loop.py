@@ -113,7 +113,9 @@ def draw_closed_loop(
     """
     all_runs = (predicted,) if others is None else (predicted, others)
     dt_s = float(time_s[1] - time_s[0])
-    friction_s = float(time_s[0]) + dt_s * (max((line.size for line in with_friction), default=1) - 1)
+    # The steps with friction may be watched for longer than the trial.
+    longest = max((line.size for line in with_friction), default=1)
+    friction_s = float(time_s[0]) + dt_s * (longest - 1)
     onset, windows = _windows(time_s, reference, disturbance, labels, all_runs, settled_s, friction_s)
     grid: Any
     if onto is not None:
@@ -137,7 +139,10 @@ def draw_closed_loop(
             panel.plot(*outline(time, line[part], hold=bool(hold)), **_PREDICTED, **hold)
             if kind == "output":
                 wanted_s, wanted = outline(time, reference[part], hold=True)
-                panel.plot(np.append(wanted_s, window.stop), np.append(wanted, wanted[-1]), **_REFERENCE)
+                # Up to the panel's edge, also where the samples end before it.
+                until_s = np.append(wanted_s, window.stop)
+                until = np.append(wanted, wanted[-1])
+                panel.plot(until_s, until, **_REFERENCE)
                 if window is windows[0]:
                     for output, look in zip(with_friction, FRICTION, strict=False):
                         # It may go on beyond the other runs.
@@ -239,14 +244,19 @@ def _windows(
     step_s = float(time_s[stepped[0]]) if stepped.size else start
 
     def shown(first: float, last: float, least: float, title: str) -> _Window:
-        part = slice(int(np.searchsorted(time_s, first)), int(np.searchsorted(time_s, last)))
-        quiet = max(
-            _quiet_from(time_s[part], getattr(runs, kind)[:, part], tolerance)
-            for runs, tolerance in zip(all_runs, (_PREDICTED_REST, _MACHINE_REST), strict=False)
-            for kind in labels
-        )
+        begin = int(np.searchsorted(time_s, first))
+        end_of_part = int(np.searchsorted(time_s, last))
+        part = slice(begin, end_of_part)
+        quiet_s = []
+        for runs, tolerance in zip(all_runs, (_PREDICTED_REST, _MACHINE_REST), strict=False):
+            for kind in labels:
+                signals = getattr(runs, kind)[:, part]
+                quiet_s.append(_quiet_from(time_s[part], signals, tolerance))
+        moving_s = max(quiet_s) - first
+        # The motion fills most of the panel, but a hundredth of a long trial is not blown up to a whole one.
         length = last - first
-        end = max(first + max(_WITH_REST * (quiet - first), _LEAST_SHARE * length), least)
+        shown_s = max(_WITH_REST * moving_s, _LEAST_SHARE * length)
+        end = max(first + shown_s, least)
         # The first sample of the disturbance is not of the step's panel.
         uncut = last if last == stop else last - _SAME_INSTANT_S
         if least > uncut:
@@ -270,7 +280,8 @@ def _windows(
     room_s = _FEWEST_MARGINS * before_s
     if not start + room_s < onset < stop - room_s:
         return onset, [_Window(start, stop, stop, "Reference step and disturbance")]
-    size = si(float(disturbance[np.argmax(np.abs(disturbance))]), style.plain(labels["command"][1], 12))
+    largest = disturbance[np.argmax(np.abs(disturbance))]
+    size = si(float(largest), style.plain(labels["command"][1], 12))
     return onset, [
         shown(start, onset, least_s, "Reference step"),
         shown(onset - before_s, stop, 0.0, f"Disturbance of {size} at the plant's input"),
@@ -279,9 +290,14 @@ def _windows(
 
 def _quiet_from(time_s: Real, runs: Real, tolerance: float) -> float:
     """Time after which all runs (R, T) stay within a share of their range of where they end."""
-    end = runs[:, -max(1, time_s.size // 20) :].mean(axis=1, keepdims=True)
-    moving = np.any(np.abs(runs - end) > tolerance * np.ptp(runs, axis=1, keepdims=True), axis=0)
-    return float(time_s[np.flatnonzero(moving)[-1]] if moving.any() else time_s[0])
+    # The mean over the last twentieth: noise has no last value.
+    last = max(1, time_s.size // 20)
+    end = runs[:, -last:].mean(axis=1, keepdims=True)
+    range_of_run = np.ptp(runs, axis=1, keepdims=True)
+    moving = np.any(np.abs(runs - end) > tolerance * range_of_run, axis=0)
+    if not moving.any():
+        return float(time_s[0])
+    return float(time_s[np.flatnonzero(moving)[-1]])
 
 
 def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float]:
@@ -329,7 +345,8 @@ def draw_measured_sensitivity(run: RunView) -> Picture | None:
     high = min(1.1 * high, run.plant.nyquist_rad_s)
     is_near = (run.loop_grid > 0.9 * low) & (run.loop_grid < high)
     fine = run.loop_grid[is_near]
-    curve = curves_of(run, np.union1d(np.geomspace(0.9 * low, high, 900), fine))[0]
+    plain_grid = np.geomspace(0.9 * low, high, 900)
+    curve = curves_of(run, np.union1d(plain_grid, fine))[0]
     picture, panel = new_picture(4.4)
     draw_curve(panel, curve, run.level)
     for measured, look in zip(loop.sensitivity.measured, _MARKERS, strict=False):
@@ -362,7 +379,8 @@ def draw_conditions(run: RunView) -> Picture | None:
         panel.plot(*outline(time_s, condition.predicted), **_PREDICTED)
         panel.plot(*outline(time_s, condition.reference, hold=True), **_REFERENCE)
         panel.set_title(condition.name)
-        low, high = height(np.append(condition.reference, condition.predicted), [condition.achieved], 1.0)
+        calm = np.append(condition.reference, condition.predicted)
+        low, high = height(calm, [condition.achieved], 1.0)
         panel.set(ylim=pad_limits(low, high, 0.08))
         panel.set(xlim=(float(time_s[0]), float(time_s[-1])))
     for panel in panels[::columns]:

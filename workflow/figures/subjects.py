@@ -102,12 +102,13 @@ class ChannelView:
     @property
     def light(self) -> list[tuple[int, ModelMode]]:
         """Lightly damped modes with their place among all modes."""
-        return [
-            (k, mode)
-            for k, mode in enumerate(self.found.modes)
-            if mode.damping < LIGHT and self.found.is_mode(mode)
-            if self.spread.intervals is None or self.spread.intervals.modes[k].told
-        ]
+        light = []
+        for place, mode in enumerate(self.found.modes):
+            intervals = self.spread.intervals
+            is_told = intervals is None or intervals.modes[place].told
+            if mode.damping < LIGHT and self.found.is_mode(mode) and is_told:
+                light.append((place, mode))
+        return light
 
     @property
     def shown_fresh(self) -> int | None:
@@ -121,7 +122,9 @@ class ChannelView:
         omega = self._omega_rad_s
         zeta = self.found.model.poles.zeta()
         light = (zeta < LIGHT) & (zeta > 5e-4)
-        slowest = np.argsort(np.where(light | ~light.any(), omega, np.inf))
+        # Where no pair is light, all may be shown.
+        candidates = light | ~light.any()
+        slowest = np.argsort(np.where(candidates, omega, np.inf))
         return int(slowest[0]) if slowest.size else None
 
     @property
@@ -141,11 +144,12 @@ class ChannelView:
         modes = [mode.omega_rad_s for mode in plot.columns()]
         is_chosen = plot.n_pairs == plot.chosen
         # A column within 2 % has the pole pair already.
-        return [
-            float(omega)
-            for omega in plot.omega_rad_s[is_chosen]
-            if not any(abs(omega / mode - 1) < 0.02 for mode in modes)
-        ]
+        unconfirmed = []
+        for omega in plot.omega_rad_s[is_chosen]:
+            is_known = any(abs(omega / mode - 1) < 0.02 for mode in modes)
+            if not is_known:
+                unconfirmed.append(float(omega))
+        return unconfirmed
 
     @cached_property
     def zeros(self) -> Complex:
@@ -162,7 +166,13 @@ class ChannelView:
         # One of each pair; a zero near the origin is no frequency.
         is_upper = (zeros.imag > 1e-9) & (np.abs(zeros) > 0.05)
         log = np.log(zeros[is_upper]) / self.found.model.dt_s
-        return sorted((abs(s), -s.real / abs(s)) for s in log if abs(s.real) < LIGHT * abs(s))
+        pairs = []
+        for s in log:
+            omega = abs(s)
+            # Zeros of a light pair dent the response; of a damped one nobody sees anything.
+            if abs(s.real) < LIGHT * omega:
+                pairs.append((omega, -s.real / omega))
+        return sorted(pairs)
 
     @property
     def searched(self) -> tuple[int, int]:
@@ -200,7 +210,8 @@ class AnyRunView:
         largest = []
         for item in self.results.records.of_role("estimation"):
             column = item.record.input_names.index(signal)
-            largest.append(float(np.max(np.abs(item.record.input[:, column]))))
+            commands = item.record.input[:, column]
+            largest.append(float(np.max(np.abs(commands))))
         return max(largest)
 
     @property
@@ -240,16 +251,15 @@ class RunView(AnyRunView):
         closed_loop = None
         if index == self.config.control_index and self.results.design.controller is not None:
             closed_loop = closed_loop_poles(self.controller, self.plant)
+        model = identified.model
+        fresh = tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in identified.fresh)
         return ChannelView(
             found=identified,
             spread=self.results.uncertainty.channels[index],
             options=channel.identification,
-            fresh_records=tuple(_as_fitted(by_name[fit.name], channel, friction) for fit in identified.fresh),
+            fresh_records=fresh,
             measured=tuple(records.fitted(channel)),
-            units=(
-                records.unit(identified.model.input_name),
-                records.unit(identified.model.output_name),
-            ),
+            units=(records.unit(model.input_name), records.unit(model.output_name)),
             file=f"{index + 1}-{slug}".strip("-"),
             closed_loop=closed_loop,
         )
@@ -318,11 +328,12 @@ class RunView(AnyRunView):
         # The grid of the certificate: fine wherever the open or the closed loop has a pole or a zero.
         closed = closed_loop_poles(law, plant)
         every_mode = (*plant.modes, *modes_of(closed, plant.dt_s), *modes_of(law.poles, plant.dt_s))
-        light = [
-            Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
-            for mode in every_mode
-            if abs(mode.zeta) < LIGHT and mode.omega_rad_s < plant.nyquist_rad_s
-        ]
+        light = []
+        for mode in every_mode:
+            # Growing modes need a fine grid, too; a mode without damping would need one without end.
+            damping = abs(mode.zeta)
+            if damping < LIGHT and mode.omega_rad_s < plant.nyquist_rad_s:
+                light.append(Mode(mode.omega_rad_s, max(damping, 1e-4)))
         roots = np.concatenate([plant.poles, plant.zeros, law.poles, closed])
         omega = checked_grid(plant, light, 1000, 120, roots=roots)
 
@@ -336,13 +347,16 @@ class RunView(AnyRunView):
         for name, with_delay in (("K_with_delay", True), ("K_without_delay", False)):
             of_loop = nominal_margins(partial(loop_gain, with_delay=with_delay), omega, at_zero=at_zero)
             gain = of_loop.gain_up
-            if of_loop.gain_down > 0 and -np.log(of_loop.gain_down) < np.log(of_loop.gain_up):
+            # The factor that is nearer to 1, up or down, is the margin.
+            falls_sooner = of_loop.gain_down > 0 and -np.log(of_loop.gain_down) < np.log(of_loop.gain_up)
+            if falls_sooner:
                 gain = of_loop.gain_down
             ends = loop_gain(omega[-1:], with_delay).real
             if at_zero is not None:
                 ends = np.append(ends, at_zero)
             at_end = bool(np.any(np.isclose(gain * ends, -1.0, rtol=1e-6)))
-            margins[name] = (gain, float(np.degrees(of_loop.phase_rad)), of_loop.modulus), at_end
+            phase_deg = float(np.degrees(of_loop.phase_rad))
+            margins[name] = (gain, phase_deg, of_loop.modulus), at_end
         return margins
 
     @staticmethod
@@ -365,7 +379,9 @@ class RunView(AnyRunView):
 
         zeros = in_pairs(system.zeros())
         poles = in_pairs(system.poles())
-        gain = float(np.real(system(here) * np.prod(here - poles) / np.prod(here - zeros)))
+        from_poles = np.prod(here - poles)
+        from_zeros = np.prod(here - zeros)
+        gain = float(np.real(system(here) * from_poles / from_zeros))
         above, below = signal.zpk2tf(zeros, poles, gain)
         # scipy's sections hold powers of 1/z: each zero fewer than there are poles is a delay of one sample.
         delays = [[0.0, 1.0, 0.0, 1.0, 0.0, 0.0]] * (poles.size - zeros.size)
@@ -403,18 +419,19 @@ class RunView(AnyRunView):
         poles = [closed_loop_poles(self.controller, self.plant)]
         if self.controller.order:
             poles.append(np.linalg.eigvals(self.controller.A).astype(np.complex128))
-        modes = [
-            Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4))
-            for mode in modes_of(np.concatenate(poles), self.plant.dt_s)
-            if omega[0] < mode.omega_rad_s < omega[-1]
-        ]
-        plants = () if self.results.certify.certificate is None else self.results.certify.certificate.plants
-        worst = [v.worst_margin_omega_rad_s for v in plants if 0 < v.worst_margin_omega_rad_s <= omega[-1]]
-        dense = frequency_grid(
-            float(omega[-1]), modes, omega_min_rad_s=float(omega[0]), n_log=2, n_mode=81 * len(modes)
-        )
+        lowest = float(omega[0])
+        highest = float(omega[-1])
+        modes = []
+        for mode in modes_of(np.concatenate(poles), self.plant.dt_s):
+            if lowest < mode.omega_rad_s < highest:
+                modes.append(Mode(mode.omega_rad_s, max(abs(mode.zeta), 1e-4)))
+        certificate = self.results.certify.certificate
+        plants = () if certificate is None else certificate.plants
+        margins_at = [plant.worst_margin_omega_rad_s for plant in plants]
+        worst = [at for at in margins_at if 0 < at <= highest]
+        dense = frequency_grid(highest, modes, omega_min_rad_s=lowest, n_log=2, n_mode=81 * len(modes))
         together = np.unique(np.concatenate([omega, dense, worst]))
-        is_inside = (together > 0) & (together <= omega[-1])
+        is_inside = (together > 0) & (together <= highest)
         return smooth_grid(
             together[is_inside], lambda w: self.controller.response(w) * self.plant.at(w).centre
         )
@@ -431,7 +448,9 @@ def unit_of(key: str, input_unit: str, output_unit: str) -> str:
         "input_limit": input_unit,
         "rate_limit": ratio_unit(input_unit, "s"),
     }
-    return units.get(key, next((unit for end, unit in _ENDINGS if key.endswith(end)), ""))
+    by_ending = [unit for end, unit in _ENDINGS if key.endswith(end)]
+    default = by_ending[0] if by_ending else ""
+    return units.get(key, default)
 
 
 def _as_fitted(record: Record, channel: Channel, friction: FrictionFit | None) -> Record:
