@@ -65,6 +65,7 @@ def diagnose(
     """
     try:
         return chain.diagnose(case, progress=progress, rng=rng, time_limit_s=time_limit_s)
+    # A case is not checked by its type: what has a case's attributes will do.
     except AttributeError:
         if hasattr(case, "machine"):
             raise

@@ -25,6 +25,7 @@ def front_door(function: F) -> F:
 
     @wraps(function)
     def called(*arguments: Any, **named: Any) -> Any:
+        # With several threads sums round otherwise: the same call would give other last digits.
         with threadpool_limits(1):
             return clear(*arguments, **named)
 

@@ -81,6 +81,7 @@ class Simulation(Shown, simulation.Trajectory):
 
     def record(self, output: str = "hub_angle_rad", name: str = "simulated") -> Record:
         """Voltage and one signal of the machine, as `hub_angle_rad` or `tip_m`, as a `Record`."""
+        # What is measured: all but time and input.
         signals = [each.name for each in fields(self) if each.name not in ("time_s", "voltage_V")]
         if output not in signals:
             raise ValueError(f"no output {output!r}; there are {', '.join(signals)}")

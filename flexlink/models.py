@@ -352,6 +352,7 @@ def _records(records: Any) -> tuple[Record, ...]:
 def _records_of(identification: Any, records: Any) -> tuple[Record, ...]:
     """These records or those of the identification, of one input and one output."""
     model = getattr(identification, "model", None)
+    # The uncertainty of a measured response is that of its measurement.
     if isinstance(identification, FrfIdentification):
         raise ValueError(
             "a fitted response brings its uncertainty: fitted.posterior, "
@@ -361,6 +362,7 @@ def _records_of(identification: Any, records: Any) -> tuple[Record, ...]:
         raise ValueError("several inputs or outputs: use flexlink.matrix_posterior(records, identification)")
     if not isinstance(model, GobfModel):
         raise ValueError(f"expected the result of flexlink.identify, got {type(identification).__name__}")
+    # A model that was read from a file has no records with it.
     used = _records(getattr(identification, "records", ()) if records is None else records)
     if not used:
         raise ValueError("give the records of the identification")

@@ -373,6 +373,7 @@ def _loop(result: Any) -> Figure:
 
     plant, controller = _parts(result, None)
     assert result.specification is not None
+    # A measured response is known at its own frequencies only; zero has no place on a logarithmic axis.
     omega = _grid(plant.dt_s) if plant.own_grid is None else plant.own_grid[plant.own_grid > 0]
     curves = sensitivity_curves(plant, controller, result.specification, omega)
     return _figure(draw_sensitivities(curves, level=plant.level))

@@ -17,6 +17,7 @@ def describe(result: object) -> str:
     A class without any, as that of somebody who derives from `Shown`, has those of its base, or prints as any
     object does.
     """
+    # By the name of its class or of the nearest base: whoever extends a result keeps its sentences.
     for kind in type(result).__mro__:
         if kind.__name__ in SUMMARIES:
             lines = SUMMARIES[kind.__name__](result)
@@ -26,6 +27,7 @@ def describe(result: object) -> str:
 
 def html_text(result: Shown) -> str:
     """Return the sentences as HTML for a notebook, with a table where the class has a short one."""
+    # Names of records and signals are a user's: they must not become tags.
     headline, *lines = (html.escape(line.strip()) for line in describe(result).splitlines())
     sentences = "<br>".join([f"<b>{headline}</b>", *lines])
     sentences = f"<p>{sentences}</p>"

@@ -103,6 +103,7 @@ def identification(result: Identification) -> list[str]:
 def frf_identification(result: FrfIdentification) -> list[str]:
     model = result.model
     omega = result.omega_rad_s
+    # A measured response has ellipses of its own: the fit is good where it stays inside of them.
     inside_percent = 100 * result.share_inside
     headline = (
         f"GobfModel of order {model.order} of a measured response, dt = {model.dt_s:.6g} s: inside "
@@ -136,6 +137,7 @@ def error_surface(result: ErrorSurface) -> list[str]:
     coordinates = " and ".join(result.names)
     lowest = result.mean_square.min()
     highest = result.mean_square.max()
+    # More than one: a search that only descends may end in the wrong one.
     n_minima = len(result.local_minima())
     return [
         f"Error surface over {coordinates}, {points} points: mean square {lowest:.4g} to {highest:.4g}, "
@@ -166,6 +168,7 @@ def multivariable_result(result: MultivariableResult) -> list[str]:
             f"weighted gain {at_most(result.gamma, 4)} on the grid (certify it before use)"
         ]
     for name, value in result.worst.items():
+        # The joint and the plant that allow no less.
         places = "".join(
             f" (joints[{point.joint}] of '{point.plant}' at {point.omega_rad_s:.4g} rad/s)"
             for point in result.blocking
@@ -260,6 +263,7 @@ def uncertain_plant(result: UncertainPlant) -> list[str]:
     states = f"{result.nominal.nstates} state{'s' if result.nominal.nstates != 1 else ''}"
     integrators = ("no integrator", "one integrator", "two integrators")[result.n_integrators]
     is_exact = result.uncertainty is None
+    # What a certificate for this plant would cover.
     known = "response taken as exact" if is_exact else f"{100 * result.level:.4g} % ellipses"
     lines = [f"UncertainPlant '{result.name}': {states}, dt = {result.dt_s:.6g} s, {integrators}, {known}"]
     for mode in result.modes:
@@ -271,6 +275,7 @@ def synthesis_result(result: SynthesisResult) -> list[str]:
     if result.outcome.name == "NOT_CONVERGED":
         lines = ["No controller: no stable design was found"]
     else:
+        # What the optimisation saw: the certificate looks at all frequencies, this one at a grid.
         if any(plant.uncertainty is not None for plant in result.plants):
             over = "over all ellipses of the grid"
         else:
@@ -312,6 +317,7 @@ def certificate(result: Certificate) -> list[str]:
 
 
 def _certificate_headline(result: Certificate) -> str:
+    # A loop that is unstable has no margins: its numbers would mislead.
     unstable = next((plant for plant in result.plants if not plant.stable), None)
     if unstable is not None:
         return (
@@ -406,6 +412,7 @@ def _diagnosis_headline(result: Diagnosis, added: Sequence[str]) -> str:
 def _sizes(result: Diagnosis, effects: Sequence[str]) -> str:
     from workflow.describe.diagnosis_words import times_noise
 
+    # In the order of the repair: as stated, with other values, with the effects.
     sizes = f"{times_noise(result.gap_before)} nominal"
     if result.deviations:
         sizes += f", {times_noise(result.gap_refit)} re-estimated"
@@ -431,6 +438,7 @@ def comparison(result: Comparison) -> list[str]:
     ]
     for model in result.models:
         line = f"  {model.name}: {model.fit_percent:.1f} %, order {model.order}"
+        # A model without a noise model does not predict one sample ahead.
         if not math.isnan(model.one_step_percent):
             line += f", {model.one_step_percent:.1f} % one sample ahead"
         if not math.isnan(model.fit_s):

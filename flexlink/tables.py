@@ -134,6 +134,7 @@ def _surface(surface: ErrorSurface) -> pd.DataFrame:
 @table.register(MultivariableCertificate)
 def _joints(certificate: MultivariableCertificate) -> pd.DataFrame:
     rows = []
+    # The bound between the grid's points decides, not the value on it.
     for verdict in certificate.verdicts:
         for name, bound in verdict.bounds.items():
             row = {

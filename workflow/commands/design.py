@@ -118,8 +118,10 @@ def load_asked(
 
 def of_run(paths: Sequence[Path]) -> RunResults | None:
     """The run whose directory is the only plant, if it has come to a design."""
-    run = RunDirectory.open(paths[0]) if len(paths) == 1 and paths[0].is_dir() else None
-    return RunResults(run) if run is not None and run.stage_file("design") else None
+    if len(paths) != 1 or not paths[0].is_dir():
+        return None
+    run = RunDirectory.open(paths[0])
+    return RunResults(run) if run.stage_file("design") else None
 
 
 def at_one_bandwidth(specification: Specification, run: RunResults | None) -> Specification:
@@ -243,27 +245,29 @@ def design_controller(
         }
         for source in sources_found
     ]
+    title = f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants"
+    file_rows = [worded("signals", scaled if files else "")]
+    file_rows += [worded("", str(path)) for path in files]
+    sections = [
+        plants_section(sources_found),
+        design_section(design, achievable, order, advice=advice or ""),
+        controller_section(numbers, specification.computational_delay_samples, scaled),
+        certificate_section(certify, shares),
+        not_checked_section(certify),
+        filter_section(prefilter),
+        Section("written", said(*file_rows)),
+    ]
+    design_numbers = {
+        **codec.plain(design),
+        "order_advice": advice,
+        "gave_way": codec.plain(given_way),
+    }
     return RunSummary(
-        title=f"controller for {names[0]}" if len(names) == 1 else f"controller for {len(names)} plants",
-        sections=[
-            plants_section(sources_found),
-            design_section(design, achievable, order, advice=advice or ""),
-            controller_section(numbers, specification.computational_delay_samples, scaled),
-            certificate_section(certify, shares),
-            not_checked_section(certify),
-            filter_section(prefilter),
-            Section(
-                "written",
-                said(worded("signals", scaled if files else ""), *(worded("", str(path)) for path in files)),
-            ),
-        ],
+        title=title,
+        sections=sections,
         numbers={
             "plants": about,
-            "design": {
-                **codec.plain(design),
-                "order_advice": advice,
-                "gave_way": codec.plain(given_way),
-            },
+            "design": design_numbers,
             "engineers_numbers": None if numbers is None else numbers.to_dict(),
             "achievable_performance": bracket_numbers(achievable, gamma),
             "certificate": codec.plain(certify.certificate),

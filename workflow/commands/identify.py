@@ -100,18 +100,19 @@ def identify_logs(
     true_modes = truth_beside(logs.files, logs.measured[0].output_names[0])
     in_loop = loop is not None and loop.stated
     common = with_common_sampling_time(records)
+    n_measured = len(logs.measured)
     with speaking("identify"), naming_readings(records), naming("identify"):
         timing = timing_of(
             common,
-            in_loop=in_loop or made_in_loop(common[: len(logs.measured)]),
+            in_loop=in_loop or made_in_loop(common[:n_measured]),
             stated_period_s=logs.controller_period_s,
             averaged=logs.command_averaged,
         )
         common = with_equivalent_command(common, timing)
     with speaking("identify"), naming_readings(records):
         result = identify_records(
-            common[: len(logs.measured)],
-            common[len(logs.measured) :],
+            common[:n_measured],
+            common[n_measured:],
             options,
             described=described,
             band_rad_s=band_rad_s,
@@ -142,23 +143,25 @@ def identify_logs(
     with speaking("identify"):
         about = result.about
         spread = result.spread
+        log_numbers = []
+        for record in (*result.measured, *result.fresh_records):
+            log_numbers.append(
+                {
+                    "name": record.name,
+                    "dt_s": record.dt_s,
+                    "time_column": codec.plain(record.time_column),
+                    "input_unit": "".join(record.input_units),
+                    "output_unit": "".join(record.output_units),
+                    "input_cut_samples": record.cut,
+                }
+            )
         return RunSummary(
             title=f"{about.input} to {about.output}",
             sections=identify_sections(result),
             numbers={
                 **model_numbers(about),
                 "warnings": [words(item) for item in result.careful],
-                "logs": [
-                    {
-                        "name": record.name,
-                        "dt_s": record.dt_s,
-                        "time_column": codec.plain(record.time_column),
-                        "input_unit": "".join(record.input_units),
-                        "output_unit": "".join(record.output_units),
-                        "input_cut_samples": record.cut,
-                    }
-                    for record in (*result.measured, *result.fresh_records)
-                ],
+                "logs": log_numbers,
                 "uncertainty": uncertainty_numbers(spread),
                 "file": None if out is None else str(out),
                 "model_file": None if export is None else str(export),

@@ -133,29 +133,28 @@ def init(
     if len(found.read.records) > 1:
         run = found.read.tables[-1].run
         validation = f"{found.logs[-1].name}, {run}" if run else found.logs[-1].name
+    sections = init_sections(
+        draft,
+        found.read.roles,
+        found.read.unit_of,
+        validation,
+        found.doubts,
+        logs=len(found.read.records),
+    )
+    seen = {
+        "roles": codec.plain(found.read.roles),
+        "told_rad_s": codec.plain(look.told_rad_s),
+        "first_mode": codec.plain(look.mode),
+        "notch_rad_s": look.notch,
+        "motion": codec.plain(look.motion),
+        "turned": look.turned,
+        "friction": draft.friction,
+        "unstable_per_s": draft.unstable_per_s,
+    }
     return RunSummary(
         title=str(out),
-        sections=init_sections(
-            draft,
-            found.read.roles,
-            found.read.unit_of,
-            validation,
-            found.doubts,
-            logs=len(found.read.records),
-        ),
-        numbers={
-            "configuration": config.with_defaults(),
-            "seen": {
-                "roles": codec.plain(found.read.roles),
-                "told_rad_s": codec.plain(look.told_rad_s),
-                "first_mode": codec.plain(look.mode),
-                "notch_rad_s": look.notch,
-                "motion": codec.plain(look.motion),
-                "turned": look.turned,
-                "friction": draft.friction,
-                "unstable_per_s": draft.unstable_per_s,
-            },
-        },
+        sections=sections,
+        numbers={"configuration": config.with_defaults(), "seen": seen},
         verdict=f"flexlink run --config {path_as_typed(out)}",
     )
 
@@ -229,9 +228,10 @@ def decided(
                 raise
         results = RunResults(run)
         at = config.control_index
+        channel = results.identify.channels[at]
         if found.refused and not found.remote:
-            found = replace(found, refused=found.refused + _best_linear(results.identify.channels[at]))
-        draft = informed(found.draft, results.identify.channels[at], results.uncertainty.channels[at])
+            found = replace(found, refused=found.refused + _best_linear(channel))
+        draft = informed(found.draft, channel, results.uncertainty.channels[at])
     if typed:
         draft = replace(draft, specification=with_typed(draft.specification, typed))
     found = replace(found, draft=draft, before=found.draft, typed=frozenset(typed or ()))
@@ -273,7 +273,11 @@ def _best_linear(channel: IdentifiedChannel) -> str:
     values = {} if channel.closed_loop is None else channel.closed_loop.values
     if "least_in_loop_percent" not in values:
         return ""
-    modes = [f"{mode.omega_rad_s / (2 * np.pi):.3g}" for mode in channel.modes if channel.is_mode(mode)]
+    modes = []
+    for mode in channel.modes:
+        if channel.is_mode(mode):
+            frequency_Hz = mode.omega_rad_s / (2 * np.pi)
+            modes.append(f"{frequency_Hz:.3g}")
     worst_percent = f"{values['least_in_loop_percent']:.0f}"
     best_percent = f"{values['most_in_loop_percent']:.0f}"
     share = worst_percent if worst_percent == best_percent else f"{worst_percent} to {best_percent}"
@@ -410,22 +414,30 @@ def read_channel(
             roles = replace(roles, time=None)
         tables = [run for table in tables for run in table.runs(roles.time)]
         if roles.time is None and stated.dt_s is None:
-            typed = f"flexlink {command} {to_type(logs)} {stated.typed(command)}".rstrip()
             named = {"input": stated.input_name, "output": stated.output_name, "reference": stated.reference}
-            typed += "".join(f" --{role} {as_typed(name)}" for role, name in named.items() if name)
-            ways = [f"--time {as_typed(name)}" for name in rising(tables[0])] or ["--dt-s SECONDS"]
-            raise ValueError(f"no column looks like time; type: {typed} {ways[0]}")
+            typed = f"flexlink {command} {to_type(logs)} {stated.typed(command)}".rstrip()
+            for role, name in named.items():
+                if name:
+                    typed += f" --{role} {as_typed(name)}"
+            # What rises from row to row may be time; without such a column the period has to be stated.
+            rising_columns = rising(tables[0])
+            way = f"--time {as_typed(rising_columns[0])}" if rising_columns else "--dt-s SECONDS"
+            raise ValueError(f"no column looks like time; type: {typed} {way}")
 
     # What time stamps and angles need so that the next command reads them alike.
     with naming(""):
-        options = [
-            option_for(table.stamps(roles.time, roles.output if table.sparse else None, stated.time_unit)[0])
-            for table in tables
-            if roles.time
-        ]
-        period = max(wraps_at(table.columns([roles.output])[roles.output]) for table in tables)
+        options = []
+        periods = []
+        for table in tables:
+            if roles.time:
+                # Where cells are missing, stamps count in which the output has a reading.
+                measured = roles.output if table.sparse else None
+                options.append(option_for(table.stamps(roles.time, measured, stated.time_unit)[0]))
+            periods.append(wraps_at(table.columns([roles.output])[roles.output]))
+        period = max(periods)
     # Uneven stamps that only resampling can read: its step takes the place of a repair.
     steps = [float(text.split()[1]) for text in options if text.startswith("--resample-s")]
+    own_unwrap = {roles.output: float(period)} if period else {}
     how = stated.model_copy(
         update={
             "input_name": roles.input,
@@ -436,7 +448,7 @@ def read_channel(
             "time_unit": stated.time_unit if roles.time else None,
             "repair": "--repair" in options and not steps,
             "resample_s": max(steps, default=None),
-            "unwrap": stated.unwrap or ({roles.output: float(period)} if period else {}),
+            "unwrap": stated.unwrap or own_unwrap,
         }
     )
 
@@ -444,7 +456,8 @@ def read_channel(
     records = how.records(tables)
     repeats = min(_repeats(record) for record in records)
     if repeats > 1 and not steps:
-        how = how.model_copy(update={"resample_s": float(f"{repeats * records[0].dt_s:.9g}")})
+        own_step_s = float(f"{repeats * records[0].dt_s:.9g}")
+        how = how.model_copy(update={"resample_s": own_step_s})
         records = how.records(tables)
     if drafted:
         fitted = fitted_records(records)
@@ -453,10 +466,11 @@ def read_channel(
             refuse_hopeless_logs(fitted, progress, loop=in_loop)
     for record in records:
         refuse_constant_input(record)
-    unit_of = {
-        name: stated.units.get(name, "" if name in stated.scale else tables[0].unit(name))
-        for name in (roles.input, roles.output)
-    }
+    unit_of = {}
+    for name in (roles.input, roles.output):
+        # A scaled column is no longer in the unit of its header.
+        in_header = "" if name in stated.scale else tables[0].unit(name)
+        unit_of[name] = stated.units.get(name, in_header)
     return ReadChannel(
         roles, how, unit_of, with_common_sampling_time(records), repeats if not steps else 1, tables
     )
@@ -467,9 +481,14 @@ def _repeats(record: Record) -> int:
     columns = [record.input, record.output]
     if record.reference is not None:
         columns.append(record.reference)
-    gaps = np.diff(np.flatnonzero(np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1)))
+    changes = np.any(np.diff(np.hstack(columns), axis=0) != 0, axis=1)
+    gaps = np.diff(np.flatnonzero(changes))
     usual = int(np.median(gaps)) if gaps.size else 1
-    return usual if usual > 1 and np.mean(gaps % usual == 0) > _NEARLY_ALL else 1
+    if usual <= 1:
+        return 1
+    # A value may stay for two or three periods, but for no part of one.
+    whole_periods = np.mean(gaps % usual == 0)
+    return usual if whole_periods > _NEARLY_ALL else 1
 
 
 def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
@@ -484,14 +503,17 @@ def configuration(found: Found, records: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _toml(value: Any) -> str:
-    return tomlkit.item(value.item() if isinstance(value, np.generic) else value).as_string()
+    plain = value.item() if isinstance(value, np.generic) else value
+    return tomlkit.item(plain).as_string()
 
 
 def _entries(tables: Sequence[Table], out: Path, draft: Draft) -> list[dict[str, Any]]:
     """Keys of each record. The last log, or run, validates; of one the last part, where it is split."""
     base = out.absolute().parent
     stems = [table.path.stem for table in tables]
-    paths = [Path(os.path.relpath(table.path.absolute(), base)).as_posix() for table in tables]
+    # Relative to the configuration, so that a folder with both can be moved.
+    relative = [os.path.relpath(table.path.absolute(), base) for table in tables]
+    paths = [Path(path).as_posix() for path in relative]
     if len(tables) == 1 and draft.split_sample is not None:
         first = {"path": paths[0], "name": f"{stems[0]}, first part", "stop_sample": draft.split_sample}
         last = {"path": paths[0], "name": f"{stems[0]}, last part", "start_sample": draft.split_sample}

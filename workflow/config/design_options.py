@@ -90,6 +90,7 @@ class ReferenceFilterSettings(ReferenceFilterOptions):
         """Where the model has fallen by 3 dB, rad/s; its fastest pole where it never does."""
         model = self.reference_model
         poles = np.abs(np.roots(model.denominator))
+        # Three decades to each side of all poles: beyond them the gain has its end values.
         omega = np.geomspace(1e-3 * poles.min(initial=1.0), 1e3 * poles.max(initial=1.0), 4000)
         size = np.abs(model.at(1j * omega))
         below = np.flatnonzero(size < size[0] / np.sqrt(2))

@@ -361,9 +361,9 @@ def _which_section(view: DiagnosisView, suspected: Sequence[str]) -> PageSection
     if view.of_rig:
         by_probability = sorted(view.place.subsystem.items(), key=lambda item: item[1], reverse=True)
         lines = []
-        for part, share_of_it in by_probability:
-            subsystem = _SUBSYSTEMS.get(part, part.replace("_", " "))
-            lines.append((subsystem, probability_words(share_of_it)))
+        for subsystem, of_subsystem in by_probability:
+            subsystem_words = _SUBSYSTEMS.get(subsystem, subsystem.replace("_", " "))
+            lines.append((subsystem_words, probability_words(of_subsystem)))
         blocks.append(Table(("subsystem", "probability"), tuple(lines), "The same, added up by subsystem."))
     return PageSection("which", "Which effect, and how sure", "Which", tuple(blocks))
 

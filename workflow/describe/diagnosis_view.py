@@ -126,6 +126,7 @@ def shown(found: Diagnosis) -> Diagnosis:
     """
     if not found.case.model_error > 0:
         return found
+    # One unit of the scaled residuals is one per cent of the motion.
     level, rounding = 0.01 * motion_of(found.case), rounding_effect(found.case)
     (case, before), (_, refit), (_, after) = (
         over_levels(found.case, residuals, level)

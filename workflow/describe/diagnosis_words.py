@@ -61,6 +61,7 @@ def output_unit(output: str, units: Mapping[str, str]) -> str:
 def probability_words(p: float) -> str:
     """A probability in percent, without claiming 100 or 0."""
     percent = 100 * p
+    # No list of candidates is complete, and no noise level exact: no answer is certain.
     if percent > 99.9:
         return "over 99.9 %"
     if percent < 0.1:

@@ -136,6 +136,7 @@ def _first_rows(result: LogIdentification, channel: ChannelView) -> tuple[Row, .
 def _known_to(ends: tuple[float, float]) -> str:
     """Half the width of an interval of a positive number, in percent of its lower end."""
     low, high = ends
+    # Half of the width, times 100 %.
     half_percent = 50 * (high / low - 1) if low > 0 else math.inf
     return f"±{percent(half_percent, 2)}" if half_percent < 100 else "a factor of two at best"
 

@@ -120,21 +120,18 @@ def of_case(loaded: SimulatorCase, seen: Telling) -> RunSummary:
             f"; {len(alike)} groups of them look alike in these records, if one of them is present. "
             "The diagnosis says which of them it leaves open"
         )
-    return RunSummary(
-        title=case.name,
-        sections=check_sections(
-            logs,
-            case.dt_s,
-            case.units,
-            doubts,
-            first,
-            Candidates(sizes, values, limits, untried),
-            advice,
-            groups_left_out=len(alike) - len(first.alike),
-        ),
-        numbers={"logs": codec.plain(logs), "doubts": list(doubts), **codec.plain(seen), "advice": advice},
-        verdict=verdict,
+    sections = check_sections(
+        logs,
+        case.dt_s,
+        case.units,
+        doubts,
+        first,
+        Candidates(sizes, values, limits, untried),
+        advice,
+        groups_left_out=len(alike) - len(first.alike),
     )
+    numbers = {"logs": codec.plain(logs), "doubts": list(doubts), **codec.plain(seen), "advice": advice}
+    return RunSummary(title=case.name, sections=sections, numbers=numbers, verdict=verdict)
 
 
 def _log(loaded: SimulatorCase, k: int) -> LogSeen:
@@ -184,7 +181,10 @@ def share_at_ends(command: Real) -> float:
     # A command that settles at a set point comes to it in small steps; one that is cut stops in full motion.
     came_there = at_end & (begins > 0)
     last_steps = np.abs(steps[begins[came_there] - 1])
-    if not last_steps.size or np.median(last_steps) <= _MET * np.sqrt(np.mean(steps**2)):
+    if not last_steps.size:
+        return 0.0
+    usual_step = np.sqrt(np.mean(steps**2))
+    if np.median(last_steps) <= _MET * usual_step:
         return 0.0
     return min(share, _MOST_OF_A_MOVING_ONE)
 

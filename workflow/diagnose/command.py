@@ -68,11 +68,10 @@ class DiagnosisRun:
     def complaints(self) -> list[str]:
         """One line for every case that failed or whose fit did not converge."""
         lines = [f"{case}: {one_line(failure.reason)}" for case, failure in self.failures]
-        return lines + [
-            f"{document['case']}: the fit did not converge, no cause is named"
-            for document in self.documents
-            if document["detail_verdict"] == "not_converged"
-        ]
+        for document in self.documents:
+            if document["detail_verdict"] == "not_converged":
+                lines.append(f"{document['case']}: the fit did not converge, no cause is named")
+        return lines
 
     def json_parts(self, *, ascii_only: bool = False) -> Iterator[str]:
         """The run as JSON text in parts, an answer each: a thousand answers are never in memory at once."""
@@ -164,11 +163,9 @@ class Answers(Sequence[Mapping[str, Any]]):
 
     def __getitem__(self, index: Any) -> Any:
         name = self.names[index]
-        return (
-            self.directory.document(f"{name}.json")
-            if isinstance(name, str)
-            else Answers(self.directory, name)
-        )
+        if isinstance(name, str):
+            return self.directory.document(f"{name}.json")
+        return Answers(self.directory, name)
 
 
 @dataclass(frozen=True, eq=False)

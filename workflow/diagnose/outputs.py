@@ -96,18 +96,19 @@ def _of_rig(
         no_check=no_check,
         rig_text=rig,
         effects_text=effects,
-        progress=lambda f, m: report(_DIAGNOSED + (1 - _DIAGNOSED) * f, f"drawing {m}"),
+        progress=lambda share, what: report(_DIAGNOSED + (1 - _DIAGNOSED) * share, f"drawing {what}"),
     )
     files = {f"{case.name}.html": html.encode(), rig_name: rig.encode()}
     if effects:
         files[effects_name] = effects.encode()
     if coming.proposal is not None and coming.proposal.separates:
         files[f"{case.name}.next.csv"] = coming.csv_text().encode()
+    next_experiment = {"advice": coming.advice, "words": advice, **codec.plain(coming.proposal or {})}
     beside = {
         "where": place,
         "remains": remains,
         "completeness": completeness_of(diagnosis, remains),
-        "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.proposal or {})},
+        "next_experiment": next_experiment,
         "controller": {"skipped": no_check} if check is None else check.document(),
     }
     return beside, files
@@ -126,16 +127,17 @@ def _of_simulator(
     record_check = of_case(loaded, telling(loaded.case, time.monotonic() + _TELLING_S))
     if loaded.repaired is not None:
         files[f"{name}.xml"] = loaded.repaired(diagnosis, out).encode()
-    files[f"{name}.html"] = plant_page(
-        diagnosis, advice, record_check, loaded.model_error, *files, places=(place, remains)
-    ).encode()
+    page = plant_page(diagnosis, advice, record_check, loaded.model_error, *files, places=(place, remains))
+    files[f"{name}.html"] = page.encode()
+    next_experiment = {"advice": coming.advice, "words": advice, **codec.plain(coming.repeat or {})}
+    # What records can tell advises more records, whatever the answer; the answer has its own advice.
+    check = {key: value for key, value in record_check.numbers.items() if key != "advice"}
     beside = {
         "where": place,
         "remains": remains,
         "completeness": completeness_of(diagnosis, remains),
-        "next_experiment": {"advice": coming.advice, "words": advice, **codec.plain(coming.repeat or {})},
-        # What records can tell advises more records, whatever the answer; the answer has its own advice.
-        "check": {name: value for name, value in record_check.numbers.items() if name != "advice"},
+        "next_experiment": next_experiment,
+        "check": check,
     }
     return beside, files
 

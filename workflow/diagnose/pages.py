@@ -104,10 +104,10 @@ def plant_page(
     ValueError
         The plant does not state its sampling period (`where_in_records`).
     """
-    place, remains = places or (
-        where_in_records(diagnosis.case, diagnosis.residuals_refit, diagnosis.case.dt_s),
-        remains_of(diagnosis),
-    )
+    if places is None:
+        case = diagnosis.case
+        places = where_in_records(case, diagnosis.residuals_refit, case.dt_s), remains_of(diagnosis)
+    place, remains = places
     numbers = {
         "parameters": dict(diagnosis.rig.parameters),
         "effects": [change.to_dict() for change in diagnosis.repair],
@@ -126,11 +126,12 @@ def plant_page(
 
 def _can_show(told: RunSummary) -> list[Table]:
     """What records can tell; a next record is advised for the answer, not for all that could be one."""
-    return [
-        Table((section.title, ""), tuple((row.name, row.text) for row in section.rows))
-        for section in told.sections
-        if section.title != "next record"
-    ]
+    tables = []
+    for section in told.sections:
+        if section.title != "next record":
+            rows = tuple((row.name, row.text) for row in section.rows)
+            tables.append(Table((section.title, ""), rows))
+    return tables
 
 
 def remains_of(diagnosis: Diagnosis) -> Where:

@@ -92,9 +92,10 @@ def sampling_of(tables: Sequence[Table], settings: SimulatorSettings) -> float:
             else:
                 periods_s.append(sampling_time(table, stamps, name, None))
     if max(periods_s) > _ONE_GRID * min(periods_s):
+        longest_s = max(periods_s)
         raise InputError(
-            f"{tables[0].path}: logs are sampled every {min(periods_s):.6g} to {max(periods_s):.6g} s; put "
-            f"all on one grid: --resample-s {max(periods_s):.6g} (resample_s)"
+            f"{tables[0].path}: logs are sampled every {min(periods_s):.6g} to {longest_s:.6g} s; put all on "
+            f"one grid: --resample-s {longest_s:.6g} (resample_s)"
         )
     return periods_s[0]
 
@@ -128,10 +129,12 @@ def refuse_other_unit(
             if step_as_written * unit_s < LONG_STEP_S and fits(step_as_written * unit_s)
         ]
         scale = likely[0] if likely else 1e-3
-        of_model = f", {step_as_read_s / step_s:.4g} steps of the model ({step_s:g} s)" if step_s else ""
+        unit_words = _UNITS_OF_TIME[scale]
+        of_model = ""
+        if step_s:
+            of_model = f", {step_as_read_s / step_s:.4g} steps of the model ({step_s:g} s)"
         raise InputError(
-            f"{table.path}: {name!r} steps by {step_as_read_s:.4g} s{of_model}: is it in "
-            f"{_UNITS_OF_TIME[scale]}? Say "
+            f"{table.path}: {name!r} steps by {step_as_read_s:.4g} s{of_model}: is it in {unit_words}? Say "
             f'columns = {{time_s = {{column = "{name}", scale = {scale:g}}}}} in a case file (1: in s). If '
             "it counts samples, take it out: --dt-s (dt_s)"
         )
@@ -202,13 +205,14 @@ def noise_of(
             levels.append(stated)
             continue
         # Third differences of a smooth motion are small, those of noise are not; the median leaves out jumps.
-        third = np.concatenate([np.diff(e.output[:, k], 3) for e in experiments])
+        signals = [experiment.output[:, k] for experiment in experiments]
+        third = np.concatenate([np.diff(signal, 3) for signal in signals])
         rough = _PER_MEDIAN * float(np.median(np.abs(third))) / np.sqrt(_THIRD_DIFFERENCES)
         # A quantised reading has a uniform error of one step, of 1 / sqrt(12) of it, however still it lies.
-        steps = np.abs(np.concatenate([np.diff(e.output[:, k]) for e in experiments]))
+        steps = np.abs(np.concatenate([np.diff(signal) for signal in signals]))
         step = float(np.min(steps[steps > 0], initial=np.inf))
         quantised = step / np.sqrt(12) if np.isfinite(step) else 0.0
-        least = _LEAST_NOISE * max(float(np.ptp(e.output[:, k])) for e in experiments)
+        least = _LEAST_NOISE * max(float(np.ptp(signal)) for signal in signals)
         levels.append(max(rough, quantised, least))
     return np.array(levels)
 
@@ -264,10 +268,10 @@ def _signals(table: Table, names: Sequence[str], n_commands: int, settings: Simu
     if absent:
         raise ValueError(f"no column for {listing(absent)}: {which_column(absent, table, settings)}")
     # A column may be several quantities, and a record has it once.
-    commands = list(dict.fromkeys(column.column for column in columns[:n_commands]))
-    measured = list(
-        dict.fromkeys(column.column for column in columns[n_commands:] if column.column not in commands)
-    )
+    command_columns = [column.column for column in columns[:n_commands]]
+    output_columns = [column.column for column in columns[n_commands:]]
+    commands = list(dict.fromkeys(command_columns))
+    measured = [name for name in dict.fromkeys(output_columns) if name not in commands]
     time, unit = _time(table, settings)
     record = Record.from_file(
         table,
@@ -282,8 +286,8 @@ def _signals(table: Table, names: Sequence[str], n_commands: int, settings: Simu
     )
     read = dict(zip(record.input_names, record.input.T, strict=True))
     read |= dict(zip(record.output_names, record.output.T, strict=True))
-    signals = [
-        read[column.column] * _scale(name, column, table, settings) + column.offset
-        for name, column in zip(names, columns, strict=True)
-    ]
+    signals = []
+    for name, column in zip(names, columns, strict=True):
+        scale = _scale(name, column, table, settings)
+        signals.append(read[column.column] * scale + column.offset)
     return np.column_stack(signals)

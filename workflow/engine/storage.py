@@ -241,6 +241,7 @@ def locked(directory: Path, what: str, *below: Path) -> Iterator[None]:
         # Files of others must not be written or deleted through it.
         if place.is_symlink():
             raise InputError(f"{place}: a link; a {what} keeps its files in its own directory")
+    # A link at its place would have its target opened in the name of whoever runs this.
     no_link = os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW
     with os.fdopen(os.open(directory / "lock", no_link, 0o666), "w") as stream:
         try:

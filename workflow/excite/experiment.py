@@ -233,6 +233,7 @@ def plan_experiment(limits: ExperimentLimits, *, seed: int, **settings: object) 
     experiment = PlannedExperiment(limits, plan, seed, voltages)
     for record in experiment.records:
         about = f"{record.rms_V:g} V rms, realisation {record.realisation}"
+        # An amplitude that was scaled to the limit may pass it by rounding.
         if record.peak_V > limits.peak_V * (1 + 1e-9):
             raise InputError(f"{about}: peak of {record.peak_V:.4g} V, {limits.peak_V:g} V are allowed")
         if limits.angle_deg is not None and not (record.peak_angle_deg or 0.0) <= limits.angle_deg:

@@ -253,7 +253,6 @@ def _windows(
                 signals = getattr(runs, kind)[:, part]
                 quiet_s.append(_quiet_from(time_s[part], signals, tolerance))
         moving_s = max(quiet_s) - first
-        # The motion fills most of the panel, but a hundredth of a long trial is not blown up to a whole one.
         length = last - first
         shown_s = max(_WITH_REST * moving_s, _LEAST_SHARE * length)
         end = max(first + shown_s, least)

@@ -26,9 +26,13 @@ _LOOKS = {"stated": ("s", -0.22), "refit": ("D", 0.0), "repaired": ("o", 0.22)}
 def draw_probabilities(found: Diagnosis) -> Picture:
     """Bars: presence of the likeliest effects, those of the answer in colour; whether more is missing."""
     ranked = sorted(found.effects, key=lambda effect: -effect.presence)
-    shown = [e for e in ranked if e.presence >= 0.005 and e.name not in ("none", "unknown")][:_MOST_BARS]
-    names = [*(style.plain(in_words(e.name), 52) for e in shown), "something else is missing"]
-    percent = [100 * p for p in (*(e.presence for e in shown), 1 - found.completeness.probability)]
+    effects = [effect for effect in ranked if effect.name not in ("none", "unknown")]
+    shown = [effect for effect in effects if effect.presence >= 0.005][:_MOST_BARS]
+    names = [style.plain(in_words(effect.name), 52) for effect in shown]
+    names.append("something else is missing")
+    probabilities = [effect.presence for effect in shown]
+    probabilities.append(1 - found.completeness.probability)
+    percent = [100 * probability for probability in probabilities]
     present_colour = gap_style.MODELS["repaired"]["color"]
     colours = [present_colour if effect in found.present else gap_style.PALE for effect in shown]
     colours.append(gap_style.PALE)
@@ -45,14 +49,16 @@ def draw_waterfall(found: Diagnosis) -> Picture:
     gaps = found.gaps
     floor = found.noise_floor
     # Nothing beyond noise has no place on a logarithmic axis.
-    rows = {
-        name: {model: max(value, gap_style.LEAST * floor) for model, value in entry.items()}
-        for name, entry in found.gap_by_experiment.items()
-    }
+    least = gap_style.LEAST * floor
+    rows = {}
+    for name, entry in found.gap_by_experiment.items():
+        rows[name] = {model: max(value, least) for model, value in entry.items()}
     rough = found.case.model_error
     words = gap_style.SHARE_AXIS if rough > 0 else gap_style.RESIDUAL_AXIS
     line = gap_style.floor_of(rough)
-    picture, (left, right) = new_picture(max(3.4, 1.8 + 0.3 * len(rows)), 1, 2, width_ratios=[1.0, 1.15])
+    # A row of every experiment needs its room.
+    height_in = max(3.4, 1.8 + 0.3 * len(rows))
+    picture, (left, right) = new_picture(height_in, 1, 2, width_ratios=[1.0, 1.15])
     for place, (model, value) in enumerate(gaps.items()):
         left.bars(place, value, 0.6, color=gap_style.MODELS[model]["color"])
         if rough > 0:
@@ -65,7 +71,10 @@ def draw_waterfall(found: Diagnosis) -> Picture:
         left.words(format(value, digits), place, value, **words_at)
     left.x.named = [(k, gap_style.WORDS[model].replace(" ", "\n")) for k, model in enumerate(gaps)]
     left.axhline(floor, **line, zorder=1)
-    left.set(xlim=(-0.6, max(len(gaps), 3) - 0.4), ylim=(0, 1.15 * max(*gaps.values(), floor)))
+    highest = max(*gaps.values(), floor)
+    # Room for three bars at least: two alone would fill the panel.
+    n_places = max(len(gaps), 3)
+    left.set(xlim=(-0.6, n_places - 0.4), ylim=(0, 1.15 * highest))
     left.set(ylabel=words, title="Validation records together")
     left.grid_lines[0] = False
     for model in gaps:
@@ -76,7 +85,9 @@ def draw_waterfall(found: Diagnosis) -> Picture:
     right.axvline(floor, **line)
     every = [value for entry in rows.values() for value in entry.values()]
     # Beside a model error the repaired model may lie far below the threshold.
-    right.set(xscale="log", xlim=(0.8 * min(*every, floor), 1.3 * max(*every, 2 * floor)))
+    smallest = min(*every, floor)
+    largest = max(*every, 2 * floor)
+    right.set(xscale="log", xlim=(0.8 * smallest, 1.3 * largest))
     right.y.named = [(k, style.plain(name, 34)) for k, name in enumerate(rows)]
     right.set(ylim=(len(rows) - 0.5, -0.5), xlabel=words, title="Every experiment alone")
     return picture
@@ -85,7 +96,10 @@ def draw_waterfall(found: Diagnosis) -> Picture:
 @style.drawing("gap_partial")
 def draw_partial_answers(partial: Sequence[tuple[Sequence[str], float]]) -> Picture:
     """Bars: share of the held-out gap that effects close by themselves."""
-    names = [style.plain(listing([in_words(name) for name in effects]), 60) for effects, _ in partial]
+    names = []
+    for effects, _ in partial:
+        together = listing([in_words(name) for name in effects])
+        names.append(style.plain(together, 60))
     percent = [100 * share for _, share in partial]
     labels = [f"{p:.3g} %" for p in percent]
     colours = [gap_style.PALE] * len(names)
@@ -127,10 +141,12 @@ def draw_case_gaps(cases: Sequence[Any]) -> Picture:
     for model, values in (("stated", before), ("repaired", after)):
         panel.plot(values, at, marker=_LOOKS[model][0], ls="none", ms=7, **_label(model))
     panel.axvline(floor, **gap_style.FLOOR, zorder=0)
-    panel.set(xscale="log", xlim=(0.8 * floor, 1.3 * max(2 * floor, *before)))
-    panel.y.named = [
-        (k, f"{style.plain(case.name, 34)}: {style.plain(case.answer, 44)}") for k, case in enumerate(cases)
-    ]
+    largest = max(2 * floor, *before)
+    panel.set(xscale="log", xlim=(0.8 * floor, 1.3 * largest))
+    panel.y.named = []
+    for k, case in enumerate(cases):
+        words = f"{style.plain(case.name, 34)}: {style.plain(case.answer, 44)}"
+        panel.y.named.append((k, words))
     panel.set(ylim=(len(cases) - 0.5, -0.5), xlabel=f"validation {gap_style.RESIDUAL_AXIS}")
     panel.set_title("Model error, nominal and with effects")
     return picture

@@ -54,9 +54,11 @@ def draw_measured_beside_simulated(found: Diagnosis) -> Picture:
         # A free run may fall over, far away from what was measured.
         if runs:
             far = np.ptp(measured)
-            for panel, low, high in ((above, np.min(measured), np.max(measured)), (below, 0.0, 0.0)):
+            lowest = np.min(measured) - far
+            highest = np.max(measured) + far
+            for panel, low, high in ((above, lowest, highest), (below, -far, far)):
                 bottom, top = panel.y.limits()
-                panel.set(ylim=(max(bottom, low - far), min(top, high + far)))
+                panel.set(ylim=(max(bottom, low), min(top, high)))
     return picture
 
 
@@ -85,10 +87,13 @@ def draw_residual_traces(found: Diagnosis) -> Picture:
             for model, e in residuals.items():
                 look = {**gap_style.MODELS[model], "lw": 0.7, "ls": "-"}
                 panel.plot(*outline(time, e[:, column]), **look, label=gap_style.WORDS[model])
-            reach = max(4.0, 1.05 * max(float(np.max(np.abs(e[:, column]))) for e in residuals.values()))
+            largest = max(float(np.max(np.abs(e[:, column]))) for e in residuals.values())
+            # Four standard deviations at least, so that noise does not fill the panel.
+            reach = max(4.0, 1.05 * largest)
             panel.set(ylim=(-reach, reach))
             panel.x.margin = 0.01
-            title = f"{style.plain(experiment.name, 30)}{role}: {gap_style.look_of(case.outputs[column])[0]}"
+            output = gap_style.look_of(case.outputs[column])[0]
+            title = f"{style.plain(experiment.name, 30)}{role}: {output}"
             panel.set_title(title, size=9, bold=False)
         unit = "[% of motion]" if case.model_error > 0 else "over noise [1]"
         row[0].set(ylabel=f"residual\n{unit}")
@@ -106,9 +111,12 @@ def draw_residual_spectra(found: Diagnosis) -> Picture:
     """
     case = found.case
     dt_s = case.dt_s
+    # The arm's modes are marked where its values tell them: other plants have no such model.
     poles = linear_arm(case.rig).poles() if isinstance(case, Case) else np.zeros(0, complex)
-    modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in poles[poles.imag > 0])
-    picture, panels = small_multiples(len(case.outputs), len(case.outputs), 3.7, 0.0, sharey=True)
+    upper_poles = poles[poles.imag > 0]
+    modes_Hz = sorted(float(abs(pole)) / (2 * np.pi) for pole in upper_poles)
+    n_outputs = len(case.outputs)
+    picture, panels = small_multiples(n_outputs, n_outputs, 3.7, 0.0, sharey=True)
     for column, panel in enumerate(panels):
         for model in found.models:
             frequency, power = _spectrum([e[:, column] for e in found.residuals[model].values()], dt_s)
@@ -118,9 +126,8 @@ def draw_residual_spectra(found: Diagnosis) -> Picture:
         for number, mode in enumerate(modes_Hz[:_MODES], 1):
             if mode < 0.5 / dt_s:
                 style.tag_below(panel, mode, f"mode {number}")
-        panel.set(
-            xlabel="frequency [Hz]", title=f"Residual of the {gap_style.look_of(case.outputs[column])[0]}"
-        )
+        output = gap_style.look_of(case.outputs[column])[0]
+        panel.set(xlabel="frequency [Hz]", title=f"Residual of the {output}")
     # Once all are drawn: a limit that is set ends the scaling of the panels that share it.
     low, high = panels[0].y.limits()
     panels[0].set(ylim=(min(low, 0.1), max(high, 10.0)))

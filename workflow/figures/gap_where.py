@@ -64,25 +64,29 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Pictur
     """
     experiments = where.experiments
     factor, words = _size(model_error)
-    picture, (left, right) = new_picture(
-        max(3.7, 1.7 + 0.36 * len(experiments)), 1, 2, width_ratios=[1.25, 1.0]
-    )
+    # A bar of every experiment needs its room.
+    height_in = max(3.7, 1.7 + 0.36 * len(experiments))
+    picture, (left, right) = new_picture(height_in, 1, 2, width_ratios=[1.25, 1.0])
     sensors = [of_sensor.sensor for of_sensor in where.sensors]
     apart = np.linspace(-1.0, 1.0, len(sensors)) if len(sensors) > 1 else np.zeros(1)
     for sensor, shift in zip(sensors, 1 + 0.03 * apart, strict=True):
         name, colour = _look(where, sensor)
         for band in (band for band in where.bands if band.sensor == sensor):
-            middle = shift * np.sqrt(max(band.low_Hz, 0.5 * band.high_Hz / 4) * band.high_Hz)
+            # The whisker stands in the middle of the band as drawn, an eighth of its end at least.
+            low_Hz = max(band.low_Hz, 0.5 * band.high_Hz / 4)
+            middle = shift * np.sqrt(low_Hz * band.high_Hz)
             size, interval = _of_band(where, band, model_error)
+            # What is smaller has no place on a logarithmic axis.
+            least = factor * gap_style.LEAST
             left.plot(
                 [band.low_Hz, band.high_Hz],
-                [max(size, factor * gap_style.LEAST)] * 2,
+                [max(size, least)] * 2,
                 color=colour,
                 alpha=1.0 if band.gap.found else 0.35,
                 lw=4.0,
                 solid_capstyle="butt",
             )
-            left.plot([middle, middle], np.maximum(interval, factor * gap_style.LEAST), **_WHISKER)
+            left.plot([middle, middle], np.maximum(interval, least), **_WHISKER)
         left.plot([], [], color=colour, lw=4.0, label=name)
     left.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel=words)
     # Up to the threshold at least, so that a frame in which nothing is large is not empty.
@@ -133,10 +137,12 @@ def draw_regimes(where: Where, model_error: float = 0.0) -> Picture | None:
             label=name,
         )
         # The label where there is room for words, else the range on two lines.
-        named = [
-            style.plain(of_bin.label, 24) if count <= _FEW_BINS else f"{of_bin.low:.2g}\nto {of_bin.high:.2g}"
-            for of_bin in finding.bins
-        ]
+        named = []
+        for of_bin in finding.bins:
+            if count <= _FEW_BINS:
+                named.append(style.plain(of_bin.label, 24))
+            else:
+                named.append(f"{of_bin.low:.2g}\nto {of_bin.high:.2g}")
         panel.x.named = list(zip(at, named, strict=True))
         panel.tick_size[X] = 8.0
         panel.axhline(1.0, **gap_style.floor_of(model_error))

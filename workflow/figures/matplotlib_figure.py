@@ -185,7 +185,8 @@ def _legend(figure: Figure) -> None:
     for axes in figure.axes:
         for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    entry_in = _SAMPLE_IN + _LETTER_IN * max(len(label) for label in handles)
+    longest = max(len(label) for label in handles)
+    entry_in = _SAMPLE_IN + _LETTER_IN * longest
     fitting = max(1, int(figure.get_figwidth() / entry_in))
     figure.legend(
         list(handles.values()),
@@ -210,7 +211,8 @@ def _draw_panel(picture: Picture, panel: Panel, axes: Axes) -> None:
         _draw_mark(mark, axes)
     for which, axis in enumerate((panel.x, panel.y)):
         name = "xy"[which]
-        getattr(axes, f"set_{name}label")(drawable(panel.labels[which]), fontsize=panel.label_size[which])
+        label = drawable(panel.labels[which])
+        getattr(axes, f"set_{name}label")(label, fontsize=panel.label_size[which])
         axes.grid(visible=panel.grid_lines[which], axis=name)  # type: ignore[arg-type]
         of_axis = axes.yaxis if which else axes.xaxis
         _number(of_axis, axis)
@@ -307,7 +309,8 @@ def _in_the_font() -> frozenset[int]:
 
 def drawable(text: str) -> str:
     """A text in which characters that the font lacks are a box."""
-    return "".join(letter if letter == "\n" or ord(letter) in _in_the_font() else "\u25a1" for letter in text)
+    drawn = [letter if letter == "\n" or ord(letter) in _in_the_font() else "\u25a1" for letter in text]
+    return "".join(drawn)
 
 
 def _hertz_axis(axes: Axes) -> None:

@@ -90,8 +90,8 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
         is_inside_second = 0 < j < surface.second.size - 1
         is_inside_grid = is_inside_first and is_inside_second
         # The pair's own minimum is no grid point.
-        ratio = surface.first[i] / surface.pole[0]
-        is_another = abs(np.log(ratio)) > 0.2
+        frequency_ratio = surface.first[i] / surface.pole[0]
+        is_another = abs(np.log(frequency_ratio)) > 0.2
         if is_inside_grid and is_another:
             further_minima.append((i, j))
     if further_minima:

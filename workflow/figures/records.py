@@ -44,7 +44,9 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
     picture, grid = new_picture(
         1.55 * len(rows) + 1.0, len(rows), 2, squeeze=False, sharex="col", width_ratios=[2.1, 1.0]
     )
-    starts = np.concatenate([[0.0], np.cumsum([item.duration_s * 1.02 for item in shown])])
+    # A fiftieth of each record is left free before the next.
+    lengths_s = [item.duration_s * 1.02 for item in shown]
+    starts = np.concatenate([[0.0], np.cumsum(lengths_s)])
     first = shown[0].record
     # The first output where there is one, else the first input.
     liveliest_row = rows[0]
@@ -57,10 +59,10 @@ def draw_records(shown: Sequence[RunRecord], inputs: Sequence[str], outputs: Seq
             shade = {"color": style.SHADE[item.role], "label": _WORDS[item.role], "alpha": 0.15, "lw": 0}
             left.axvspan(start, start + item.duration_s, **shade)
             signal, _ = _signal(item.record, kind, name)
-            left.plot(
-                *outline(item.record.time_s + start, signal, max(600 // len(shown), 40)),
-                **style.MEASURED_LINE | {"lw": 0.6},
-            )
+            # Many records share one axis: each gets as many points as it has pixels.
+            n_points = max(600 // len(shown), 40)
+            drawn = outline(item.record.time_s + start, signal, n_points)
+            left.plot(*drawn, **style.MEASURED_LINE | {"lw": 0.6})
         signal, unit = _signal(first, kind, name)
         steps = {"drawstyle": "steps-post"} if kind == "input" else {}
         right.plot(first.time_s[zoom], signal[zoom], **style.MEASURED_LINE, **steps)
@@ -89,4 +91,5 @@ def _signal(record: Record, kind: str, name: str) -> tuple[Real, str]:
         raise ValueError(f"{record.label}: no {kind} column {name!r}; there is {list(names)}")
     column = names.index(name)
     units = getattr(record, f"{kind}_units")
-    return np.asarray(getattr(record, kind)[:, column]), units[column] if units else ""
+    signals = getattr(record, kind)
+    return np.asarray(signals[:, column]), units[column] if units else ""

@@ -114,6 +114,7 @@ class PointModel:
                 continue
             s = np.log(pole) / dt_s
             left, sizes, _ = np.linalg.svd(residue)
+            # A mode moves all outputs in one shape: its residue has rank one, but for rounding.
             one_shape = sizes.size == 1 or sizes[1] < 1e-6 * sizes[0]
             moved = left[:, 0] / left[np.argmax(np.abs(left[:, 0])), 0]
             modes.append((float(abs(s)), float(-s.real / abs(s)), moved.real if one_shape else None))

@@ -221,6 +221,7 @@ def run_loops(stage: StageInput) -> JointsLoopResult:
     # Twenty time constants of the slowest joint, unless a time is stated.
     bandwidths = [joint.bandwidth_rad_s for joint in config.joints if joint.bandwidth_rad_s]
     bandwidth_rad_s = min(bandwidths, default=1.0)
+    # Twenty time constants of the bandwidth: a step has settled in the first few.
     duration_s = config.closed_loop.duration_s or 20.0 / bandwidth_rad_s
     samples = int(np.ceil(duration_s / law.dt_s))
 

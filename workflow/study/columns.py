@@ -129,7 +129,9 @@ def _of_one_loop(results: RunResults, config: RunConfig) -> dict[str, Number]:
         numbers["disturbance_peak"] = check.spread_of("disturbance_peak")[-1]
         # A run that never gets there has no time: neither has the point.
         rows = metric_rows(check, "", "")
-        numbers |= {row.key.rpartition(".")[2]: row.value.plain["largest"] for row in rows}
+        for row in rows:
+            metric = row.key.rpartition(".")[2]
+            numbers[metric] = row.value.plain["largest"]
         numbers["settled_draws"] = check.settled_draws
         numbers["draws"] = check.draws
         if check.friction is not None:
@@ -157,12 +159,13 @@ def _of_joints(results: JointsResults) -> dict[str, Number]:
         bounds = max(bound for verdict in verdicts for bound in verdict.bounds.values())
         numbers["worst_gamma"] = plain(bounds if math.isfinite(bounds) else certificate.gamma)
         if all(verdict.stable for verdict in verdicts):
-            numbers["disk_margin"] = min(
-                min(verdict.input_disk.alpha, verdict.output_disk.alpha) for verdict in verdicts
-            )
+            # The weaker side of the loop: at the commands or at the measurements.
+            alphas = [min(verdict.input_disk.alpha, verdict.output_disk.alpha) for verdict in verdicts]
+            numbers["disk_margin"] = min(alphas)
     if runs:
         numbers["settled_draws"] = sum(run.settled for run in runs)
         numbers["draws"] = len(runs)
         if all(run.settled for run in runs):
-            numbers["overshoot_percent"] = 100.0 * max(0.0, *(float(run.overshoot.max()) for run in runs))
+            overshoots = [float(run.overshoot.max()) for run in runs]
+            numbers["overshoot_percent"] = 100.0 * max(0.0, *overshoots)
     return numbers

@@ -161,10 +161,11 @@ def _said(name: str, words: str) -> Row:
 
 def study_page(study: StudyView) -> Page:
     """The page of a study: what is best, the Pareto plots, every point, and why some are not certified."""
-    reasons = [
-        f"Point{'' if len(points) == 1 else 's'} {', '.join(map(str, points))} ({state}): {why}"
-        for state, why, points in study.reasons
-    ]
+    reasons = []
+    for state, why, points in study.reasons:
+        numbers = ", ".join(map(str, points))
+        plural = "" if len(points) == 1 else "s"
+        reasons.append(f"Point{plural} {numbers} ({state}): {why}")
     first = FirstScreen(
         headline(study),
         "certified" if any(row.good for row in study.rows) else "refused",

@@ -82,6 +82,7 @@ class StudyDirectory(Store):
 
     def plant(self, point: Point) -> RunDirectory:
         """The run directory of the plant that a point shares."""
+        # 64 bits of the hash tell the plants of any study apart, and keep paths short.
         return RunDirectory(self.path / "plants" / point.plant_key[:16])
 
     def point(self, point: Point) -> RunDirectory:
@@ -146,12 +147,14 @@ def _write(run: RunDirectory, point: Point, given: Mapping[str, bytes], done: Do
 def _matches(run: RunDirectory, point: Point, stages: tuple[Stage, ...], skip: tuple[str, ...] = ()) -> bool:
     """Whether the stages are there, made from what they would be made from now (but for those to skip)."""
     needed = {name for stage in stages for name in (stage.name, *stage.after)}
-    return (
-        run.manifest_path.is_file()
-        and all(run.stage_file(name) is not None for name in needed)
-        and all(
-            run.is_done(stage.name, stage_input_hash(stage, point.config, run, point.inputs))
-            for stage in stages
-            if stage.name not in skip
-        )
-    )
+    if not run.manifest_path.is_file():
+        return False
+    if any(run.stage_file(name) is None for name in needed):
+        return False
+    for stage in stages:
+        if stage.name in skip:
+            continue
+        made_from = stage_input_hash(stage, point.config, run, point.inputs)
+        if not run.is_done(stage.name, made_from):
+            return False
+    return True

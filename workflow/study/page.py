@@ -65,7 +65,11 @@ def row_of(point: Point, run: RunDirectory) -> PointRow:
         why = run_verdict(replace(design, met=True), certify, results.closed_loop, conditions=conditions)
 
     lowered = lowered_text(specification, design.specification, (), numbers["bandwidth_rad_s"] or 0)
-    if state == "certified" and check and check.tracking and check.spread_of("settling_time_s")[-1] is None:
+    never_arrives = False
+    if state == "certified" and check and check.tracking:
+        *_, longest_settling_s = check.spread_of("settling_time_s")
+        never_arrives = longest_settling_s is None
+    if check and never_arrives:
         # At rest, but beside the reference: certified, and yet of no use.
         state = "does not settle"
         why = never_settles(check)
@@ -109,7 +113,11 @@ def pareto_front(rows: Sequence[PointRow], plot: ParetoPlot) -> list[int]:
     """Numbers of the good points that no other good point beats in one column without losing in the other."""
     names = (plot.x, plot.y)
     # A point without one of the two numbers is on no front.
-    placed = [row for row in rows if row.good and None not in [row.numbers[name] for name in names]]
+    placed = []
+    for row in rows:
+        has_both = None not in [row.numbers[name] for name in names]
+        if row.good and has_both:
+            placed.append(row)
     x, y = ([COLUMNS[name].badness(row.numbers[name] or 0.0) for row in placed] for name in names)
     # beats[j, i]: j is nowhere worse than i, and somewhere better.
     beats = np.less_equal.outer(x, x) & np.less_equal.outer(y, y)
@@ -207,20 +215,13 @@ class StudyView:
     @property
     def document(self) -> Any:
         """What table.json holds."""
-        return codec.plain(
-            {
-                "title": self.title,
-                "columns": {
-                    name: {"label": column.label, "unit": column.unit, "better": column.better}
-                    for name, column in COLUMNS.items()
-                },
-                "fronts": [
-                    {"x": plot.x, "y": plot.y, "points": front}
-                    for plot, front in zip(self.config.pareto, self.fronts, strict=True)
-                ],
-                "points": self.rows,
-            }
-        )
+        columns = {}
+        for name, column in COLUMNS.items():
+            columns[name] = {"label": column.label, "unit": column.unit, "better": column.better}
+        fronts = []
+        for plot, front in zip(self.config.pareto, self.fronts, strict=True):
+            fronts.append({"x": plot.x, "y": plot.y, "points": front})
+        return codec.plain({"title": self.title, "columns": columns, "fronts": fronts, "points": self.rows})
 
 
 # A point of a Pareto plot: in front of the line between those of the front.
@@ -252,11 +253,12 @@ def _draw(panel: Panel, study: StudyView, plot: ParetoPlot, front: list[int]) ->
     y_column = study.column(plot.y)
     x_label = study.heading(plot.x)
     y_label = study.heading(plot.y)
+    short_x = style.plain(x_label, 40)
+    short_y = style.plain(y_label, 40)
     panel.set(
-        xlabel=f"{style.plain(x_label, 40)} ({x_column.better} is better)",
-        ylabel=f"{style.plain(y_label, 40)} ({y_column.better} is better)",
+        xlabel=f"{short_x} ({x_column.better} is better)",
+        ylabel=f"{short_y} ({y_column.better} is better)",
     )
-    panel.set_title(style.plain(f"{y_label} against {x_label}", 70))
 
     # A point without one of the two numbers has no place, but it is counted.
     at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
@@ -283,19 +285,25 @@ def _draw(panel: Panel, study: StudyView, plot: ParetoPlot, front: list[int]) ->
     # The front as a line from left to right, points above one another from bottom to top.
     if on_front.sum() > 1:
         places = at[on_front]
-        along = places[np.lexsort((places[:, 1], places[:, 0]))]
+        along_x = np.lexsort((places[:, 1], places[:, 0]))
+        along = places[along_x]
         panel.plot(*along.T, color=style.PREDICTED, lw=0.9, ls=":", zorder=2)
     if has_place.any():
         x, y = at[has_place].T
-        panel.set(xlim=pad_limits(x.min(), x.max(), 0.1), ylim=pad_limits(y.min(), y.max(), 0.1))
+        x_limits = pad_limits(x.min(), x.max(), 0.1)
+        y_limits = pad_limits(y.min(), y.max(), 0.1)
+        panel.set(xlim=x_limits, ylim=y_limits)
         _number(panel, at[on_front], number[on_front])
 
 
 def _number(panel: Panel, at: npt.NDArray[np.float64], number: npt.NDArray[np.int64]) -> None:
     """Numbers as in the table at places (P, 2), those of points in one place together."""
     # A fiftieth of the axes: closer together, two labels would lie on one another.
-    shares = np.rint(50 * np.column_stack([panel.x.shares(at[:, 0]), panel.y.shares(at[:, 1])]))
+    x_shares = panel.x.shares(at[:, 0])
+    y_shares = panel.y.shares(at[:, 1])
+    shares = np.rint(50 * np.column_stack([x_shares, y_shares]))
     for share in np.unique(shares, axis=0):
         here = np.all(shares == share, axis=1)
-        words = style.plain(", ".join(map(str, sorted(number[here]))), 18)
+        numbers = ", ".join(map(str, sorted(number[here])))
+        words = style.plain(numbers, 18)
         panel.words(words, *at[here][0], offset=(6.0, 5.0), size=8.5, color=style.REFERENCE)

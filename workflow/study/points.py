@@ -204,13 +204,12 @@ class PointMaker:
 
         # Keys by what results depend on: points of equal keys share them.
         plant = kind_of(config).plant_stages
+        given_digests = {name: self._digests[name] for name in given}
+        settings = {stage.name: stage.settings(config) for stage in plant}
+        # A plant that is taken over whole draws nothing.
+        seed = None if len(given) == len(plant) else config.run.seed
         plant_key = hash_of(
-            {
-                "given": {name: self._digests[name] for name in given},
-                "seed": None if len(given) == len(plant) else config.run.seed,
-                "files": dict(inputs),
-                "settings": {stage.name: stage.settings(config) for stage in plant},
-            }
+            {"given": given_digests, "seed": seed, "files": dict(inputs), "settings": settings}
         )
         design = kind_of(config).controller_stages[0].settings(config)
         design_key = hash_of({"plant": plant_key, "seed": config.run.seed, "settings": design})
@@ -234,6 +233,7 @@ class PointMaker:
     def _name(self, values: Mapping[str, Any], digest: str) -> str:
         labels = {axis.key: axis.name for axis in self._axes}
         words = [f"{labels[key]}-{short(value)}" for key, value in values.items()]
+        # File systems allow 255 bytes a name; the digest tells points apart whose words are cut.
         readable = re.sub(r"[^A-Za-z0-9_.-]+", "_", "_".join(words))[:90]
         return f"{readable or 'base'}_{digest[:10]}"
 
@@ -248,10 +248,11 @@ class PointMaker:
                 type(self._base.config).model_validate(document, context=self._base.context)
             except ValidationError as error:
                 # Only what sections say about values that are each right by themselves.
-                if all(
+                about_sections = [
                     detail["type"] == "value_error" and last_name(axis.key) not in detail["loc"]
                     for detail in error.errors()
-                ):
+                ]
+                if all(about_sections):
                     continue
             except ValueError:
                 pass
@@ -275,5 +276,6 @@ def short(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(short(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key} = {short(item)}" for key, item in value.items()) + "}"
+        entries = [f"{key} = {short(item)}" for key, item in value.items()]
+        return "{" + ", ".join(entries) + "}"
     return str(value)

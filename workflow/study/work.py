@@ -156,19 +156,16 @@ class _Work:
         groups: dict[str, list[Point]] = {}
         for point in valid:
             if point.plant_key in self.broken_plants:
-                rows[point.name] = PointRow(
-                    point.number, point.name, point.values, "failed", self.broken_plants[point.plant_key]
-                )
+                why = self.broken_plants[point.plant_key]
+                rows[point.name] = PointRow(point.number, point.name, point.values, "failed", why)
             elif self.directory.has_point(point):
                 rows[point.name] = row_of(point, self.directory.point(point))
                 self.taken_up += 1
             else:
                 groups.setdefault(point.design_key, []).append(point)
         self._report(rows.values())
-        work = [
-            _task(group, self.directory.plant_files(group[0]), kind_of(self.base.config).controller_stages)
-            for group in groups.values()
-        ]
+        stages = kind_of(self.base.config).controller_stages
+        work = [_task(group, self.directory.plant_files(group[0]), stages) for group in groups.values()]
         for results in _done(self.executor, list(groups.values()), work):
             for point, done in results:
                 if isinstance(done, Failure):

@@ -232,6 +232,7 @@ def make_trial(
     k = np.arange(samples)
     half = samples // 2
     if disturbance is None:
+        # Small beside the commands of the records, so that the loop has room to answer it.
         disturbance = 0.1 * rms_of([record.input for record in used])
     reference = np.where(k >= round(LEAD_IN * samples), step, 0.0)
     filtered = reference if reference_filter is None else reference_filter.filtered(reference)
@@ -262,6 +263,7 @@ def run_on_arm(stage: StageInput, controller: Controller, trial: Trial) -> LoopR
     nominal = rig_of(_simulated(stage))
     runs = []
     for draw in range(options.draws):
+        # The first tenth was the model, the last two tenths are sensitivity and conditions.
         stage.progress.update("closed_loop", 0.1 + 0.7 * draw / options.draws, "machine")
         # The first run is the nominal rig, the others as its tolerances allow (all alike where it has none).
         rig = nominal if draw == 0 else nominal.drawn(stage.rng("closed_loop", "rig", str(draw)))

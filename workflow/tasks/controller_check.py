@@ -133,8 +133,8 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
         input_rms = rms_of([e.voltage_V for e in case.estimation])
         plan = plan_sensitivity(controller, plant, input_rms, trial.time_s.size // 2)
         seen = measure_sensitivity(controller, arm, np.random.default_rng(_SEED), **plan.excitation())
-        margin = 1.0 / seen.peak[0]
-        runs.append(trial.run(controller, arm, plant.name, "repaired machine", margin))
+        measured_margin = 1.0 / seen.peak[0]
+        runs.append(trial.run(controller, arm, plant.name, "repaired machine", measured_margin))
     return ControllerCheck(
         trial=trial,
         specification=specification,

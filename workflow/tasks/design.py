@@ -158,6 +158,7 @@ def would_meet(
         A larger effort_limit, else a smaller bandwidth; of a key that gives way a further limit. None where
         none of a few values is certified.
     """
+    # The trials draw from a generator of their own: the caller's must not depend on how many there were.
     root = int(copy.deepcopy(rng).integers(2**63))
     quick = synthesis.model_copy(update={"sufficient_gamma": _CLEARLY})
     # Of a range of bandwidths it is the lowest that was missed.

@@ -261,6 +261,7 @@ def _measured(path: Path, design: DesignFile) -> DesignSource:
     remarks = tuple[str, ...]()
     if about.nominal is not None:
         nominal = read_state_space(about.nominal, read_document(about.nominal))
+        # Periods that are written with all their digits differ by rounding only.
         if not np.isclose(float(nominal.dt), about.dt_s, rtol=1e-9, atol=0):
             raise InputError(
                 f"{about.nominal}: dt_s = {float(nominal.dt):.6g}, but [plant] says {about.dt_s:.6g}"

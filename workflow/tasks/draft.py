@@ -304,6 +304,7 @@ def _specification(
     """Requirements that leave the bandwidth to what the identified arm allows; no less is asked for than the
     recorded loop had."""
     dt_s = look.records[0].dt_s * timing.rows_per_command
+    # Without a known band: a twentieth of the Nyquist frequency, where sampling costs hardly any phase.
     highest = look.told_rad_s[1] if look.told_rad_s else 0.05 * np.pi / dt_s
     # What the bandwidth stays below: the first mode, else the first notch, else what the logs tell.
     base = look.mode[0] if look.mode else look.notch or highest

@@ -160,9 +160,11 @@ def write_controller(
     content = {path: law_bytes(law, path.suffix, c) for path in targets(out)}
     if reference_filter is not None:
         content |= {filter_file(path): law_bytes(reference_filter, path.suffix, c) for path in targets(out)}
-    changed = {
-        path: data for path, data in content.items() if not path.is_file() or path.read_bytes() != data
-    }
+    changed = {}
+    for path, data in content.items():
+        # A file that would stay the same keeps its time.
+        if not path.is_file() or path.read_bytes() != data:
+            changed[path] = data
     storage.write_together(changed)
     return list(content)
 

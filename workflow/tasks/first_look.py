@@ -104,7 +104,8 @@ class RigidMotion:
         if s.size == 0:
             return True
         stiffness = 0.0 if self.stiffness is None else self.stiffness.value
-        force = s ** (self.order - 1) * (self.inertia.value * s + self.viscous.value) + stiffness
+        free = s ** (self.order - 1) * (self.inertia.value * s + self.viscous.value)
+        force = free + stiffness
         distance = np.abs(1 - response.centre[: s.size] * force)
         return bool(np.median(distance) < _AGREES)
 
@@ -186,11 +187,10 @@ def first_look(records: Sequence[Record], *, position: bool) -> FirstLook:
     turned = motion is not None and motion.turned
     if motion is not None and turned:
         cut = tuple(replace(record, input=-record.input) for record in cut)
-        negated: dict[str, Any] = {
-            name: replace(term, value=-term.value)
-            for name, term in vars(motion).items()
-            if isinstance(term, Term)
-        }
+        negated: dict[str, Any] = {}
+        for name, term in vars(motion).items():
+            if isinstance(term, Term):
+                negated[name] = replace(term, value=-term.value)
         motion = replace(motion, **negated)
     return FirstLook(cut, told_rad_s, motion, turned=turned)
 
@@ -215,15 +215,17 @@ def unseen_limit(look: FirstLook, *, position: bool) -> float | None:
         rigid = rigid_motion(clipped, motion.below_rad_s, told_rad_s[1], position=position)
         return np.inf if rigid is None else 1 - rigid.explained
 
-    limits = np.quantile(
-        np.abs(np.concatenate([record.input[:, 0] for record in look.records])), _LIMIT_QUANTILES
-    )
+    commands = np.concatenate([record.input[:, 0] for record in look.records])
+    limits = np.quantile(np.abs(commands), _LIMIT_QUANTILES)
     unexplained_at = [unexplained(float(limit)) for limit in limits]
     best = int(np.argmin(unexplained_at))
     if not unexplained_at[best] < _STAYS_UNEXPLAINED * (1 - motion.explained):
         return None
-    around = float(limits[max(best - 1, 0)]), float(limits[min(best + 1, limits.size - 1)])
-    return float(minimize_scalar(unexplained, bounds=around, method="bounded", options={"maxiter": 12}).x)
+    # The best one lies between the neighbours of the best that was tried.
+    below = float(limits[max(best - 1, 0)])
+    above = float(limits[min(best + 1, limits.size - 1)])
+    nearest = minimize_scalar(unexplained, bounds=(below, above), method="bounded", options={"maxiter": 12})
+    return float(nearest.x)
 
 
 def from_reference(records: Sequence[Record], of: Literal["input", "output"]) -> list[Record]:
@@ -261,15 +263,16 @@ def _told_by(records: Sequence[Record]) -> FrequencyUncertainty | None:
     omega = response.omega_rad_s
     spread = np.sqrt(np.trace(response.covariance, axis1=1, axis2=2))
     width = 2 * half + 1
-    instrument, output = (
-        np.sum(
-            np.abs(part[:, : omega.size * width].reshape(len(records), omega.size, width)) ** 2, axis=(0, 2)
-        )
-        for part in (spectra.instrument, spectra.output)
-    )
+    # Power of each signal about each frequency, over all records.
+    powers = []
+    for part in (spectra.instrument, spectra.output):
+        lines = part[:, : omega.size * width].reshape(len(records), omega.size, width)
+        powers.append(np.sum(np.abs(lines) ** 2, axis=(0, 2)))
+    instrument, output = powers
 
     # Lines that are excited and known: small deviation, some power at the instrument, output above the noise.
-    floor = float(np.median(output[-max(1, omega.size // 5) :]))
+    last_fifth = max(1, omega.size // 5)
+    floor = float(np.median(output[-last_fifth:]))
     is_told = spread < TOLD * np.abs(response.centre)
     is_told &= instrument > _EXCITED * instrument.max()
     is_told &= output > _ABOVE_FLOOR * floor
@@ -348,6 +351,7 @@ def rigid_motion(
 
     dt_s = records[0].dt_s
     low, high = (
+        # The corner of a filter has to lie below the Nyquist frequency; 0.6 of it is chosen.
         butter(3, min(omega * dt_s / np.pi, 0.6), output="sos")
         for omega in (below_rad_s, max(speed_rad_s, below_rad_s))
     )
@@ -371,7 +375,8 @@ def rigid_motion(
         smooth = sosfiltfilt(low, y)
         speed = derivative(sosfiltfilt(high, y), to_speed)
         # A fiftieth of the usual speed counts as part of the turn.
-        sign = sosfiltfilt(low, np.tanh(speed / max(0.02 * float(np.std(speed)), 1e-300)))
+        usual_speed = float(np.std(speed))
+        sign = sosfiltfilt(low, np.tanh(speed / max(0.02 * usual_speed, 1e-300)))
         of_record = np.zeros((record.n_samples, len(records)))
         of_record[:, k] = 1.0
         # Inertia, viscous friction, two further derivatives, dry friction, spring.
@@ -395,15 +400,19 @@ def rigid_motion(
     independent = target.size * min(1.0, below_rad_s * dt_s / np.pi)
     if independent < 4 * matrix.shape[1]:
         return None
-    rss = float(np.sum((target - q @ (r @ solution)) ** 2))
+    residual = target - q @ (r @ solution)
+    rss = float(np.sum(residual**2))
+    # Neighbouring samples are alike behind the filter: as many count as are independent.
     noise = rss / (independent - matrix.shape[1]) * independent / target.size
-    spread = np.sqrt(noise * np.sum(np.linalg.pinv(r) ** 2, axis=1) * target.size / independent)
+    variances = np.sum(np.linalg.pinv(r) ** 2, axis=1)
+    spread = np.sqrt(noise * variances * target.size / independent)
     total = float(np.std(target))
 
     def term(k: int) -> Term:
-        return Term(
-            float(solution[k] / scale[k]), float(spread[k] / scale[k]), float(abs(solution[k])) / total
-        )
+        value = float(solution[k] / scale[k])
+        std = float(spread[k] / scale[k])
+        share = float(abs(solution[k])) / total
+        return Term(value, std, share)
 
     return RigidMotion(
         inertia=term(0),

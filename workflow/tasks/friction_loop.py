@@ -464,6 +464,7 @@ def _shown_samples(run: ClosedLoopTrajectory, samples: int) -> int:
     if settling_s is None:
         return samples
     before = int(np.flatnonzero(run.reference)[0])
+    # So that the picture shows that it stays where it settled.
     needed = before + round(1.15 * settling_s / run.dt_s)
     return max(samples, min(needed, _MOST_SHOWN * samples))
 
@@ -509,6 +510,7 @@ def recorded_loop(stage: StageInput, loop: FrictionLoop) -> FrictionLoop | None:
     law = None if timing is None else timing.law
     if law is None or law.on_error is None:
         return None
+    # The loops are compared sample by sample.
     if abs(law.dt_s - loop.controller.dt_s) > 1e-6 * law.dt_s:
         return None
     numerator, denominator = law.on_error
@@ -578,6 +580,7 @@ def soonest(
 
 def _around(value: float, fit: FrictionFit) -> Interval:
     """95 % interval of a value that is proportional to the level of the friction."""
+    # 95 % of a normal distribution lie within 1.96 standard deviations.
     share = 1.96 * fit.level_std / fit.level if fit.level > 0 else 0.0
     return value * max(1 - share, 0.0), value * (1 + share)
 

@@ -92,6 +92,7 @@ def _searched_around(channel: Channel, dt_s: float) -> IdentOptions:
     if options.omega_min_rad_s is None:
         bounds["omega_min_rad_s"] = band[0] / 2
     if options.omega_max_rad_s is None:
+        # An octave above the band: a mode beyond its end shows inside. Near Nyquist there is none.
         bounds["omega_max_rad_s"] = min(2 * band[1], 0.9 * np.pi / dt_s)
     return options.model_copy(update=bounds)
 
@@ -121,15 +122,16 @@ def identify_channels(stage: StageInput) -> IdentifyResult:
                 lambda done, what: progress(what),
                 free=any(channel.uncertainty.friction_identified for channel in other_channels),
             )
-    in_loop = isinstance(config.source, FileSource) and (
-        config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
-    )
+    in_loop = False
+    if isinstance(config.source, FileSource):
+        in_loop = config.closed_loop_data.stated or made_in_loop(records.fitted(shaft))
     scale = config.source.scale if isinstance(config.source, FileSource) else {}
     channels = []
     for k, channel in enumerate(config.channels):
 
         def report(fraction: float, message: str, k: int = k, label: str = channel.label) -> None:
-            stage.progress.update("identify", (k + fraction) / len(config.channels), f"{label}: {message}")
+            share_done = (k + fraction) / len(config.channels)
+            stage.progress.update("identify", share_done, f"{label}: {message}")
 
         with naming(f"channel {channel.label!r}"):
             known = friction if channel.uncertainty.friction_identified else None
@@ -279,8 +281,10 @@ def identify_channel(
         if band is not None:
             # The search may go an octave further.
             warnings += pairs_outside(model.poles, options.fixed(), model.dt_s, band)
+        if opened:
+            warnings = [*warnings, *opened.warnings]
         return replace(
-            with_warnings(identified, [*warnings, *(opened.warnings if opened else ())]),
+            with_warnings(identified, warnings),
             bounded=tuple(bounded),
             increments=channel.increments,
             band_rad_s=channel.band_rad_s,
@@ -359,10 +363,10 @@ def _behind_remote_friction(
     as_recorded = identify_channel(plain, measured, [], loop, report, with_plot=False, units=units)
     remote = remote_friction(measured, as_recorded.model)
     free = [without_remote_friction(record, remote) for record in measured]
-    free_unseen = [
-        (without_remote_friction(record.siso(channel.input, channel.output), remote), role)
-        for record, role in unseen
-    ]
+    free_unseen = []
+    for record, role in unseen:
+        shaft_record = record.siso(channel.input, channel.output)
+        free_unseen.append((without_remote_friction(shaft_record, remote), role))
     identified = identify_channel(plain, free, free_unseen, loop, report, with_plot=with_plot, units=units)
     return replace(identified, remote=remote)
 

@@ -131,6 +131,7 @@ class ConditionBench:
         length = max(2, round(0.4 * n))
         samples_moving = np.arange(n) - start
         x = np.clip(samples_moving / length, 0.0, 1.0)
+        # The shortest polynomial from 0 to 1 that begins and ends without speed and acceleration.
         shape = x**3 * (10 - 15 * x + 6 * x**2)
         size = 4 * self.step
         if self.controller.input_limit is not None:
@@ -175,6 +176,7 @@ class ConditionBench:
         much.
         """
         link = self.rig.link
+        # Of the mass of the link alone, without hub and payload [kg].
         tenth = 0.1 * link.density_kg_m3 * link.width_m * link.thickness_m * link.length_m
         extra = float(self.effects.get("tip_payload", {}).get("mass_kg", 0.0))
         rated = self.rig.payload.mass_kg + extra or tenth
@@ -269,7 +271,7 @@ class ConditionBench:
         exchanged by name; steps: of measurement and command."""
         reference = self.reference if reference is None else reference
         predicted = self.predict(reference, law=law, output_disturbance=output_disturbance, clip=clip)
-        changed = {name: dict(effect) for name, effect in (effects or {}).items()}
+        changed = {key: dict(effect) for key, effect in (effects or {}).items()}
         extra = list((self.effects | changed).values())
         rng = self.rng.spawn(1)[0]
         arm = encoded_arm(self.source, extra, rng, rig=rig or self.rig, tip_force_N=tip_force_N)

@@ -50,6 +50,7 @@ def settling_samples(pole_radius: float, shortest: int, longest: int) -> int:
 
     pole_radius: its modulus, below 1; the result lies between shortest and longest.
     """
+    # A pole on the circle would need a trial without end, one at zero none at all.
     radius = min(max(pole_radius, 0.5), 1 - 1e-9)
     samples = round(2 * 7 / -np.log(radius))
     return int(min(max(samples, shortest), longest))
@@ -108,26 +109,34 @@ def plan_sensitivity(
         Samples in which the loop settles; they are left out.
     """
     dt = controller.dt_s
+    # Some 2300 points a decade: a lightly damped peak is not missed between two.
     omega = np.geomspace(1e-3 / dt, plant.nyquist_rad_s, 8000)
-    size = 1 / np.abs(1 + (controller.response(omega) * plant.channel.nominal_response(omega)))
+    loop = controller.response(omega) * plant.channel.nominal_response(omega)
+    size = 1 / np.abs(1 + loop)
     at = int(np.argmax(size))
+    # The peak of a loop that rolls off late may lie where a reference can hardly excite it.
     centre = min(float(omega[at]), plant.nyquist_rad_s / 4)
-    period = int(np.clip(round(2 * np.pi * _LINES_BELOW_PEAK / (centre * dt)), _SHORTEST, _LONGEST))
+    samples = round(2 * np.pi * _LINES_BELOW_PEAK / (centre * dt))
+    period = int(np.clip(samples, _SHORTEST, _LONGEST))
 
     # A flat reference over the band; its size follows from the gain to the command.
     line = 2 * np.pi / (period * dt)
-    band = (max(centre / _LINES_BELOW_PEAK, line), min(10 * centre, 0.8 * plant.nyquist_rad_s))
-    inside = np.arange(band[0], band[1], line)
-    gain = np.abs(controller.response(inside))
-    gain = gain / np.abs(1 + controller.response(inside) * plant.channel.nominal_response(inside))
+    lowest = max(centre / _LINES_BELOW_PEAK, line)
+    highest = min(10 * centre, 0.8 * plant.nyquist_rad_s)
+    inside = np.arange(lowest, highest, line)
+    law = controller.response(inside)
+    return_difference = 1 + law * plant.channel.nominal_response(inside)
+    gain = np.abs(law) / np.abs(return_difference)
     command = _INPUT_SHARE * input_rms
     if controller.input_limit is not None:
         command = min(command, controller.input_limit / _CREST)
+    lead_in = int(np.clip(np.ceil(transient_samples / period), 1, 4))
+    rms_gain = float(np.sqrt(np.mean(gain**2)))
     return SensitivityPlan(
-        band_rad_s=(float(band[0]), float(band[1])),
+        band_rad_s=(float(lowest), float(highest)),
         period_samples=period,
-        lead_in_periods=int(np.clip(np.ceil(transient_samples / period), 1, 4)),
-        rms=command / float(np.sqrt(np.mean(gain**2))),
+        lead_in_periods=lead_in,
+        rms=command / rms_gain,
         nominal_peak=float(size[at]),
         nominal_omega_rad_s=float(omega[at]),
     )
@@ -153,6 +162,8 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
     for number, (name, effects, share) in enumerate(arms):
         measurement = measured_on_arm(stage, controller, plan.excitation(share), str(number), effects)
         peak, std, omega = measurement.peak
+        off_nominal_percent = 100 * (peak / plan.nominal_peak - 1)
+        off_certified_percent = 100 * (peak / certified - 1) if np.isfinite(certified) else None
         rows.append(
             MeasuredPeak(
                 name=name,
@@ -160,8 +171,8 @@ def sensitivity_on_arm(stage: StageInput, controller: Controller, transient_samp
                 peak=peak,
                 peak_std=std,
                 peak_omega_rad_s=omega,
-                off_nominal_percent=100 * (peak / plan.nominal_peak - 1),
-                off_certified_percent=100 * (peak / certified - 1) if np.isfinite(certified) else None,
+                off_nominal_percent=off_nominal_percent,
+                off_certified_percent=off_certified_percent,
                 peak_command=measurement.peak_command,
                 limited_fraction=measurement.limited_fraction,
                 omega_rad_s=measurement.omega_rad_s,

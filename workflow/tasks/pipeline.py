@@ -117,10 +117,9 @@ def run_pipeline(
 
         # Names and number type of the C code: as stated now, or when the run began.
         kept_dialect = run.manifest().get("c_code", {})
+        kept_keys = {key: kept_dialect[key] for key in ("prefix", "number") if key in kept_dialect}
         with naming(str(run.manifest_path)):
-            dialect_before = changed(
-                Dialect(), **{key: kept_dialect[key] for key in ("prefix", "number") if key in kept_dialect}
-            )
+            dialect_before = changed(Dialect(), **kept_keys)
         dialect = changed(dialect_before, **(c_code or {}))
         run.record_status("running", c_code=asdict(dialect))
 
@@ -324,10 +323,10 @@ def _say_what_cannot_be_taken_over(earlier: RunDirectory, nothing_because: str, 
     for name, state in lost.items():
         by_state.setdefault(state, []).append(name)
     if by_state:
-        words = [
-            f"{', '.join(names)} {'is' if len(names) == 1 else 'are'} {state}"
-            for state, names in by_state.items()
-        ]
+        words = []
+        for state, names in by_state.items():
+            verb = "is" if len(names) == 1 else "are"
+            words.append(f"{', '.join(names)} {verb} {state}")
         progress.note(f"of {earlier.path}/stages {' and '.join(words)}: done again")
 
 

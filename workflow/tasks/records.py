@@ -182,11 +182,11 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
     first = records[0]
     for other in records[1:]:
         if not other.sampled_like(first):
+            longest_s = max(record.dt_s for record in records)
             raise InputError(
                 f"records {first.name!r} and {other.name!r} differ in sampling time "
                 f"({first.dt_s:.6g} and {other.dt_s:.6g} s); put all on one grid, --resample-s "
-                f"{max(record.dt_s for record in records):.6g} (resample_s), or identify them in separate "
-                "runs"
+                f"{longest_s:.6g} (resample_s), or identify them in separate runs"
             )
     from ident.friction import with_commands_in_time
 

@@ -202,7 +202,8 @@ class IdentifiedChannel:
     def modes(self) -> tuple[ModelMode, ...]:
         """Ascending in frequency."""
         poles = self.model.stable_poles
-        pairs = zip(poles.omega_rad_s(self.model.dt_s).tolist(), poles.zeta().tolist(), strict=True)
+        omega_rad_s = poles.omega_rad_s(self.model.dt_s).tolist()
+        pairs = zip(omega_rad_s, poles.zeta().tolist(), strict=True)
         return tuple(ModelMode(omega, zeta) for omega, zeta in sorted(pairs))
 
     @property
@@ -219,7 +220,8 @@ class IdentifiedChannel:
         """Decay rates, slowest first; a pole at or left of z = 0 has none."""
         real = self.model.stable_poles.real
         decays = real > 0
-        return tuple(sorted((-np.log(real[decays]) / self.model.dt_s).tolist()))
+        rates_per_s = -np.log(real[decays]) / self.model.dt_s
+        return tuple(sorted(rates_per_s.tolist()))
 
     @property
     def real_poles_z(self) -> tuple[float, ...]:
@@ -230,6 +232,7 @@ class IdentifiedChannel:
     def unstable_poles(self) -> tuple[tuple[float, float], ...]:
         """Growth rate, 1/s, and frequency, rad/s (0 for a real one), of each pole outside the circle."""
         outside = np.log(self.model.unstable_poles) / self.model.dt_s
+        # Of a pair the upper one stands for both.
         return tuple((float(s.real), float(s.imag)) for s in outside if s.imag >= 0)
 
     @property
@@ -292,7 +295,8 @@ class ModeInterval:
 
     @property
     def frequency_Hz(self) -> Interval:
-        return self.omega_rad_s[0] / (2 * np.pi), self.omega_rad_s[1] / (2 * np.pi)
+        low, high = self.omega_rad_s
+        return low / (2 * np.pi), high / (2 * np.pi)
 
 
 @dataclass(frozen=True)
@@ -420,7 +424,9 @@ class UncertainChannel:
         centre = np.mean([part.centre for part in parts], axis=0)
         covariance = np.zeros_like(self.frequency.covariance)
         for part in parts:
-            away = np.stack([(part.centre - centre).real, (part.centre - centre).imag], axis=1)
+            offset = part.centre - centre
+            away = np.stack([offset.real, offset.imag], axis=1)
+            # An ellipse of this level is so many standard deviations large.
             away = away / chi2_radius(self.level)
             covariance += 2 * (part.covariance + away[:, :, None] * away[:, None, :])
         return replace(self.frequency, centre=centre, covariance=covariance)
@@ -502,16 +508,19 @@ class UncertaintyResult:
             performance = None
             if performance_index is not None:
                 performance = channels[performance_index].in_plant()
-            self._plants[key] = tuple(
-                UncertainPlant(
-                    name=f"{name}, {member.about}" if member.about else name,
-                    nominal=member.nominal.to_control(),
-                    uncertainty=member.posterior,
-                    performance=performance,
-                    level=control.level,
+            plants = []
+            for member in control.members:
+                plant_name = f"{name}, {member.about}" if member.about else name
+                plants.append(
+                    UncertainPlant(
+                        name=plant_name,
+                        nominal=member.nominal.to_control(),
+                        uncertainty=member.posterior,
+                        performance=performance,
+                        level=control.level,
+                    )
                 )
-                for member in control.members
-            )
+            self._plants[key] = tuple(plants)
         return self._plants[key]
 
     @cached_property
@@ -767,12 +776,15 @@ class SlowSine:
     @property
     def stands_still(self) -> bool:
         """The arm without feed-forward: its error is nearly the whole sine."""
-        return self.amplitude < self.moves_from and self.rms[0] > 0.9 * self.amplitude / np.sqrt(2)
+        rms_of_sine = self.amplitude / np.sqrt(2)
+        return self.amplitude < self.moves_from and self.rms[0] > 0.9 * rms_of_sine
 
     @property
     def rms(self) -> tuple[float, float]:
         """Root mean square of the error, without and with feed-forward."""
-        return float(np.sqrt(np.mean(self.without**2))), float(np.sqrt(np.mean(self.given**2)))
+        without = float(np.sqrt(np.mean(self.without**2)))
+        given = float(np.sqrt(np.mean(self.given**2)))
+        return without, given
 
 
 @dataclass(frozen=True)
@@ -812,7 +824,8 @@ class SettlingRange:
         fewer do. Choices are made by it, as the ends of the range are chance themselves."""
         # Each size stands for the sizes up to half-way to its neighbours.
         places = np.log(np.abs(self.sizes))
-        edges = np.concatenate([places[:1], (places[1:] + places[:-1]) / 2, places[-1:]])
+        half_way = (places[1:] + places[:-1]) / 2
+        edges = np.concatenate([places[:1], half_way, places[-1:]])
         shares = np.diff(edges) / (places[-1] - places[0])
         times_s = np.array([np.inf if time is None else time for time in self.times_s])
         order = np.argsort(times_s, kind="stable")
@@ -1035,7 +1048,9 @@ class LoopCheck:
         """First, smallest and largest of a metric over the runs; None (never reached) is larger than all."""
         values = [getattr(row, metric) for row in self.achieved]
         known = [value for value in values if value is not None]
-        return values[0], min(known, default=None), max(known) if len(known) == len(values) else None
+        smallest = min(known, default=None)
+        largest = max(known) if len(known) == len(values) else None
+        return values[0], smallest, largest
 
 
 @dataclass(frozen=True, eq=False)

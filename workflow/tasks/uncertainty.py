@@ -462,6 +462,7 @@ def display_grid(model: GobfModel, records: Sequence[Record]) -> RealArray:
             modes.append(Mode(float(omega), float(zeta)))
     low = 2 * np.pi / longest_s
     high = np.pi / model.dt_s
+    # A curve of 300 points looks smooth, but for its resonances: each has points of its own.
     return frequency_grid(high, modes, omega_min_rad_s=low, n_log=300, n_mode=41 * len(modes))
 
 
@@ -578,6 +579,7 @@ def scatter_of(
     decades = np.log10(high / low)
     n_bands = max(round(2 * decades), 1)
     edges = np.geomspace(low, high * (1 - 1e-6), n_bands + 1)
+    # Some twenty frequencies a band; the last one lies inside the last band.
     omega = np.geomspace(low, high * (1 - 2e-6), 20 * len(edges))
     estimates = [[each.at(omega, channel.uncertainty.level) for each in group] for group in posteriors]
     return tuple(repeat_scatter(estimates, list(pairwise(edges.tolist()))))

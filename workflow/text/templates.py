@@ -79,6 +79,7 @@ class CompiledTemplates(BytecodeCache):
     def load_bytecode(self, bucket: Bucket) -> None:
         with contextlib.suppress(OSError):
             content = _file(bucket).read_bytes()
+            # A SHA-256 has 32 bytes. A file that was written only in part has another one.
             digest, code = content[:32], content[32:]
             if digest == self._digest(bucket, code):
                 bucket.code = marshal.loads(code)

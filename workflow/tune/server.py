@@ -50,6 +50,7 @@ class TuneServer(ThreadingHTTPServer):
         except (OSError, OverflowError) as error:
             raise InputError(f"--port {port}: cannot be listened on ({error}); choose another") from error
         self.session = session
+        # Other pages in the same browser, and other users of the machine, do not know it.
         self.token = secrets.token_urlsafe(24)
         self.hosts = tuple(f"{name}:{self.server_port}" for name in (HOST, "localhost"))
         self.actions: dict[str, Handler] = {
@@ -78,25 +79,22 @@ class TuneServer(ThreadingHTTPServer):
         session = self.session
         settings = _of_script(session.settings())
         unit = session.output_unit
-        return (
-            environment()
-            .get_template("tune.html.j2")
-            .render(
-                title=f"Tune {', '.join(path.stem for path in session.paths)}",
-                settings=settings,
-                nonce=nonce,
-                fixed=[
-                    name
-                    for name, value in session.specification.model_dump(exclude_none=True).items()
-                    if isinstance(value, dict | tuple)
-                ],
-                step=session.step_words,
-                step_size=session.step_size,
-                unit=_of_script(f" [{unit}]" if unit else ""),
-                filtered=session.filter is not None,
-                out=session.out,
-                name=_free_name(session.out),
-            )
+        # What has several numbers is no slider: the page names it as fixed.
+        stated = session.specification.model_dump(exclude_none=True)
+        fixed = [name for name, value in stated.items() if isinstance(value, dict | tuple)]
+        plants = ", ".join(path.stem for path in session.paths)
+        template = environment().get_template("tune.html.j2")
+        return template.render(
+            title=f"Tune {plants}",
+            settings=settings,
+            nonce=nonce,
+            fixed=fixed,
+            step=session.step_words,
+            step_size=session.step_size,
+            unit=_of_script(f" [{unit}]" if unit else ""),
+            filtered=session.filter is not None,
+            out=session.out,
+            name=_free_name(session.out),
         )
 
 
@@ -130,6 +128,7 @@ class _Request(BaseHTTPRequestHandler):
         if asked.path != "/":
             self._refuse(HTTPStatus.NOT_FOUND, "no such page")
         elif self._allowed(token):
+            # Only the script of this very answer may run.
             nonce = secrets.token_urlsafe(16)
             self._answer(HTTPStatus.OK, self.server.page(nonce), "text/html", nonce)
 
@@ -189,15 +188,17 @@ class _Request(BaseHTTPRequestHandler):
         policy = "default-src 'none'; style-src 'unsafe-inline'; connect-src 'self'; img-src data:; "
         policy += f"base-uri 'none'; form-action 'none'; frame-ancestors 'none'; script-src 'nonce-{nonce}'"
         self.send_response(status)
-        for name, value in {
+        headers = {
             "Content-Type": f"{kind}; charset=utf-8",
             "Content-Length": str(len(content)),
             "Content-Security-Policy": policy,
             "Cache-Control": "no-store",
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
-            **({"Connection": "close"} if self.close_connection else {}),
-        }.items():
+        }
+        if self.close_connection:
+            headers["Connection"] = "close"
+        for name, value in headers.items():
             self.send_header(name, value)
         try:
             self.end_headers()
@@ -258,6 +259,7 @@ def serve(server: TuneServer, tell: Callable[[str], None], *, browser: bool) -> 
         tell(server.url)
         if browser:
             webbrowser.open(server.url)
+        # So soon Ctrl-C is heard [s].
         server.serve_forever(poll_interval=0.2)
     except KeyboardInterrupt:
         tell("stopped")

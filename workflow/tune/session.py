@@ -170,6 +170,7 @@ class TuningSession:
         if self.drawable:
             words = "confidence of each ellipse: share of the probability inside"
             about = {"name": CONFIDENCE, "kind": "number", "words": words, "value": self._plants[0].level}
+            # Below one half an ellipse holds less than it leaves out; near 1 it grows without end.
             settings.append(about | {"ge": 0.5, "lt": 0.9999})
         return [setting | {"unit": unit_of(setting["name"], *self._units)} for setting in settings]
 
@@ -405,6 +406,7 @@ class TuningSession:
             # The step until it hardly moves: beyond its settling to 2 %.
             distance = np.abs(y - y[-1])
             away = np.flatnonzero(distance > 0.01 * self.step_size)
+            # A step that settles within a few samples would be a jump without a shape.
             shown = 40
             if away.size:
                 shown = max(shown, int(1.5 * (away[-1] + 1)))

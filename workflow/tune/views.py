@@ -70,6 +70,7 @@ def bode(law: Controller, plant: UncertainPlant, omega_rad_s: Real, units: tuple
     ):
         degrees = np.degrees(np.unwrap(np.angle(values)))
         if shifted:
+            # Whole turns are arbitrary: at the crossover the phase is to lie between -360 and 0 degrees.
             degrees = degrees - 360.0 * np.ceil(degrees[crossover] / 360.0)
         curves.append({"symbol": symbol, "unit": unit, "gain": short(np.abs(values)), "deg": short(degrees)})
     return {"x": short(omega_rad_s), "curves": curves}
