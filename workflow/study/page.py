@@ -259,6 +259,7 @@ def _draw(panel: Panel, study: StudyView, plot: ParetoPlot, front: list[int]) ->
         xlabel=f"{short_x} ({x_column.better} is better)",
         ylabel=f"{short_y} ({y_column.better} is better)",
     )
+    panel.set_title(style.plain(f"{y_label} against {x_label}", 70))
 
     # A point without one of the two numbers has no place, but it is counted.
     at = np.array([(row.numbers[plot.x], row.numbers[plot.y]) for row in study.rows], dtype=np.float64)
