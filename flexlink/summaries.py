@@ -288,6 +288,7 @@ def synthesis_result(result: SynthesisResult) -> list[str]:
             f"Controller of order {result.controller.order}: worst weighted gain {at_most(result.gamma, 4)} "
             f"{over}, {verdict}"
         ]
+    # What to relax first, where the specification is missed.
     for point in result.blocking[:_SHOWN_REQUIREMENTS]:
         lines.append(
             f"  hardest: {point.weight} of '{point.plant}' at {point.omega_rad_s:.4g} rad/s, "
@@ -405,6 +406,7 @@ def _diagnosis_headline(result: Diagnosis, added: Sequence[str]) -> str:
     if result.verdict == "unknown":
         cause = "of unknown cause" if added else "explained by none of the candidate effects"
         return f"Model error {cause} (error / noise: {_sizes(result, added)})"
+    # A cause that is found need not be the only one.
     incomplete = ", and something else" if complete.probability < _EVEN_ODDS else ""
     return f"Model error / noise: {_sizes(result, added)}{incomplete}"
 

@@ -64,6 +64,7 @@ _LEAST_MIB = 600
 def too_little_memory() -> str:
     """What to do where `ulimit -v` leaves less than the libraries need; else empty."""
     soft, _ = resource.getrlimit(resource.RLIMIT_AS)
+    # The limit is in bytes.
     if soft == resource.RLIM_INFINITY or soft >= _LEAST_MIB << 20:
         return ""
     wanted = f"flexlink needs {_LEAST_MIB}: ulimit -v {_LEAST_MIB << 10}"

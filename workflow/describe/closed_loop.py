@@ -431,6 +431,7 @@ def _metrics_table(check: LoopCheck, output_unit: str, further_rows: Sequence[Ro
     rows = []
     for row in further_rows:
         name = row.name
+        # A run that never gets there has no number, and the table would hide it behind the others.
         metric = row.key.rpartition(".")[2]
         never = [run for run in check.achieved if getattr(run, metric) is None]
         if never:

@@ -128,6 +128,7 @@ def refuse_other_unit(
             for unit_s in _UNITS_OF_TIME
             if step_as_written * unit_s < LONG_STEP_S and fits(step_as_written * unit_s)
         ]
+        # Where no unit fits, milliseconds are the one that loggers write most often.
         scale = likely[0] if likely else 1e-3
         unit_words = _UNITS_OF_TIME[scale]
         of_model = ""

@@ -157,6 +157,7 @@ def _frame(scale: float, axes_seen: str, record_s: float, shown_s: float) -> str
     faster = ""
     if record_s > _NOTICEABLY_FASTER * shown_s:
         faster = f", shown {record_s / shown_s:.2g} times faster"
+    # A scale in metres and the axes seen on the left; on the right a bar that fills while the motion runs.
     ink = 'stroke="#555" stroke-width="1.5" fill="none"'
     words = 'fill="#555" font-size="12"'
     return (

@@ -297,6 +297,7 @@ class RunDirectory(Store):
             _Manifest.model_validate(document)
         except ValidationError as error:
             key = ".".join(map(str, error.errors()[0]["loc"]))
+            # A message stays a line, whatever a damaged file holds.
             raise InputError(f"{self.manifest_path}: damaged at {key[:80]}; start a new run") from error
         return document
 

@@ -60,8 +60,10 @@ def response_band(uncertainty: FrequencyUncertainty) -> ResponseBand:
     origin = -centre * np.conj(u1)
     low = nearest_distance(origin, s1, s2)
     phase = unwrapped_degrees(centre)
+    # Seen from its centre the edge turns the phase by little; from the origin it would jump by whole turns.
     turn = ellipse.boundary(128)[keep] / np.where(centre == 0, 1.0, centre)[:, None]
     swing = np.degrees(np.angle(1.0 + turn))
+    # An ellipse that holds the origin has members of every phase.
     holds_origin = low <= 0
     return ResponseBand(
         omega_rad_s=uncertainty.omega_rad_s[keep],

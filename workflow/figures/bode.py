@@ -227,6 +227,7 @@ def draw_comparison(
     """
     picture, (gain, phase) = new_picture(6.0, 2, 1, sharex=True, height_ratios=[1.4, 1.0])
     colours = (style.MODEL, style.ACHIEVED, style.PREDICTED, style.LIMIT, style.HIGHLIGHT, style.MEASURED)
+    # Colours first, then dashes: eighteen responses differ in one or the other.
     lines = ("-", (0, (5, 2)), (0, (1, 1.5)))
     bands = []
     for k, (name, response) in enumerate(responses.items()):

@@ -317,6 +317,7 @@ def height(asked: Real, runs: Sequence[Real], most: float) -> tuple[float, float
     """
     low = float(asked.min())
     high = float(asked.max())
+    # A reference that stands has no span: its own size is the next best measure.
     span = high - low if high > low else max(abs(high), 1e-12)
     together = np.nan_to_num(np.concatenate([asked, *(np.ravel(run) for run in runs)]), nan=low)
     shown = np.clip(together, low - most * span, high + most * span)
@@ -341,9 +342,11 @@ def draw_measured_sensitivity(run: RunView) -> Picture | None:
     if loop is None or loop.sensitivity is None:
         return None
     low, high = loop.sensitivity.band_rad_s
+    # A little beyond the measured lines, so that the first and the last do not stand on the frame.
     high = min(1.1 * high, run.plant.nyquist_rad_s)
     is_near = (run.loop_grid > 0.9 * low) & (run.loop_grid < high)
     fine = run.loop_grid[is_near]
+    # Both grids together: even for the eye, and fine at the resonances.
     plain_grid = np.geomspace(0.9 * low, high, 900)
     curve = curves_of(run, np.union1d(plain_grid, fine))[0]
     picture, panel = new_picture(4.4)

@@ -27,6 +27,7 @@ def draw_probabilities(found: Diagnosis) -> Picture:
     """Bars: presence of the likeliest effects, those of the answer in colour; whether more is missing."""
     ranked = sorted(found.effects, key=lambda effect: -effect.presence)
     effects = [effect for effect in ranked if effect.name not in ("none", "unknown")]
+    # Half a percent: below it a bar cannot be seen.
     shown = [effect for effect in effects if effect.presence >= 0.005][:_MOST_BARS]
     names = [style.plain(in_words(effect.name), 52) for effect in shown]
     names.append("something else is missing")
@@ -141,6 +142,7 @@ def draw_case_gaps(cases: Sequence[Any]) -> Picture:
     for model, values in (("stated", before), ("repaired", after)):
         panel.plot(values, at, marker=_LOOKS[model][0], ls="none", ms=7, **_label(model))
     panel.axvline(floor, **gap_style.FLOOR, zorder=0)
+    # The line of the floor stays inside, also where no case has a model error.
     largest = max(2 * floor, *before)
     panel.set(xscale="log", xlim=(0.8 * floor, 1.3 * largest))
     panel.y.named = []

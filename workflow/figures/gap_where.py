@@ -69,10 +69,11 @@ def draw_bands_and_experiments(where: Where, model_error: float = 0.0) -> Pictur
     picture, (left, right) = new_picture(height_in, 1, 2, width_ratios=[1.25, 1.0])
     sensors = [of_sensor.sensor for of_sensor in where.sensors]
     apart = np.linspace(-1.0, 1.0, len(sensors)) if len(sensors) > 1 else np.zeros(1)
+    # Whiskers of several sensors stand beside each other.
     for sensor, shift in zip(sensors, 1 + 0.03 * apart, strict=True):
         name, colour = _look(where, sensor)
         for band in (band for band in where.bands if band.sensor == sensor):
-            # The whisker stands in the middle of the band as drawn, an eighth of its end at least.
+            # A band may begin at zero, which has no place on a logarithmic axis: an eighth of its end counts.
             low_Hz = max(band.low_Hz, 0.5 * band.high_Hz / 4)
             middle = shift * np.sqrt(low_Hz * band.high_Hz)
             size, interval = _of_band(where, band, model_error)

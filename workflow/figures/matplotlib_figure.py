@@ -290,6 +290,7 @@ def _number(of_axis: MatplotlibAxis, axis: Axis) -> None:
     elif axis.whole:
         of_axis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     elif axis.kind == "log":
+        # Below two decades powers of ten alone would be one or two numbers.
         few = low > 0 and high / low < 60
         if few:
             subs = LogLocator(base=10, subs=(1.0, 2.0, 5.0))

@@ -84,6 +84,7 @@ def draw_nyquist(
         # What comes nearest to -1 fills most of the view, whichever of the three is largest.
         widest = max(distance[nearest], modulus_margin, 0.35)
         side = float(np.clip(1.35 * widest, 0.5, 1.3))
+        # More to the right, towards the origin.
         real = (-1 - side, -1 + 1.25 * side)
         imag = (-1.12 * side, 1.12 * side)
 
@@ -126,6 +127,7 @@ def draw_nichols(panel: Panel, loop: FrequencyUncertainty) -> None:
     turned = phase[:, None] + np.degrees(beside_centre)
     panel.plot(phase, level, **style.PREDICTED_LINE, label="loop at the centres")
     panel.plot([-180], [0], marker="P", ms=8, color=style.REFERENCE, ls="none", label="-1")
+    # A whole turn is in view at least, with -1 in its middle.
     ends = np.append(phase[shown], [-360.0, 0.0])
     highest = max(float(level.max()), 12.0)
     view: Any = {"xlim": (ends.min(), ends.max()), "ylim": (_LOWEST_DB, highest)}

@@ -27,6 +27,7 @@ def draw_overview(run: RunView) -> Picture:
     gain.plot(band.omega_rad_s, nominal, **dotted, label="nominal model")
     unit = style.plain(style.ratio_unit(run.output_unit, run.input_unit), 30)
     gain.set(yscale="log", ylabel=f"gain [{unit}]")
+    # An enlarged band may reach far below: the view keeps to the gain itself.
     gain.set(ylim=(0.3 * band.gain.min(), 3 * band.gain.max()))
     gain.set_title("Identified, with its uncertainty")
     margin = run.specification.modulus_margin

@@ -95,6 +95,7 @@ def draw_surface(surface: ErrorSurface, searched: Real | None = None, name: str 
         if is_inside_grid and is_another:
             further_minima.append((i, j))
     if further_minima:
+        # More of them would hide the surface.
         i, j = np.array(further_minima[:8]).T
         left.plot(first[i], second[j], **_HOLLOW, label="other local minima")
     polar = surface.names == ("omega_rad_s", "zeta")

@@ -210,6 +210,7 @@ class AnyRunView:
         largest = []
         for item in self.results.records.of_role("estimation"):
             column = item.record.input_names.index(signal)
+            # Either sign: the command of a reference in the other direction is as large.
             commands = item.record.input[:, column]
             largest.append(float(np.max(np.abs(commands))))
         return max(largest)

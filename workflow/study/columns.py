@@ -166,6 +166,7 @@ def _of_joints(results: JointsResults) -> dict[str, Number]:
         numbers["settled_draws"] = sum(run.settled for run in runs)
         numbers["draws"] = len(runs)
         if all(run.settled for run in runs):
+            # Of the joint that overshoots most.
             overshoots = [float(run.overshoot.max()) for run in runs]
             numbers["overshoot_percent"] = 100.0 * max(0.0, *overshoots)
     return numbers

@@ -121,6 +121,7 @@ def check_controller(case: Case, rig: Rig, effects: tuple[Effect, ...]) -> Contr
     names = ("nominal parameters", "repaired")
     plants = [_plant(name, machine) for name, machine in zip(names, machines, strict=True)]
     specification = _specification(case, plants[0])
+    # One specification for both, so that the designs differ by what each knows of the arm only.
     designs = [_designed(plant, specification) for plant in plants]
     certificates = [certify(k, [p], specification) for k, p in zip(designs, plants, strict=True)]
     trial = ControllerTrial.of(case, designs[0], plants[0])

@@ -117,6 +117,7 @@ def run_pipeline(
 
         # Names and number type of the C code: as stated now, or when the run began.
         kept_dialect = run.manifest().get("c_code", {})
+        # A run that began with an older version may have fewer of them.
         kept_keys = {key: kept_dialect[key] for key in ("prefix", "number") if key in kept_dialect}
         with naming(str(run.manifest_path)):
             dialect_before = changed(Dialect(), **kept_keys)

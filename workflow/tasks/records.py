@@ -182,6 +182,7 @@ def with_common_sampling_time(records: Sequence[Record]) -> list[Record]:
     first = records[0]
     for other in records[1:]:
         if not other.sampled_like(first):
+            # Resampling to a shorter period would invent readings.
             longest_s = max(record.dt_s for record in records)
             raise InputError(
                 f"records {first.name!r} and {other.name!r} differ in sampling time "
