@@ -379,7 +379,7 @@ def periodic_words(finding: PeriodicFinding, floor: Floor) -> str:
         )
     if groups:
         group = max(groups, key=lambda group: group.repeated_rms)
-        # A group is named "even lines": its first word tells the kind of distortion.
+        # A group is called "not excited, odd": its last word is the kind of distortion.
         kind = f"{group.group.split(' ')[-1]} " if finding.even_odd_separable else ""
         size = f"{number(group.repeated_rms, 2)} {floor.units}"
         sentences.append(

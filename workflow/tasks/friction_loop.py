@@ -335,7 +335,7 @@ def friction_feedforward(controller: Controller, fit: FrictionFit) -> FrictionFe
     follows its reference with that delay.
     """
     omega = np.array([1e-5 * np.pi / controller.dt_s])
-    # The loop's phase at a frequency far below all of its own is its delay.
+    # Far below all of its own frequencies the closed loop's phase over the frequency is its delay.
     arm = fit.model.frequency_response(omega) * fit.drive_response(omega)
     loop = controller.response(omega) * arm
     closed = loop / (1 + loop)
