@@ -146,7 +146,7 @@ def test_a_verdict_says_that_nobody_looked_for_friction_and_that_linear_plants_h
         proved = replace(certify, certificate=SimpleNamespace(plants=plants))
         assert bandwidth_numbers(lower, proved, asked)["reached"] is None
     given = SimpleNamespace(certified=True, plants=[]), ""
-    assert design_verdict(lower, *given, asked).startswith("; bandwidth_rad_s = 16 was not met")
+    assert design_verdict(lower, *given, asked).startswith("bandwidth_rad_s = 16 was not met")
     soft = Specification(effort_limit=2.2, highest_effort_limit=8.8, mode_peak_ratio=1.0)
     less = replace(design, specification=Specification(effort_limit=2.31, mode_peak_ratio=1.0))
     words = run_verdict(less, certify, SimpleNamespace(check=check), asked=soft)
