@@ -12,7 +12,7 @@ from scipy.signal import lfilter, lsim
 
 from diagnosis import EffectParameter, Plant, PlantCase, PlantEffect, PlantExperiment, diagnose, with_effects
 from diagnosis.machine.around import Actuator, Body, EffectLaw, MeasuredBody, Sensor
-from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothForce, SmoothLaw
+from diagnosis.machine.body_forces import BodyForces, DryFriction, SmoothForce, SmoothLaw, force_over_part
 from diagnosis.machine.listed_effects import KINDS
 from diagnosis.machine.motion_effects import LinearBody, PulseResponse
 from diagnosis.machine.plant_effect import Change
@@ -599,3 +599,15 @@ def test_what_is_no_motion_has_no_play(output, unit, has_play):
     )
     equipped = with_effects(plant, "all", [record], dt_s=DT_S, sensor=Sensor(output))
     assert ("backlash" in {effect.name for effect in equipped.effects}) == has_play
+
+
+@pytest.mark.parametrize("upwards", [1.0, -1.0])
+def test_a_body_that_breaks_away_is_slowed_by_its_friction_in_both_directions(upwards):
+    """2 N against a level of 1 N over a part of .1 s: half of the speed that it would have without."""
+    speed_per_force, position_per_force = 0.1, 0.005  # of 1 kg
+    push_N = 2.0 * upwards
+    force_N, position_m, speed_m_s = force_over_part(
+        push_N * position_per_force, push_N * speed_per_force, 0.0, 0.0, position_per_force, speed_per_force,
+        push_N, 0.0, DryFriction(coulomb=1.0), np.zeros((0, 5)), 3,
+    )  # fmt: skip
+    assert (force_N, position_m, speed_m_s) == pytest.approx((-upwards, 0.005 * upwards, 0.1 * upwards))
