@@ -275,8 +275,7 @@ class Comparison(Shown):
             curves += axes.plot(time_s, model.simulated[rows], label=label)
 
         # A unit that nobody stated is never guessed.
-        stated_units = [unit for unit in record.output_units if unit]
-        unit = stated_units[0] if stated_units else "as logged"
+        unit = (record.output_units or ("",))[0] or "as logged"
         axes.set_xlabel("time [s]")
         axes.set_ylabel(f"{record.output_names[0]} [{unit}]")
         axes.set_title(record.name if title is None else title)

@@ -7,8 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
@@ -111,6 +111,15 @@ def build_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     from workflow.report import rendering
 
     monkeypatch.setattr(rendering, "drawings", _Built)
+
+
+def perform_stages(monkeypatch: pytest.MonkeyPatch, stages: Sequence[Any]) -> None:
+    """Runs of one loop perform these stages (`Stage`) in place of their own."""
+    from workflow.tasks import pipeline, stages as of_one_loop
+
+    changed = replace(of_one_loop.ONE_LOOP, stages=tuple(stages))
+    for module in (pipeline, of_one_loop):
+        monkeypatch.setattr(module, "ONE_LOOP", changed)
 
 
 def kill(process: subprocess.Popen[bytes]) -> None:

@@ -86,7 +86,10 @@ def unbuilt(undrawn: None, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def unidentified(monkeypatch: pytest.MonkeyPatch) -> None:
     """`flexlink init` writes what it makes of the logs before it identifies them, within a second."""
-    from workflow.commands import init
+    # The run is loaded first: it would keep what is put in place here, in whatever test loads it.
+    from workflow.commands import init, run as run_command
+
+    assert run_command.decided is init.decided
 
     def decided(command, logs, file, stated, progress, run):
         return init.drafted(command, logs, file, stated)

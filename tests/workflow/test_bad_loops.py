@@ -15,6 +15,7 @@ from scipy.signal import lfilter
 
 from benchmarks.closed_loop_machines.judge import read_law, violations
 from benchmarks.closed_loop_machines.simulator import Law, Plant, response
+from tests.workflow.command import perform_stages
 from workflow.engine.errors import InputError
 from workflow.engine.run_directory import RunDirectory
 from workflow.tasks.results import RunResults
@@ -85,7 +86,7 @@ def up_to_design(monkeypatch):
         raise InputError(REACHED)
 
     stages = [replace(one, run=stop) if one.name == "design" else one for one in ONE_LOOP.stages]
-    monkeypatch.setattr(ONE_LOOP, "stages", tuple(stages))
+    perform_stages(monkeypatch, stages)
 
 
 @pytest.fixture
@@ -101,7 +102,7 @@ def taken(flexlink, tmp_path, up_to_design):
 
 
 @pytest.fixture
-def records(flexlink, tmp_path, monkeypatch, unidentified):
+def records(flexlink, tmp_path, monkeypatch):
     """Records that `run` makes of logs, and its configuration; nothing is identified."""
     seen = []
 
@@ -110,7 +111,7 @@ def records(flexlink, tmp_path, monkeypatch, unidentified):
         raise InputError(REACHED)
 
     stages = [replace(one, run=stop) if one.name == "identify" else one for one in ONE_LOOP.stages]
-    monkeypatch.setattr(ONE_LOOP, "stages", tuple(stages))
+    perform_stages(monkeypatch, stages)
 
     def run(paths):
         answer = flexlink("run", *paths, "--out", tmp_path / "out")

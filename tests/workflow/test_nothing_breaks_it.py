@@ -24,7 +24,14 @@ from control_design.controllers.controller import Controller
 from tests.ident.mutations import DAMAGE, Tally, tally
 from tests.ident.test_forty_logs import LOGS, Log
 from tests.workflow import test_design_sources as sources
-from tests.workflow.command import FAST_ARM, ROOT, build_nothing, draw_nothing, without_progress
+from tests.workflow.command import (
+    FAST_ARM,
+    ROOT,
+    build_nothing,
+    draw_nothing,
+    perform_stages,
+    without_progress,
+)
 from tests.workflow.diagnosis_examples import FRICTION, write_case
 from tests.workflow.mutations import spoilt, tamper
 from tests.workflow.study_examples import SMALL_STUDY, TWO_POINTS, write_study
@@ -149,7 +156,7 @@ def cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
 def cut_computations_off(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is computed: what was given has been taken once a command gets that far."""
     idle = [with_fields(stage, run=_computes) for stage in ONE_LOOP.stages]
-    monkeypatch.setattr(ONE_LOOP, "stages", tuple(idle))
+    perform_stages(monkeypatch, idle)
     monkeypatch.setattr(workflow.commands.design, "_design", _computes)
     monkeypatch.setattr(workflow.commands.identify, "identify_logs", _computes)
     monkeypatch.setattr(workflow.tasks.design_source, "identify_frf", _computes)

@@ -109,6 +109,7 @@ def run_from_files(
             results = run_pipeline(
                 drafted,
                 place,
+                kind=kind_of(drafted),
                 config_text=with_absolute_paths(text, drafted),
                 called="logs",
                 page=page_of(drafted),

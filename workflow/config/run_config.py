@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from itertools import combinations
@@ -442,14 +443,14 @@ class AnyConfig(AnyRun):
     """The configuration of a whole run, of one loop or of several joints."""
 
     @property
+    @abstractmethod
     def columns(self) -> Sequence[Signals]:
         """Inputs and outputs that records have."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def loops(self) -> Sequence[Signals]:
         """What the controller drives and is fed."""
-        raise NotImplementedError
 
 
 class RunConfig(AnyConfig):

@@ -155,7 +155,6 @@ def margins_by_key(certificate: Certificate) -> tuple[Row, ...]:
 def _each_margin(place: str, margins: Margins, of: str) -> tuple[Row, ...]:
     """A row for each margin; an infinite one is unlimited."""
     # A gain may rise up to one factor and fall down to another: the margin is the nearer of the two.
-    # A gain may be wrong in either direction: the nearer limit is the margin.
     factors = [margins.gain_up] if math.isfinite(margins.gain_up) else []
     if margins.gain_down:
         factors.append(1.0 / margins.gain_down)

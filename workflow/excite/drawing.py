@@ -62,13 +62,17 @@ def draw_excitation(experiment: PlannedExperiment) -> Picture:
     lines.set_title("Lines of every record")
 
     # Where the radius lies below the gain, the response will be known.
+    expected = list(experiment.radii)
     if experiment.gain is not None:
+        expected += [np.min(experiment.gain), np.max(experiment.gain)]
         response.plot(lines_Hz, experiment.gain, **style.MODEL_LINE, label="expected gain")
     ends_Hz = lines_Hz[[0, -1]]
     radius_line = {"color": style.UNCERTAIN, "lw": 1.4, "label": "expected 95 % radius"}
     for value, radius in zip(rms, experiment.radii, strict=True):
         response.plot(ends_Hz, [radius] * 2, **radius_line)
-        response.words(f"{value:g} V rms", lines_Hz[0], radius, offset=(0.0, 1.0))
+        response.words(f"{value:g} V rms", lines_Hz[0], radius, offset=(0.0, 3.0))
     response.set(xscale="log", yscale="log", xlabel="frequency [Hz]", ylabel="hub angle / voltage [rad/V]")
+    # Half and twice the values leave room for the words above the highest line.
+    response.set(ylim=(0.5 * min(expected), 2 * max(expected)))
     response.set_title("Response to be expected")
     return picture

@@ -6,6 +6,7 @@ closed loop (R, T); responses (F,) over frequencies.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -1077,7 +1078,7 @@ class StageResult(Generic[T]):
         return result
 
 
-class AnyResults:
+class AnyResults(ABC):
     """Results of a run directory, of one loop or of several joints, each read once.
 
     Attributes
@@ -1095,18 +1096,18 @@ class AnyResults:
         self.read: dict[str, Any] = {}
 
     @property
+    @abstractmethod
     def certified(self) -> bool:
         """Whether the controller of the run is certified."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def settles(self) -> bool:
         """Whether every run of the closed loop settles."""
-        raise NotImplementedError
 
+    @abstractmethod
     def certified_for(self, config: Any) -> str:
         """What a certificate of the identified plant covers, in words; config: that of the run."""
-        raise NotImplementedError
 
 
 class RunResults(AnyResults):

@@ -121,7 +121,7 @@ def _stated_of_left_open(document: Any, where: str = "") -> Iterator[str]:
 PLANT = ("records", "identify", "uncertainty")
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class RunKind:
     """One kind of run: of one loop, or of several joints.
 
